@@ -119,7 +119,7 @@ def corrected_episodes(corrections: Path) -> list[int]:
     for rollout in load_evaluation(corrections).rollouts:
         if rollout.success:
             with Recording(corrections / rollout.file) as recording:
-                if interventions(recording.columns().phase).any():
+                if interventions(recording.phases).any():
                     corrected.append(rollout.episode_index)
     return corrected
 

@@ -44,7 +44,7 @@ def main() -> None:
     args = parser.parse_args()
     shown: list[Image.Image] = []
     with Recording(args.recording) as recording:
-        phases = recording.columns().phase
+        phases = recording.phases
         images = zip(recording.images("front"), recording.images("wrist"), strict=True)
         for frame, pair in enumerate(images):
             if frame % EVERY:

@@ -37,6 +37,7 @@ from numpy.typing import NDArray
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
@@ -100,13 +101,13 @@ def made_up(images: Images, episode: int) -> tuple[EpisodeInfo, list[Frame], Out
     )
     cameras = tuple(
         replace(camera, height=images[camera.name][0].shape[0], width=images[camera.name][0].shape[1])
-        for camera in info.scene.cameras
+        for camera in info.simulated.scene.cameras
     )
     frames = [
         replace(frame, images={name: replace(frame.images[name], color=images[name][t]) for name in images})
         for t, frame in enumerate(frames)
     ]
-    return info.with_simulation(scene=replace(info.scene, cameras=cameras)), frames, outcome
+    return with_simulation(info, scene=replace(info.simulated.scene, cameras=cameras)), frames, outcome
 
 
 def record(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:

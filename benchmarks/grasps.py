@@ -30,7 +30,7 @@ from demorec.core.tables import ROBOTS, TASKS
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body
 from demorec.loop import ScriptAgent, Session, make_world, prepare
-from demorec.loop.prepare import Episode
+from demorec.loop.prepare import PreparedEpisode
 
 LIMIT = 0.001
 """Of slip, metres."""
@@ -100,15 +100,15 @@ def run_episode(config: GenerateConfig, index: int) -> Row:
     )
 
 
-def _timed(session: Session, episode: Episode) -> tuple[float, list[Frame]]:
+def _timed(session: Session, episode: PreparedEpisode) -> tuple[float, list[Frame]]:
     started = time.process_time()
     frames = list(session.run(ScriptAgent(episode)))
     return time.process_time() - started, frames
 
 
-def lifted(episode: Episode, frames: Sequence[Frame]) -> tuple[int, float]:
+def lifted(episode: PreparedEpisode, frames: Sequence[Frame]) -> tuple[int, float]:
     """How often something was lifted, and how far, metres, it moved in the hand at most until it was lowered."""
-    hand = episode.info.scene.robot.world_from_base.matrix() @ matrices(
+    hand = episode.info.simulated.scene.robot.world_from_base.matrix() @ matrices(
         np.array([frame.observation.base_from_tcp.vector() for frame in frames])
     )
     count, slip = 0, 0.0
@@ -117,7 +117,8 @@ def lifted(episode: Episode, frames: Sequence[Frame]) -> tuple[int, float]:
         if not carried:
             continue
         held = {
-            body.name: np.linalg.inv(hand[rows]) @ _poses(frames, body)[rows] for body in episode.info.scene.movable
+            body.name: np.linalg.inv(hand[rows]) @ _poses(frames, body)[rows]
+            for body in episode.info.simulated.scene.movable
         }
         nearest = min(held.values(), key=lambda pose: float(np.linalg.norm(pose[0, :3, 3])))
         if np.linalg.norm(nearest[0, :3, 3]) < 0.05 and frames[rows[0]].observation.contact_force > 0:

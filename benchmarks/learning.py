@@ -143,9 +143,9 @@ def plain_increments(dataset: Path) -> NDArray[np.float32]:
     count = json.loads((dataset / "meta" / "info.json").read_text())["total_episodes"]
     for path in sorted((dataset.parent / "episodes").glob("*.mcap"))[:count]:
         with Recording(path) as recording:
-            columns, start = recording.columns(), recording.info.scene.robot.joint_position
-        increments = np.diff(columns.action_joint_target, axis=0, prepend=np.array([start]))
-        rows.append(np.concatenate([increments, columns.action_gripper[:, None]], axis=1))
+            trajectory, start = recording.trajectory(), recording.info.simulated.scene.robot.joint_position
+        increments = np.diff(trajectory.action_joint_target, axis=0, prepend=np.array([start]))
+        rows.append(np.concatenate([increments, trajectory.action_gripper[:, None]], axis=1))
     return np.asarray(np.concatenate(rows), dtype=np.float32)
 
 

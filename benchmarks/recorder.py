@@ -88,7 +88,7 @@ def lost_seconds(folder: Path, args: argparse.Namespace) -> float:
     with Recorder(folder, robot="any", fps=args.hz, task="measure") as recorder:
         (kept,) = recorder.recovered
     with Recording(kept) as recording:
-        there = float(recording.columns().features["observation.state"][-1, 0])
+        there = float(recording.table().features["observation.state"][-1, 0])
     return (last - there) / float(args.hz)
 
 

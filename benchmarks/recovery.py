@@ -20,7 +20,7 @@ from demorec.core.geometry import Array, Pose
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Action
 from demorec.learn.evaluate.statistics import Rate
-from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.sim.world import World
 from demorec.tasks.skills import Expert, GaveUp
 
@@ -29,7 +29,7 @@ _FREE = 0.16
 """Metres between an object that is put somewhere and everything else, the hand too."""
 
 
-def bring_about(kind: str, world: World, episode: Episode, random: np.random.Generator) -> None:
+def bring_about(kind: str, world: World, episode: PreparedEpisode, random: np.random.Generator) -> None:
     """Bring a state about."""
     frames = int(random.integers(5, 200))
     for frame in Session.of_episode(world, episode).run(ScriptAgent(episode)):
@@ -69,7 +69,7 @@ def move_object(world: World, random: np.random.Generator) -> None:
         world.apply(world.hold())
 
 
-def outcome(world: World, episode: Episode) -> str:
+def outcome(world: World, episode: PreparedEpisode) -> str:
     """What is wrong in the end; "" for a success."""
     expert = Expert(world, replace(episode.behaviour, miss_x=0.0, miss_y=0.0))
     try:

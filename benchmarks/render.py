@@ -20,7 +20,7 @@ from demorec.core.errors import RenderError
 from demorec.core.geometry import Array, Pose
 from demorec.core.tables import RENDERERS
 from demorec.episode.scene import SceneCamera
-from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.sim.world import World
@@ -50,11 +50,11 @@ class Variant:
         return f"{self.renderer}{smooth}, {'colour + depth + segmentation' if self.everything else 'colour'}"
 
 
-def plan(index: int = 0, **config: Any) -> Episode:
+def plan(index: int = 0, **config: Any) -> PreparedEpisode:
     return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index))
 
 
-def run_episode(world: World, episode: Episode) -> list[State]:
+def run_episode(world: World, episode: PreparedEpisode) -> list[State]:
     """Every frame of an episode, without images."""
     return [
         State(frame.observation.joint_position, dict(frame.observation.object_poses))
@@ -81,7 +81,9 @@ def measure(painter: Painter, world: World, states: list[State]) -> float:
     return 1e3 * spent / len(states)
 
 
-def table(episode: Episode, renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frames: int) -> None:
+def table(
+    episode: PreparedEpisode, renderers: list[str], sizes: list[tuple[int, int]], rounds: int, frames: int
+) -> None:
     variants = [
         Variant(name, antialias, everything)
         for name in renderers
@@ -90,9 +92,12 @@ def table(episode: Episode, renderers: list[str], sizes: list[tuple[int, int]], 
     ]
     with make_world(episode.info) as world:
         states = run_episode(world, episode)
-        print(f"{len(states)} frames of {episode.info.task} by {episode.info.robot.name}; {rounds} rounds of {frames}")
+        print(
+            f"{len(states)} frames of {episode.info.simulated.task} by {episode.info.robot_name}; {rounds} rounds of "
+            f"{frames}"
+        )
         for width, height in sizes:
-            every = [replace(camera, width=width, height=height) for camera in episode.info.scene.cameras]
+            every = [replace(camera, width=width, height=height) for camera in episode.info.simulated.scene.cameras]
             for cameras in [(camera,) for camera in every] + [tuple(every)]:
                 times: dict[Variant, list[float]] = {variant: [] for variant in variants}
                 for number in range(rounds):

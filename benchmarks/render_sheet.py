@@ -34,7 +34,9 @@ def main() -> int:
             try:
                 with RENDERERS.load(name)() as renderer:
                     for width, height in SIZES:
-                        cameras = tuple(replace(c, width=width, height=height) for c in episode.info.scene.cameras)
+                        cameras = tuple(
+                            replace(c, width=width, height=height) for c in episode.info.simulated.scene.cameras
+                        )
                         painter = painter_for(renderer, world, cameras, antialias=True, everything=False)
                         for images in painter.images().values():
                             wide = round(TILE_HEIGHT * width / height)

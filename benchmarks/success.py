@@ -43,7 +43,7 @@ def measure(config: GenerateConfig, *, first: int, episodes: int) -> dict[str, A
             for _ in session.run(ScriptAgent(episode)):
                 pass
             outcomes[index] = session.outcome
-            things[index] = episode.info.scene.goals[0].object if episode.info.scene.goals else ""
+            things[index] = episode.info.simulated.scene.goals[0].object if episode.info.simulated.scene.goals else ""
         seconds = time.process_time() - started
     done = list(outcomes.values())
     successes = [outcome for outcome in done if outcome.success]

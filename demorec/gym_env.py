@@ -29,8 +29,9 @@ from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED, ObservationRows
+from demorec.episode.simulated import with_simulation
 from demorec.episode.variation import Preset
-from demorec.loop import Episode, Session, SimulatorCache, Step, prepare
+from demorec.loop import PreparedEpisode, Session, SimulatorCache, Step, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
 from demorec.render.painter import Painter, WarmRenderer
 from demorec.sim.world import World
@@ -161,11 +162,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
         info = self.episode.info
-        self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * max(1, len(info.scene.goals)))
+        self._max_episode_steps = episode_length or round(
+            SECONDS_PER_GOAL * config.fps * max(1, len(info.simulated.scene.goals))
+        )
         self.privileged = self._is_privileged() if privileged is None else privileged
         self._vector_lengths = self._lengths(info)
         self.observation_space = _observation_space(info, self._vector_lengths)
-        low, high = (bound.astype(np.float32) for bound in action_bounds(info.robot, action, fps=config.fps))
+        low, high = (bound.astype(np.float32) for bound in action_bounds(info.simulated.robot, action, fps=config.fps))
         self.action_space = spaces.Box(low, high)
         self._simulators, self._viewers = SimulatorCache(), WarmRenderer()
 
@@ -271,7 +274,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         if self._viewer is None:
             width, height = self._render_size
             camera = CAMERAS.load(self._render_camera).camera(
-                self._render_camera, self.info.robot, width=width, height=height
+                self._render_camera, self.info.simulated.robot, width=width, height=height
             )
             self._viewer = Painter(self._viewers.of(self.config.renderer), (camera,), antialias=self.config.antialias)
             self._viewer.setup(self.world)
@@ -287,7 +290,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     # ------------------------------------------------------------------------------------------------ parts
 
-    def _prepare(self, index: int, scene: Scene | None) -> Episode:
+    def _prepare(self, index: int, scene: Scene | None) -> PreparedEpisode:
         """The first attempt at this episode for which a layout is found, as the generator does it."""
         for attempt in range(self.config.max_attempts):
             try:
@@ -299,8 +302,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             break
         if scene is None:
             return episode
-        scene = replace(scene, cameras=episode.info.scene.cameras)
-        return replace(episode, info=episode.info.with_simulation(scene=scene))
+        scene = replace(scene, cameras=episode.info.simulated.scene.cameras)
+        return replace(episode, info=with_simulation(episode.info, scene=scene))
 
     def _is_privileged(self) -> bool:
         """The default: without cameras, and with as many objects in each of the first scenes."""
@@ -308,13 +311,19 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             return False
         infos = [self._prepare(index, None).info for index in range(PROBED_SCENES)]
         # A round object has no yaw, so that its vector is shorter.
-        names = (features.observation_names(info.robot, info.scene, privileged=True) for info in infos)
+        names = (
+            features.observation_names(info.simulated.robot, info.simulated.scene, privileged=True) for info in infos
+        )
         return len({len(of_scene[features.ENVIRONMENT_STATE]) for of_scene in names}) == 1
 
     def _lengths(self, info: EpisodeInfo) -> dict[str, int]:
         """Dataset feature -> how many numbers it has."""
         names = features.observation_names(
-            info.robot, info.scene, privileged=self.privileged, state=self._state_kind, sensed=self._sensed
+            info.simulated.robot,
+            info.simulated.scene,
+            privileged=self.privileged,
+            state=self._state_kind,
+            sensed=self._sensed,
         )
         return {name: len(components) for name, components in names.items()}
 
@@ -333,8 +342,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     def _observation(self, situation: Situation) -> dict[str, Any]:
         vectors = features.observation_vectors(
             ObservationRows.of_observation(situation.observation),
-            self.info.robot,
-            self.info.scene,
+            self.info.simulated.robot,
+            self.info.simulated.scene,
             privileged=self.privileged,
             state=self._state_kind,
             sensed=self._sensed,
@@ -361,10 +370,10 @@ def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> 
         _key(name): spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         for name, length in vector_lengths.items()
     }
-    if info.scene.cameras:
+    if info.simulated.scene.cameras:
         images = {
             camera.name: spaces.Box(0, 255, shape=(camera.height, camera.width, 3), dtype=np.uint8)
-            for camera in info.scene.cameras
+            for camera in info.simulated.scene.cameras
         }
         found["pixels"] = spaces.Dict(images)
     return spaces.Dict(found)

@@ -28,7 +28,7 @@ from demorec.core.tables import load_robot
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
-from demorec.loop import Episode, ScriptAgent, Session, make_world, prepare
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.mcap import EpisodeWriter
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.robots.assets import allow_models, asset_path
@@ -66,22 +66,24 @@ class TaskContract:
             again = self._episode(index).info
             assert again == info, f"episode {index} is another when it is drawn again: is everything drawn from rng?"
         for first, second in itertools.combinations(infos, 2):
-            assert first.scene != second.scene, "two episodes have the same scene"
-        assert self._episode(2, attempt=1).info.scene != infos[2].scene, "another attempt has the same scene"
+            assert first.simulated.scene != second.simulated.scene, "two episodes have the same scene"
+        assert self._episode(2, attempt=1).info.simulated.scene != infos[2].simulated.scene, (
+            "another attempt has the same scene"
+        )
 
     def test_scenes_come_back_from_their_description(self) -> None:
         """A recording's metadata rebuild the scene; it has goals, all for movable bodies, and an instruction."""
         for index in range(self.num_layouts):
             info = self._episode(index).info
             assert read_episode_info(to_json(info)) == info, f"episode {index} is another when it is read back"
-            assert info.scene.goals, f"episode {index} has no goal"
+            assert info.simulated.scene.goals, f"episode {index} has no goal"
             assert info.instruction.strip(), f"episode {index} has no instruction"
             assert info.instruction.isprintable(), f"the instruction of episode {index} is not one line of text"
 
     def test_objects_stand_apart(self) -> None:
         """No two movable bodies that stand on the table are in each other."""
         for index in range(self.num_layouts):
-            movable = self._episode(index).info.scene.movable
+            movable = self._episode(index).info.simulated.scene.movable
             standing = [body for body in movable if body.world_from_body.position[2] < 0.05]
             for a, b in itertools.combinations(standing, 2):
                 gap = math.dist(a.world_from_body.position[:2], b.world_from_body.position[:2])
@@ -92,9 +94,9 @@ class TaskContract:
         """The hand, pointing down, gets to where each object is and to where it shall be, at one yaw at least."""
         for index in range(self.num_layouts):
             info = self._episode(index).info
-            for goal in info.scene.goals:
-                start = info.scene.body(goal.object).world_from_body
-                for what, pose in (("start", start), ("goal", info.scene.world_from_goal(goal))):
+            for goal in info.simulated.scene.goals:
+                start = info.simulated.scene.body(goal.object).world_from_body
+                for what, pose in (("start", start), ("goal", info.simulated.scene.world_from_goal(goal))):
                     at = pose.position.round(3).tolist()
                     assert _is_within_reach(info, at), f"the {what} of {goal.object} of episode {index}, {at}"
 
@@ -102,7 +104,7 @@ class TaskContract:
         """The conditions of success do not hold at the start, so they cannot hold by chance."""
         episode = self._episode(0)
         with make_world(episode.info) as world:
-            world.reset(episode.info.scene)
+            world.reset(episode.info.simulated.scene)
             checks = episode.task.evaluate(world)
         assert checks, "the task has no conditions of success"
         assert not all(check.passed for check in checks), "the task is done before anything has moved"
@@ -120,7 +122,7 @@ class TaskContract:
 
     def test_commands_stay_within_the_limits_of_the_robot(self) -> None:
         """Joint positions and velocities that the expert asks for, and the opening of the gripper."""
-        robot = self._episode(0).info.robot
+        robot = self._episode(0).info.simulated.robot
         frames, _ = run_expert(self.task, self.robot, self.seed, 0)
         targets = np.array([frame.action.joint_target for frame in frames])
         widths = np.array([frame.action.gripper_target for frame in frames])
@@ -166,7 +168,7 @@ class TaskContract:
         assert replayed.is_identical, f"the replay differs: {replayed.first_difference}"
         assert replayed.success == outcome.success, "the replay ends otherwise"
 
-    def _episode(self, index: int, *, attempt: int = 0) -> Episode:
+    def _episode(self, index: int, *, attempt: int = 0) -> PreparedEpisode:
         return prepare(replace(plan_of(self.task, self.robot, self.seed, index), attempt=attempt))
 
 
@@ -225,9 +227,9 @@ class RobotContract:
     def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(self) -> None:
         """Their boxes in the simulator, opened as tasks open them."""
         episode = self._episode()
-        robot, gripper = episode.info.robot, episode.info.robot.gripper
+        robot, gripper = episode.info.simulated.robot, episode.info.simulated.robot.gripper
         with make_world(episode.info) as world:
-            world.reset(episode.info.scene)
+            world.reset(episode.info.simulated.scene)
             world.arm.place(np.array(robot.home_q), gripper.open_width)
             tcp = world.arm.world_from_tcp()
             tips = []
@@ -265,7 +267,7 @@ class RobotContract:
         allow_models(allowed)
         return load_robot(self.robot, allowed)
 
-    def _episode(self) -> Episode:
+    def _episode(self) -> PreparedEpisode:
         return prepare(plan_of("pick_place", self.robot, self.seed, 0))
 
 
@@ -289,9 +291,9 @@ def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Fram
 
 def _is_within_reach(info: EpisodeInfo, point: list[float]) -> bool:
     """Whether the TCP gets to a point of the world (3,), metres, with the hand pointing down."""
-    base_from_world = info.scene.robot.world_from_base.inverse()
-    arm = arm_kinematics(info.robot, scale=info.scene.robot.scale)
-    start = np.array(info.robot.home_q)
+    base_from_world = info.simulated.scene.robot.world_from_base.inverse()
+    arm = arm_kinematics(info.simulated.robot, scale=info.simulated.scene.robot.scale)
+    start = np.array(info.simulated.robot.home_q)
     ahead = base_from_world.apply(np.array(point)) - arm.origins[0]
     start[0] = math.atan2(ahead[1], ahead[0])
     return any(

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from demorec.core.geometry import Pose
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.scene import Goal, Scene
 
 if TYPE_CHECKING:
@@ -80,7 +80,7 @@ class EpisodeTimeline:
         return "release" in phases and "lower" not in phases and "carry" in phases
 
 
-def episode_timeline(recording: Recording, columns: Columns) -> EpisodeTimeline:
+def episode_timeline(recording: Recording, trajectory: Trajectory) -> EpisodeTimeline:
     """Return attempts and segments of a recording.
 
     An attempt begins where the script announced a grasp; a recording without such events is one attempt at its only
@@ -89,9 +89,9 @@ def episode_timeline(recording: Recording, columns: Columns) -> EpisodeTimeline:
     Raises:
         RecordingError: The recording is damaged.
     """
-    attempts = _attempts(recording, columns, recording.info.scene)
+    attempts = _attempts(recording, trajectory, recording.info.simulated.scene)
     starts = [attempt.first for attempt in attempts]
-    phases = columns.phase
+    phases = trajectory.phase
     first = sorted({0, *starts, *(t for t in range(1, len(phases)) if phases[t] != phases[t - 1])})
     segments = [
         PhaseSegment(
@@ -99,17 +99,17 @@ def episode_timeline(recording: Recording, columns: Columns) -> EpisodeTimeline:
             end=end,
             phase=phases[start],
             attempt=attempts[max(0, bisect_right(starts, start) - 1)],
-            is_deliberate_miss=bool(columns.is_deliberate_miss[start:end].any()),
+            is_deliberate_miss=bool(trajectory.is_deliberate_miss[start:end].any()),
         )
         for start, end in pairwise([*first, len(phases)])
     ]
     return EpisodeTimeline(attempts=tuple(attempts), segments=tuple(segments))
 
 
-def _attempts(recording: Recording, columns: Columns, scene: Scene) -> list[GoalAttempt]:
+def _attempts(recording: Recording, trajectory: Trajectory, scene: Scene) -> list[GoalAttempt]:
     attempts: list[GoalAttempt] = []
     for time_ns, event in recording.events():
-        frame = int(np.searchsorted(columns.time_ns, time_ns))
+        frame = int(np.searchsorted(trajectory.time_ns, time_ns))
         if event.name == "grasp" and (match := re.match(r"grasp (\S+) at yaw", event.message)):
             attempts.append(_next_attempt(attempts, match[1], frame, scene.goals))
         elif attempts and event.name in _FAILURES:
@@ -123,8 +123,8 @@ def _attempts(recording: Recording, columns: Columns, scene: Scene) -> list[Goal
     if not attempts:
         attempts = [GoalAttempt(first=0, goal=0 if len(scene.goals) == 1 else None)]
     last = attempts[-1]
-    if last.end == "unfinished" and "release" in columns.phase[last.first :]:
-        is_placed = last.goal is None or _is_at_goal(scene.goals[last.goal], scene, columns)
+    if last.end == "unfinished" and "release" in trajectory.phase[last.first :]:
+        is_placed = last.goal is None or _is_at_goal(scene.goals[last.goal], scene, trajectory)
         attempts[-1] = replace(last, end="placed" if is_placed else "misplaced")
     return attempts
 
@@ -146,9 +146,11 @@ def _goal_of(name: str, goals: Sequence[Goal], first: int) -> int | None:
     return next((index for index in range(first, len(goals)) if goals[index].object == name), None)
 
 
-def _is_at_goal(goal: Goal, scene: Scene, columns: Columns) -> bool:
+def _is_at_goal(goal: Goal, scene: Scene, trajectory: Trajectory) -> bool:
     """Whether the object is at its goal in the last frame, seen from above."""
-    ends = {name: Pose(position=poses[-1, :3], quat_xyzw=poses[-1, 3:]) for name, poses in columns.object_poses.items()}
+    ends = {
+        name: Pose(position=poses[-1, :3], quat_xyzw=poses[-1, 3:]) for name, poses in trajectory.object_poses.items()
+    }
     if goal.object not in ends:
         return False
     onto = ends[goal.onto] if goal.onto in ends else scene.body(goal.onto).world_from_body if goal.onto else Pose()

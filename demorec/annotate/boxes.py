@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.scene import SceneCamera, Shape
 from demorec.episode.words import nouns_of
 from demorec.mcap import Recording
@@ -47,7 +47,7 @@ class SeenObject:
 
 
 def seen_objects(
-    recording: Recording, columns: Columns, rows: NDArray[np.intp], camera: SceneCamera
+    recording: Recording, trajectory: Trajectory, rows: NDArray[np.intp], camera: SceneCamera
 ) -> Iterator[SeenObject]:
     """Yield everything that a camera with segmentation sees in the given frames, row by row.
 
@@ -56,20 +56,26 @@ def seen_objects(
     """
     row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
     bodies = {
-        body.name: body for body in recording.info.scene.bodies if body.role in ("object", "target", "distractor")
+        body.name: body
+        for body in recording.info.simulated.scene.bodies
+        if body.role in ("object", "target", "distractor")
     }
     value_of = {name: value for value, name in recording.segment_names().items() if name in bodies}
     for frame, image in enumerate(recording.segmentation(camera.name)):
         if frame not in row_of:
             continue
-        world_from_camera = columns.world_from_camera[camera.name][frame]
+        world_from_camera = trajectory.world_from_camera[camera.name][frame]
         for name, value in value_of.items():
             shown = image == value
             area = int(np.count_nonzero(shown))
             if not area:
                 continue
             body = bodies[name]
-            pose = columns.object_poses[name][frame] if name in columns.object_poses else body.world_from_body.vector()
+            pose = (
+                trajectory.object_poses[name][frame]
+                if name in trajectory.object_poses
+                else body.world_from_body.vector()
+            )
             outline = outline_area(camera, world_from_camera, body.shape, pose)
             yield SeenObject(
                 row=row_of[frame],

@@ -14,26 +14,26 @@ from demorec.annotate.subtasks import goal_words, memories, motion, plan, subtas
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.scene import Scene
 from demorec.mcap import Recording
 
 
 def episode_statements(
-    recording: Recording, columns: Columns, rows: NDArray[np.intp], kinds: Collection[LanguageKind]
+    recording: Recording, trajectory: Trajectory, rows: NDArray[np.intp], kinds: Collection[LanguageKind]
 ) -> list[Statement]:
     """Return the statements of the wanted kinds, in the order of the rows; those of one row in the order of `KINDS`.
 
     Args:
         recording: With its events.
-        columns: All of its numbers.
+        trajectory: All of its numbers.
         rows: (T,) frames of the recording that the dataset has.
         kinds: Wanted kinds, as far as the recording supports them.
 
     Raises:
         RecordingError: The recording is damaged.
     """
-    annotator = _Annotator(recording, columns, rows)
+    annotator = _Annotator(recording, trajectory, rows)
     found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
         "subtask": annotator.subtasks,
         "plan": annotator.plans,
@@ -48,17 +48,17 @@ def episode_statements(
 class _Annotator:
     """The sentences of one episode, kind by kind."""
 
-    def __init__(self, recording: Recording, columns: Columns, rows: NDArray[np.intp]) -> None:
-        self._info, self._columns, self._rows = recording.info, columns, rows
-        self._timeline: EpisodeTimeline = episode_timeline(recording, columns)
-        self._scene: Scene = recording.info.scene
+    def __init__(self, recording: Recording, trajectory: Trajectory, rows: NDArray[np.intp]) -> None:
+        self._info, self._trajectory, self._rows = recording.info, trajectory, rows
+        self._timeline: EpisodeTimeline = episode_timeline(recording, trajectory)
+        self._scene: Scene = recording.info.simulated.scene
         self._words = {
             attempt.first: goal_words(self._scene, attempt.goal, self._situation(attempt.first))
             for attempt in self._timeline.attempts
         }
 
     def _situation(self, frame: int) -> Surroundings:
-        poses: dict[str, Array] = {name: values[frame] for name, values in self._columns.object_poses.items()}
+        poses: dict[str, Array] = {name: values[frame] for name, values in self._trajectory.object_poses.items()}
         return situation(self._scene, poses)
 
     def _row_of(self, frame: int) -> int:
@@ -100,16 +100,19 @@ class _Annotator:
         yield from latest.values()
 
     def motions(self) -> Iterator[Statement]:
-        columns, last = self._columns, self._rows[-1]
+        trajectory, last = self._trajectory, self._rows[-1]
         for _, first, end in self._segment_rows():
             frames = [self._rows[first], self._rows[end] if end < len(self._rows) else last]
-            text = motion(columns.base_from_tcp[frames, :3], columns.gripper_width[frames])
+            text = motion(trajectory.base_from_tcp[frames, :3], trajectory.gripper_width[frames])
             yield Statement(row=first, kind="motion", role="assistant", text=text)
 
     def wordings(self) -> Iterator[Statement]:
         info = self._info
         rng = generator(
-            root_seed=info.root_seed, episode_index=info.episode_index, attempt=info.attempt, purpose="language"
+            root_seed=info.simulated.root_seed,
+            episode_index=info.episode_index,
+            attempt=info.attempt,
+            purpose="language",
         )
         for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._timeline.is_dropped):
             yield Statement(row=0, kind="task_aug", role="user", text=text)

@@ -191,7 +191,7 @@ class Dataset:
         """The kind of the actions by the names of their components; None for another kind than demorec writes."""
         names = self.info.features[ACTION].names if ACTION in self.info.features else None
         kinds: tuple[ActionKind, ...] = ("joint", "joint_increment", "ee", "ee_delta")
-        return next((kind for kind in kinds if action_names(info.robot, kind) == names), None)
+        return next((kind for kind in kinds if action_names(info.simulated.robot, kind) == names), None)
 
 
 Episodes = CheckedEpisode | Dataset

@@ -16,7 +16,7 @@ from demorec.check.evidence import Motion, Motions, motion_of_features, motion_o
 from demorec.check.films import CameraFilms, film_of_recording
 from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Columns, frame_time_ns
+from demorec.episode.episode import Table, Trajectory, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording
@@ -61,10 +61,10 @@ class CheckedEpisode(ExitStack):
         """What was known before the first frame."""
         return self.recording.info
 
-    @cached_property
-    def columns(self) -> Columns:
-        """All numbers."""
-        return self.recording.columns()
+    @property
+    def table(self) -> Table:
+        """Features of every frame."""
+        return self.recording.table()
 
     @property
     def num_frames(self) -> int:
@@ -93,14 +93,19 @@ class CheckedEpisode(ExitStack):
         return Motions([] if motion is None else [motion])
 
     def _motion(self) -> Motion | None:
-        info, c = self.info, self.columns
+        info = self.info
         if self.form == "external":
-            return motion_of_features(c.features, info.features, info.fps, self._named_urdf or info.urdf, c.time_ns)
-        return motion_of_simulated(info, c, Urdf.parse(self.recording.description())) if self.num_frames else None
+            table, urdf = self.table, self._named_urdf or info.urdf
+            return motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns)
+        if not self.num_frames:
+            return None
+        return motion_of_simulated(info, self.recording.trajectory(), Urdf.parse(self.recording.description()))
 
     def numbers(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """(name, (T, ...) table) of all floating-point numbers."""
-        for name, column in vars(self.columns).items():
+        numbers: Table | Trajectory
+        numbers = self.table if self.form == "external" else self.recording.trajectory()
+        for name, column in vars(numbers).items():
             tables = column.items() if isinstance(column, Mapping) else [(name, column)]
             for key, table in tables:
                 if isinstance(table, np.ndarray) and table.dtype.kind == "f":
@@ -109,13 +114,13 @@ class CheckedEpisode(ExitStack):
     @property
     def cameras(self) -> tuple[SceneCamera, ...]:
         """Of the scene."""
-        return self.info.scene.cameras
+        return self.info.simulated.scene.cameras
 
     @cached_property
     def films(self) -> dict[str, CameraFilms]:
         """Camera -> its colour images."""
-        colours = [camera for camera in self.recording.cameras if camera in self.columns.images]
-        return {camera: film_of_recording(self.recording, self.columns, camera) for camera in colours}
+        colours = [camera for camera in self.recording.cameras if camera in self.table.images]
+        return {camera: film_of_recording(self.recording, self.table, camera) for camera in colours}
 
     def undecoded(self) -> Iterator[tuple[str, str]]:
         """(camera, problem) of every camera whose images do not all decode: colours, distances, labels."""

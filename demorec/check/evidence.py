@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array, signs_of_course
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo, Feature
 from demorec.robots.urdf import Urdf
@@ -168,9 +168,9 @@ def course_of(state: Array, names: Sequence[str]) -> Array:
     return course
 
 
-def motion_of_simulated(info: EpisodeInfo, c: Columns, urdf: Urdf) -> Motion:
+def motion_of_simulated(info: EpisodeInfo, c: Trajectory, urdf: Urdf) -> Motion:
     """The motion of a recording that demorec simulated, of which everything is known."""
-    robot = info.robot
+    robot = info.simulated.robot
     n = len(robot.arm_joints)
     return Motion(
         where="",

@@ -19,7 +19,7 @@ from demorec.core.geometry import Array
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.reader import EpisodePlace
 from demorec.datasets.lerobot.videos import opened_video
-from demorec.episode.episode import NO_IMAGE, Columns
+from demorec.episode.episode import NO_IMAGE, Table
 from demorec.mcap import Recording
 from demorec.mcap.video import decode
 
@@ -62,7 +62,7 @@ class CameraFilms(NamedTuple):
     error: str
 
 
-def film_of_recording(recording: Recording, columns: Columns, camera: str) -> CameraFilms:
+def film_of_recording(recording: Recording, table: Table, camera: str) -> CameraFilms:
     """Each image once, with the first frame that holds it."""
     cells: list[NDArray[np.uint8]] = []
     error = ""
@@ -72,7 +72,7 @@ def film_of_recording(recording: Recording, columns: Columns, camera: str) -> Ca
             cells.append(_parts(av.VideoFrame.from_ndarray(image, "rgb24"), reformatter))
     except RecordingError as problem:
         error = str(problem)
-    held, frames = np.unique(columns.images[camera], return_index=True)
+    held, frames = np.unique(table.images[camera], return_index=True)
     shown = (held != NO_IMAGE) & (held < len(cells))
     film = Film(
         where=f"camera {camera}",

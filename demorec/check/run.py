@@ -92,11 +92,9 @@ class CheckedRun:
         for path in sorted((self.path / EPISODES).glob("*.mcap")):
             try:
                 with open_recording(path) as recording:
-                    columns = recording.columns()
-                    if recording.info.simulation is not None:
-                        yield path.name, motion_vector(columns.joint_position)
-                    elif STATE in columns.features:
-                        yield path.name, motion_vector(columns.features[STATE])
+                    features = recording.table().features
+                    if STATE in features:
+                        yield path.name, motion_vector(features[STATE])
             except (RecordingError, OSError):
                 continue  # reported by the checks of that recording
 
@@ -146,7 +144,11 @@ def _contradictions(run: CheckedRun, attempt: Attempt) -> Iterator[str]:
 def _other_config(run: RunFile, info: EpisodeInfo) -> Iterator[str]:
     """The values of a recording's config that differ from the run's, and "versions"."""
     config = to_plain(run.config)
-    yield from (name for name in sorted({*config, *info.config}) if config.get(name) != info.config.get(name))
+    yield from (
+        name
+        for name in sorted({*config, *info.simulated.config})
+        if config.get(name) != info.simulated.config.get(name)
+    )
     if run.versions and dict(info.versions) != dict(run.versions):
         yield "versions"
 

@@ -160,7 +160,7 @@ def has_environment_state(result: RunResult) -> bool:
     for attempt in result.run.successes[:MAX_PROBED_EPISODES]:
         with open_recording(result.folder / attempt.file, simulated=True) as recording:
             info = recording.info
-        names = observation_names(info.robot, info.scene, privileged=True)
+        names = observation_names(info.simulated.robot, info.simulated.scene, privileged=True)
         lengths.add(len(names[ENVIRONMENT_STATE]))
     return len(lengths) == 1
 

@@ -320,7 +320,9 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
     for file in recordings:
         with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
-            task, seed = ("(external)", "") if info.simulation is None else (info.task, str(info.root_seed))
+            task, seed = (
+                ("(external)", "") if info.simulation is None else (info.simulated.task, str(info.simulated.root_seed))
+            )
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
         word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]

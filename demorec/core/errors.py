@@ -74,25 +74,6 @@ class NotGeneratedError(RecordingError):
     """A recording was rendered or replayed from another one, or a policy made it."""
 
 
-class NotSimulatedError(RecordingError):
-    """Something was asked of an episode that only a simulated one has.
-
-    Args:
-        what: Name of it ("scene").
-        path: Of the recording, where it is known.
-    """
-
-    def __init__(self, what: str, path: Path | None = None) -> None:
-        super().__init__(what, path)
-
-    def __str__(self) -> str:
-        what, path = self.args
-        return (
-            f"This needs the {what} of an episode that demorec simulated; this one was recorded by another robot or "
-            f"program and has none{'' if path is None else f': {path}'}"
-        )
-
-
 class ExportError(DemorecError):
     """A dataset cannot be written: recordings that differ, a target in the way, a failed verification."""
 

@@ -82,28 +82,6 @@ _converter.register_unstructure_hook(
 )
 
 
-class PartValue[V]:
-    """A value of an optional part, read as one of its owner's.
-
-    Args:
-        part: Field of the owner that has the part, or None.
-        absent: Makes the error where there is none, given the value's name.
-    """
-
-    def __init__(self, part: str, absent: Callable[[str], Exception]) -> None:
-        self._part, self._absent = part, absent
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
-
-    def __get__(self, owner: Any, _: type | None = None) -> V:
-        part = getattr(owner, self._part)
-        if part is None:
-            raise self._absent(self._name)
-        value: V = getattr(part, self._name)
-        return value
-
-
 def _in_words(error: BaseException, type_: type | None) -> str:
     words = str(error)
     if isinstance(error, ValueError) and (length := _LENGTH.search(words)):

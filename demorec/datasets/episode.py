@@ -17,7 +17,7 @@ from demorec.core.errors import ConfigError, ExportError
 from demorec.core.plain import digest, to_json
 from demorec.core.registry import nearest_match
 from demorec.datasets.options import CommonOptions
-from demorec.episode.episode import NO_IMAGE, Columns, interventions
+from demorec.episode.episode import NO_IMAGE, Table, Trajectory, interventions
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -98,7 +98,7 @@ class ExportEpisode:
             sensed = [name for name, row in SENSED.items() if not row.topic or row.topic in recording.topics]
             on_request = (*sensed, COMMAND)
             self._sensed = [name for name in sensed if name in options.features]
-            robot, scene = info.robot, info.scene
+            robot, scene = info.simulated.robot, info.simulated.scene
             self.names = observation_names(
                 robot, scene, privileged=options.privileged, state=self._state, sensed=self._sensed
             )
@@ -143,7 +143,7 @@ class ExportEpisode:
         """The features that have joints of the URDF: which of their elements are the positions of which, and units."""
         if self.info.simulation is None:
             return tuple(feature for feature in self.info.features if any(feature.joints))
-        arm = self.info.robot.arm_joints
+        arm = self.info.simulated.robot.arm_joints
         pose = ("m",) * 3 + ("",) * 4 if self._state == "joint_ee" else ()
         names = self.names[STATE]
         joints = (*arm, *("" for _ in names[len(arm) :]))
@@ -156,7 +156,7 @@ class ExportEpisode:
         yield "fps", str(info.fps)
         if info.simulation is not None:
             # A scaled arm (the tutorial's) has the same joints and limits; its lengths are in the sidecar.
-            robot = info.robot
+            robot = info.simulated.robot
             yield "robot", f"{robot.name} ({digest(robot.scaled(0.0))})"
         else:
             wanted = {name: elements for name, elements in self.names.items() if self.options.takes(name)}
@@ -173,10 +173,15 @@ class ExportEpisode:
             yield "objects and goals", " ".join(dict.fromkeys(name.partition(".")[0] for name in names))
             yield "components of the environment state", f"{len(names)} ({digest(list(names))})"
 
-    @cached_property
-    def columns(self) -> Columns:
-        """All numbers, every frame; RecordingError for damage."""
-        return self.recording.columns()
+    @property
+    def table(self) -> Table:
+        """Features of every frame; RecordingError for damage."""
+        return self.recording.table()
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Everything simulated, of every frame; RecordingError for damage, or if demorec did not simulate it."""
+        return self.recording.trajectory()
 
     @cached_property
     def rows(self) -> NDArray[np.intp]:
@@ -193,7 +198,7 @@ class ExportEpisode:
             ExportError: The recording has no frames, or a number that is not finite.
             RecordingError: It is damaged.
         """
-        found = self.columns.features if self.info.simulation is None else self._simulated_vectors()
+        found = self.table.features if self.info.simulation is None else self._simulated_vectors()
         vectors = {name: values for name, values in found.items() if self.options.takes(name)}
         for name, values in vectors.items():
             self._check_finite(name, values)
@@ -221,13 +226,13 @@ class ExportEpisode:
         """Feature -> (T, D). With frames left out, an observation is that of the first frame of its group and an action
         the last one of it: where the robot shall be when the next observation is taken.
         """
-        info, rows, columns, options = self.info, self.rows, self.columns, self.options
+        info, rows, trajectory, options = self.info, self.rows, self.trajectory, self.options
         action_rows = np.minimum(rows + info.fps // self.fps - 1, self.recording.num_frames - 1)
         vectors: dict[str, NDArray[np.floating[Any]]] = dict(
             observation_vectors(
-                ObservationRows.of_columns(columns, rows),
-                info.robot,
-                info.scene,
+                ObservationRows.of_trajectory(trajectory, rows),
+                info.simulated.robot,
+                info.simulated.scene,
                 privileged=options.privileged,
                 state=self._state,
                 sensed=self._sensed,
@@ -235,8 +240,10 @@ class ExportEpisode:
             )
         )
         if COMMAND in self.names:
-            vectors[COMMAND] = command_vectors(columns, action_rows)
-        vectors[ACTION] = action_vectors(columns, info.scene, options.action, action_rows, dtype=np.float64)
+            vectors[COMMAND] = command_vectors(trajectory, action_rows)
+        vectors[ACTION] = action_vectors(
+            trajectory, info.simulated.scene, options.action, action_rows, dtype=np.float64
+        )
         return vectors
 
     @cached_property
@@ -248,7 +255,7 @@ class ExportEpisode:
             is_success = is_last & bool(self.recording.success)
             found |= {REWARD: is_success.astype(np.float32), SUCCESS: is_success}
             if INTERVENTION in self.scalars:
-                found[INTERVENTION] = interventions(self.columns.phase)[self.rows]
+                found[INTERVENTION] = interventions(self.recording.phases)[self.rows]
         return {name: found[name] for name in self.scalars}
 
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
@@ -267,13 +274,13 @@ class ExportEpisode:
         return self._held_numbers(camera.name)[self.rows]
 
     def _held_numbers(self, camera: str) -> NDArray[np.int64]:
-        columns = self.columns
-        numbers, stamps = columns.images[camera].copy(), columns.image_stamps[camera]
+        table = self.table
+        numbers, stamps = table.images[camera].copy(), table.image_stamps[camera]
         longest = round(self.options.hold_images * _SECOND_NS)
         without = np.flatnonzero(numbers == NO_IMAGE)
         for frame in without.tolist():
             before = int(numbers[frame - 1]) if frame else NO_IMAGE
-            age = int(columns.time_ns[frame] - stamps[before]) if before != NO_IMAGE else None
+            age = int(table.time_ns[frame] - stamps[before]) if before != NO_IMAGE else None
             if age is None or age > longest:
                 last, hold = "none came before it", ""
                 if age is not None:

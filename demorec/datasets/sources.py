@@ -46,7 +46,7 @@ def is_wanted(recording: Recording, options: CommonOptions) -> bool:
         return False
     if not options.corrected_only:
         return True
-    phases = recording.columns().phase
+    phases = recording.phases
     return POLICY_PHASE not in phases or bool(interventions(phases).any())
 
 

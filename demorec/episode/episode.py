@@ -10,12 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import NotSimulatedError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.info import EpisodeInfo
 
@@ -189,7 +188,7 @@ class Outcome:
 def gave_up(outcome: Outcome, events: Sequence[Event], info: EpisodeInfo) -> bool:
     """Whether a recording shows the reason of a failure, whatever the conditions say: an event of its name, or the end
     of the time."""
-    limit = info.config.get("max_episode_seconds")
+    limit = info.simulated.config.get("max_episode_seconds")
     is_over = isinstance(limit, int | float) and outcome.num_frames + 1 > limit * info.fps
     return (outcome.failure_reason == TIME_LIMIT and is_over) or any(
         event.name == outcome.failure_reason and event.level != "info" for event in events
@@ -228,52 +227,23 @@ class SampledFrame:
     subtask: str = ""
 
 
-def _nothing() -> Any:
-    """The default of a column that only simulated episodes have; asking others for it raises NotSimulatedError."""
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Columns:
-    """All numbers of an episode, one row a frame (T rows); images are read on their own.
+class Table:
+    """Numbers of an episode of T frames, and the images that the frames show.
 
-    A simulated episode has a fixed set, whose shapes and units are as in Observation and Action, and poses as position,
-    then quaternion xyzw. Any other has the features that its description names. Which image of a camera a frame holds
-    is known of both: in a simulation the one of its own number.
+    Attributes:
+        time_ns: (T,) stamps of the frames.
+        features: Feature -> (T, D) in its own dtype.
+        stamps: Feature -> (T,) stamps of the samples.
+        images: Camera -> (T,) number of the image that each frame shows, `NO_IMAGE` for none.
+        image_stamps: Camera -> (P,) stamps of its images.
     """
 
-    time_ns: NDArray[np.int64]  # (T,) stamps of the frames
-    joint_position: Array = field(default_factory=_nothing)  # (T, n_joints)
-    joint_velocity: Array = field(default_factory=_nothing)  # (T, n_joints)
-    joint_effort: Array = field(default_factory=_nothing)  # (T, n_joints)
-    gripper_width: Array = field(default_factory=_nothing)  # (T,)
-    base_from_tcp: Array = field(default_factory=_nothing)  # (T, 7)
-    object_poses: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7), world_from_object
-    contact_force: Array = field(default_factory=_nothing)  # (T,)
-    sensed: Mapping[str, Array] = field(default_factory=dict)  # quantity -> (T, D), of those of the format version
-    action_joint_target: Array = field(default_factory=_nothing)  # (T, n_arm)
-    action_gripper: Array = field(default_factory=_nothing)  # (T,)
-    action_base_from_tcp: Array = field(default_factory=_nothing)  # (T, 7)
-    command_joint_target: Array = field(default_factory=_nothing)  # (T, n_arm)
-    command_gripper: Array = field(default_factory=_nothing)  # (T,)
-    command_base_from_tcp: Array = field(default_factory=_nothing)  # (T, 7)
-    phase: tuple[str, ...] = ()  # T, or none where nobody states any
-    is_deliberate_miss: NDArray[np.bool_] = field(default_factory=_nothing)  # (T,)
-    world_from_camera: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7)
-    features: Mapping[str, NDArray[Any]] = field(default_factory=dict)  # feature -> (T, D) in its own dtype
-    stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # feature -> (T,) stamps of the samples
-    images: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (T,) number of the image held
-    image_stamps: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # camera -> (P,) stamps of its images
-
-    def __post_init__(self) -> None:
-        for name in [name for name, values in vars(self).items() if values is None]:
-            del vars(self)[name]
-
-    if not TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any:
-            if name in self.__dataclass_fields__:
-                raise NotSimulatedError(name)
-            return super().__getattribute__(name)  # the usual error
+    time_ns: NDArray[np.int64]
+    features: Mapping[str, NDArray[Any]]
+    stamps: Mapping[str, NDArray[np.int64]]
+    images: Mapping[str, NDArray[np.int64]]
+    image_stamps: Mapping[str, NDArray[np.int64]]
 
     @property
     def num_frames(self) -> int:
@@ -281,15 +251,47 @@ class Columns:
         return len(self.time_ns)
 
     def age_ns(self, feature: str) -> NDArray[np.int64]:
-        """(T,) how old each frame's sample of a feature is."""
+        """(T,) age of each frame's sample of a feature."""
         return self.time_ns - self.stamps[feature]
 
     def image_age_ns(self, camera: str) -> NDArray[np.int64]:
-        """(N,) how old the images are, of the N frames that hold one of this camera."""
+        """(N,) age of the image of each of the N frames that show one of this camera."""
         numbers = self.images[camera]
-        held = np.flatnonzero(numbers != NO_IMAGE)
-        ages: NDArray[np.int64] = self.time_ns[held] - self.image_stamps[camera][numbers[held]]
+        frames = np.flatnonzero(numbers != NO_IMAGE)
+        ages: NDArray[np.int64] = self.time_ns[frames] - self.image_stamps[camera][numbers[frames]]
         return ages
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory:
+    """Everything that demorec simulates in an episode of T frames, as it was computed.
+
+    Shapes and units of a row are those of `Observation` and `Action`. A pose is (7,): position, then quaternion xyzw.
+    """
+
+    time_ns: NDArray[np.int64]  # (T,)
+    joint_position: Array  # (T, n_joints)
+    joint_velocity: Array  # (T, n_joints)
+    joint_effort: Array  # (T, n_joints)
+    gripper_width: Array  # (T,)
+    base_from_tcp: Array  # (T, 7)
+    object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
+    contact_force: Array  # (T,)
+    sensed: Mapping[str, Array]  # quantity -> (T, D)
+    action_joint_target: Array  # (T, n_arm)
+    action_gripper: Array  # (T,)
+    action_base_from_tcp: Array  # (T, 7)
+    command_joint_target: Array  # (T, n_arm)
+    command_gripper: Array  # (T,)
+    command_base_from_tcp: Array  # (T, 7)
+    phase: tuple[str, ...]  # T
+    is_deliberate_miss: NDArray[np.bool_]  # (T,)
+    world_from_camera: Mapping[str, Array]  # name -> (T, 7)
+
+    @property
+    def num_frames(self) -> int:
+        """T."""
+        return len(self.time_ns)
 
 
 def frame_time_ns(frame_index: int, fps: int) -> int:

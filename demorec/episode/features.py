@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose, quat_multiply, quat_product, rotation_rows
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.scene import Goal, Scene
 from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.robots.robot import RobotSpec
@@ -253,7 +253,7 @@ def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
 
 
 def action_vectors(
-    columns: Columns,
+    trajectory: Trajectory,
     scene: Scene,
     kind: ActionKind,
     rows: NDArray[np.intp] | slice = slice(None),
@@ -274,34 +274,34 @@ def action_vectors(
       (`pose_from_delta`); noise is taken back as in `joint_increment`, the rotation vectors being added.
 
     Args:
-        columns: Of the whole episode.
+        trajectory: Of the whole episode.
         scene: Of the episode.
         kind: Which form.
         rows: Frames whose actions are wanted; increments are taken between these.
         dtype: Of the numbers.
     """
-    gripper = columns.action_gripper[rows]
+    gripper = trajectory.action_gripper[rows]
     if kind == "joint":
-        return _joined([columns.action_joint_target[rows], gripper], dtype)
+        return _joined([trajectory.action_joint_target[rows], gripper], dtype)
     if kind == "joint_increment":
-        targets, commands = columns.action_joint_target[rows], columns.command_joint_target[rows]
+        targets, commands = trajectory.action_joint_target[rows], trajectory.command_joint_target[rows]
         increments = targets - np.concatenate([np.array([scene.robot.joint_position]), targets[:-1]])
-        increments[1:] += _noise_share(columns.time_ns[rows]) * (targets[:-1] - commands[:-1])
+        increments[1:] += _noise_share(trajectory.time_ns[rows]) * (targets[:-1] - commands[:-1])
         return _joined([increments, gripper], dtype)
-    poses, executed = columns.action_base_from_tcp[rows], columns.command_base_from_tcp[rows]
+    poses, executed = trajectory.action_base_from_tcp[rows], trajectory.command_base_from_tcp[rows]
     if kind == "ee":
         return _joined([_continuous(poses), gripper], dtype)
-    before = np.concatenate([columns.base_from_tcp[:1], poses[:-1]])
+    before = np.concatenate([trajectory.base_from_tcp[:1], poses[:-1]])
     shifts, turns = poses[:, :3] - before[:, :3], _rotation_vectors(before[:, 3:], poses[:, 3:])
-    share = _noise_share(columns.time_ns[rows])
+    share = _noise_share(trajectory.time_ns[rows])
     shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
     turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
     return _joined([shifts, turns, gripper], dtype)
 
 
-def command_vectors(columns: Columns, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
+def command_vectors(trajectory: Trajectory, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
     """(T, D) float64, what the motors were sent: joint targets (rad), gripper opening (m)."""
-    return _joined([columns.command_joint_target[rows], columns.command_gripper[rows]], np.float64)
+    return _joined([trajectory.command_joint_target[rows], trajectory.command_gripper[rows]], np.float64)
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:

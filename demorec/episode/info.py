@@ -8,20 +8,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import NotSimulatedError
+from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
-from demorec.core.plain import PartValue
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 
 FORMAT_VERSION = 3
 """Format version of recordings, the only one that is read; versions 1 and 2 were never released."""
+
+NOT_SIMULATED = (
+    "This needs the scene of an episode that demorec simulated; this one was recorded by another robot or program"
+)
 
 Kept = Literal["", "h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
@@ -159,14 +162,13 @@ class EpisodeInfo:
         robot_name: Name of the robot.
         urdf: Its description as text, "" when unknown; that of a simulated robot is in the scene's models.
         fps: Nominal frames per second; the timestamps of the frames are exact.
-        features: Vectors that every frame has; a simulated episode has the fixed ones of `Columns` instead.
-        cameras: None to many; those of a simulation are its scene's.
+        features: Vectors that every frame has.
+        cameras: None to many.
         origin: How the episode came here; of a simulated one "" for a generated one, "replay of DIGEST", "render of
             DIGEST" for a derived one.
         versions: package -> version of the packages that wrote it; for a simulated one those that determine the bits
             (demorec, pybullet, numpy, numba, av), and digests of the user's own modules.
-        simulation: Scene, seed, task; None for an episode that demorec did not simulate. Its values can be read as
-            those of the episode (`info.scene`), which raises NotSimulatedError for other episodes.
+        simulation: Scene, seed, task; None for an episode that demorec did not simulate.
     """
 
     episode_index: int
@@ -181,38 +183,13 @@ class EpisodeInfo:
     versions: Mapping[str, str] = field(default_factory=dict)
     simulation: Simulation | None = None
 
-    root_seed = PartValue[int]("simulation", NotSimulatedError)
-    task = PartValue[str]("simulation", NotSimulatedError)
-    robot = PartValue[RobotSpec]("simulation", NotSimulatedError)
-    scene = PartValue[Scene]("simulation", NotSimulatedError)
-    physics_hz = PartValue[int]("simulation", NotSimulatedError)
-    cpu = PartValue[str]("simulation", NotSimulatedError)
-    behaviour = PartValue[Mapping[str, float]]("simulation", NotSimulatedError)
-    config = PartValue[Mapping[str, Any]]("simulation", NotSimulatedError)
-    config_digest = PartValue[str]("simulation", NotSimulatedError)
+    @property
+    def simulated(self) -> Simulation:
+        """The simulation, for code that needs one.
 
-    def with_simulation(self, **changes: Any) -> EpisodeInfo:
-        """The same episode with other values of its simulation; NotSimulatedError where it has none."""
+        Raises:
+            RecordingError: demorec did not simulate this episode.
+        """
         if self.simulation is None:
-            raise NotSimulatedError("simulation")
-        return replace(self, simulation=replace(self.simulation, **changes))
-
-    def __post_init__(self) -> None:
-        known: dict[str, Any] = {}
-        if self.simulation is None:
-            known["origin"] = self.origin or Origin()
-        else:
-            known["robot_name"] = self.simulation.robot.name
-            known["cameras"] = tuple(
-                Camera(
-                    name=camera.name,
-                    width=camera.width,
-                    height=camera.height,
-                    intrinsics=tuple(np.ravel(camera.intrinsics).tolist()),
-                    mount=camera.mount,
-                    mount_from_camera=camera.mount_from_camera,
-                )
-                for camera in self.simulation.scene.cameras
-            )
-        for name, value in known.items():
-            object.__setattr__(self, name, value)
+            raise RecordingError(NOT_SIMULATED)
+        return self.simulation

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.episode.episode import Columns, Observation
+from demorec.episode.episode import Observation, Trajectory
 from demorec.robots.robot import RobotSpec
 
 
@@ -34,15 +34,19 @@ class ObservationRows:
     sensed: Mapping[str, Array]
 
     @classmethod
-    def of_columns(cls, columns: Columns, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
+    def of_trajectory(cls, trajectory: Trajectory, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
         """Those of a recorded episode, or of some of its frames."""
-        sensed = {"joint_effort": columns.joint_effort, "contact_force": columns.contact_force, **columns.sensed}
+        sensed = {
+            "joint_effort": trajectory.joint_effort,
+            "contact_force": trajectory.contact_force,
+            **trajectory.sensed,
+        }
         return cls(
-            joint_position=columns.joint_position[rows],
-            joint_velocity=columns.joint_velocity[rows],
-            gripper_width=columns.gripper_width[rows],
-            base_from_tcp=columns.base_from_tcp[rows],
-            object_poses={name: poses[rows] for name, poses in columns.object_poses.items()},
+            joint_position=trajectory.joint_position[rows],
+            joint_velocity=trajectory.joint_velocity[rows],
+            gripper_width=trajectory.gripper_width[rows],
+            base_from_tcp=trajectory.base_from_tcp[rows],
+            object_poses={name: poses[rows] for name, poses in trajectory.object_poses.items()},
             sensed={name: values[rows] for name, values in sensed.items()},
         )
 
@@ -86,6 +90,7 @@ class Sensed:
         quantity: What observations and columns call it.
         meaning: In words, with units and coordinate frame.
         names: Of the D elements that datasets have: the first ones of the quantity.
+        units: Of these elements.
         plots: Of all D elements, in order.
         topic: Where its own messages are.
         components: Names of their elements, as tables of frames have them.
@@ -96,6 +101,7 @@ class Sensed:
     quantity: str
     meaning: str
     names: Callable[[RobotSpec], tuple[str, ...]]
+    units: Callable[[RobotSpec], tuple[str, ...]]
     plots: tuple[Plot, ...]
     topic: str = ""
     components: Callable[[RobotSpec], tuple[str, ...]] = lambda robot: ()
@@ -112,12 +118,14 @@ SENSED: Mapping[str, Sensed] = {
         quantity="joint_effort",
         meaning="motor torques of the arm's joints (N m)",
         names=lambda robot: tuple(f"{joint}.effort" for joint in robot.arm_joints),
+        units=lambda robot: ("N m",) * len(robot.arm_joints),
         plots=(Plot(curves="effort", title="joint effort (N m)"),),
     ),
     "observation.contact_force": Sensed(
         quantity="contact_force",
         meaning="sum of the normal forces on the fingers (N)",
         names=lambda robot: ("gripper.force",),
+        units=lambda robot: ("N",),
         plots=(Plot(curves="force", title="contact force (N)", names=("contact force",)),),
     ),
     # As a force-torque sensor at the hand's mount feels it: about the origin of the hand's link, nothing taken off; the
@@ -126,6 +134,7 @@ SENSED: Mapping[str, Sensed] = {
         quantity="wrench",
         meaning="force (N) and torque (N m) with which the arm holds the hand, along the axes of the hand's link",
         names=lambda robot: tuple(f"hand.{kind}.{axis}" for kind in ("force", "torque") for axis in ("x", "y", "z")),
+        units=lambda robot: ("N", "N", "N", "N m", "N m", "N m"),
         plots=(
             Plot(curves="hand force", title="force on the hand (N)", names=("x", "y", "z")),
             Plot(curves="hand torque", title="torque on the hand (N m)", names=("x", "y", "z")),

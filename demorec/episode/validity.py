@@ -16,9 +16,10 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Pose
 from demorec.core.plain import from_json
-from demorec.episode.info import Camera, EpisodeInfo, Feature
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
 from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Scene, SceneCamera, Shape
+from demorec.episode.simulated import simulated_cameras, simulated_features
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
 
@@ -48,17 +49,30 @@ def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
     return info
 
 
-def _episode(info: EpisodeInfo) -> Iterator[str]:
+def _episode(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
+    robot, scene = simulation.robot, simulation.scene
     yield from _within("episode_index", info.episode_index, 0, 2**63 - 1)
     yield from _within("attempt", info.attempt, 0, 2**31)
-    yield from _within("root_seed", info.root_seed, 0, 2**63 - 1)
+    yield from _within("root_seed", simulation.root_seed, 0, 2**63 - 1)
     yield from _within("fps", info.fps, 1, 10_000)
-    yield from _within("physics_hz", info.physics_hz, 1, 100_000)
-    yield from _robot(info.robot)
-    yield from _scene(info.scene)
-    placed = len(info.scene.robot.joint_position)
-    if placed != len(info.robot.arm_joints):
-        yield f"the robot has {len(info.robot.arm_joints)} arm joints, the scene places {placed}"
+    yield from _within("physics_hz", simulation.physics_hz, 1, 100_000)
+    yield from _robot(robot)
+    yield from _scene(scene)
+    placed = len(scene.robot.joint_position)
+    if placed != len(robot.arm_joints):
+        yield f"the robot has {len(robot.arm_joints)} arm joints, the scene places {placed}"
+
+
+def _contradictions(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
+    """What the description of a possible simulation says twice, and differently."""
+    if info.robot_name != simulation.robot.name:
+        yield f"the robot is {info.robot_name!r} and {simulation.robot.name!r}"
+    known = simulated_features(simulation)
+    if unknown := [feature.name for feature in info.features if feature not in known]:
+        yield f"the features {', '.join(unknown)} are not those of its robot"
+    yield from _unique("features", [feature.name for feature in info.features])
+    if info.cameras != simulated_cameras(simulation.scene):
+        yield "the cameras are not those of the scene"
 
 
 def _robot(robot: RobotSpec) -> Iterator[str]:
@@ -194,7 +208,9 @@ _MAX_TEXT = 10_000
 
 def find_problems(info: EpisodeInfo) -> list[str]:
     """Everything that makes a description impossible, in words; empty when nothing does."""
-    return list(_external(info) if info.simulation is None else _episode(info))
+    if info.simulation is None:
+        return list(_external(info))
+    return list(_episode(info, info.simulation)) or list(_contradictions(info, info.simulation))
 
 
 def _external(info: EpisodeInfo) -> Iterator[str]:

@@ -140,7 +140,7 @@ def _read_recording(source: Path) -> Original:
         raise ConfigError(f"The recording was recorded by another robot or program, not generated: {source}")
     if info.origin:
         raise ConfigError(f"The recording is a {info.origin}, which generate-dataset did not make: {source}")
-    config = parse_config(dict(info.config), GenerateConfig, source=str(source))
+    config = parse_config(dict(info.simulated.config), GenerateConfig, source=str(source))
     config.validate()
     return Original(
         source=source,

@@ -11,13 +11,13 @@ Generating, replaying and the gymnasium environment, through which policies are 
 is a pure function of its plan: whatever ran before in the same world, on any worker, the bits are equal.
 """
 
-from demorec.loop.prepare import Episode, SimulatorCache, load_task, make_renderer, make_world, prepare
+from demorec.loop.prepare import PreparedEpisode, SimulatorCache, load_task, make_renderer, make_world, prepare
 from demorec.loop.session import Agent, ScriptAgent, Session
 from demorec.tasks.script import Step
 
 __all__ = [
     "Agent",
-    "Episode",
+    "PreparedEpisode",
     "ScriptAgent",
     "Session",
     "SimulatorCache",

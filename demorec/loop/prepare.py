@@ -18,6 +18,7 @@ from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_rob
 from demorec.episode.camera_error import error_values, true_cameras
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Scene, SceneCamera
+from demorec.episode.simulated import simulated_info
 from demorec.episode.variation import Ranges, resolve
 from demorec.objects.folder import load_shelf
 from demorec.render import Renderer
@@ -36,7 +37,7 @@ MAX_LAYOUTS = 10
 
 
 @dataclass(frozen=True, kw_only=True)
-class Episode:
+class PreparedEpisode:
     """One attempt at one episode, ready to run.
 
     Attributes:
@@ -44,7 +45,7 @@ class Episode:
         info: What is recorded about it.
         task: The task.
         behaviour: How the expert does it.
-        cameras: Where the cameras really are: `info.scene.cameras` holds the same with the calibration error.
+        cameras: Where the cameras really are: `info.simulated.scene.cameras` holds the same with the calibration error.
         true_from_recorded: Camera name -> calibration error, of the cameras that have one.
     """
 
@@ -89,7 +90,7 @@ def load_task(config: GenerateConfig) -> type[Task]:
     return task
 
 
-def prepare(plan: EpisodePlan) -> Episode:
+def prepare(plan: EpisodePlan) -> PreparedEpisode:
     """Draw an episode's scene, words and behaviour; a pure function of the plan, without a simulator.
 
     Imports the user's own modules that the plan's config names: one that was read from a file must have passed
@@ -113,25 +114,26 @@ def prepare(plan: EpisodePlan) -> Episode:
     scene = replace(scene, cameras=tuple(moved_camera(camera, errors[camera.name]) for camera in cameras))
     drawn = behaviour.as_mapping() | error_values(errors)
     cameras, errors = true_cameras(scene.cameras, drawn)
-    info = EpisodeInfo(
+    simulation = Simulation(
+        root_seed=config.seed,
+        task=config.task,
+        robot=robot,
+        scene=scene,
+        physics_hz=config.physics_hz,
+        cpu=cpu_type(),
+        behaviour=drawn,
+        config=to_plain(config),
+        config_digest=digest(config),
+    )
+    info = simulated_info(
+        simulation,
         episode_index=plan.episode_index,
         attempt=plan.attempt,
         instruction=task.instruction(scene, _rng(plan, "expert")),
         fps=config.fps,
         versions=deciding_versions(config),
-        simulation=Simulation(
-            root_seed=config.seed,
-            task=config.task,
-            robot=robot,
-            scene=scene,
-            physics_hz=config.physics_hz,
-            cpu=cpu_type(),
-            behaviour=drawn,
-            config=to_plain(config),
-            config_digest=digest(config),
-        ),
     )
-    return Episode(
+    return PreparedEpisode(
         plan=plan,
         info=info,
         task=task,
@@ -192,7 +194,7 @@ def _sampler(plan: EpisodePlan, ranges: Ranges, task: Task) -> Sampler:
 
 def make_world(info: EpisodeInfo) -> World:
     """An empty world for episodes like this one (same robot, rates and joint sampling)."""
-    return World(info.robot, fps=info.fps, sample_joints=info.config.get("joint_rate") == "physics")
+    return World(info.simulated.robot, fps=info.fps, sample_joints=info.simulated.config.get("joint_rate") == "physics")
 
 
 def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
@@ -202,9 +204,9 @@ def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
         ConfigError: An unknown renderer.
         MissingDependencyError, RenderError: It cannot work on this machine.
     """
-    if not info.scene.cameras:
+    if not info.simulated.scene.cameras:
         return nullcontext(None)
-    return RENDERERS.load(str(info.config.get("renderer", "raster")))()
+    return RENDERERS.load(str(info.simulated.config.get("renderer", "raster")))()
 
 
 class SimulatorCache:
@@ -227,12 +229,12 @@ class SimulatorCache:
             ConfigError: An unknown renderer.
             MissingDependencyError, RenderError: It cannot work on this machine.
         """
-        key = (info.robot, info.fps, info.config.get("joint_rate"))
+        key = (info.simulated.robot, info.fps, info.simulated.config.get("joint_rate"))
         if self._world is None or key != self._key:
             self.close()
             self._world, self._key = make_world(info), key
-        name = str(info.config.get("renderer", "raster"))
-        renderer = self._renderers.of(name) if info.scene.cameras else None
+        name = str(info.simulated.config.get("renderer", "raster"))
+        renderer = self._renderers.of(name) if info.simulated.scene.cameras else None
         return self._world, renderer
 
     def close(self) -> None:

@@ -25,7 +25,7 @@ from demorec.episode.episode import (
 )
 from demorec.episode.features import NOISE_DECAY
 from demorec.episode.scene import Scene
-from demorec.loop.prepare import Episode
+from demorec.loop.prepare import PreparedEpisode
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.sim.world import World
@@ -88,7 +88,7 @@ class Session:
 
     @classmethod
     def of_episode(
-        cls, world: World, episode: Episode, renderer: Renderer | None = None, *, only_color: bool = False
+        cls, world: World, episode: PreparedEpisode, renderer: Renderer | None = None, *, only_color: bool = False
     ) -> Self:
         """A session of a prepared episode with its cameras and time limit; without a renderer it has no images.
 
@@ -106,7 +106,7 @@ class Session:
                 antialias=config.antialias,
             )
         max_frames = math.floor(config.max_episode_seconds * episode.info.fps)
-        return cls(world, episode.info.scene, episode.task, painter=painter, max_frames=max_frames)
+        return cls(world, episode.info.simulated.scene, episode.task, painter=painter, max_frames=max_frames)
 
     @property
     def observation(self) -> Observation:
@@ -233,7 +233,7 @@ class ActionNoise:
 class ScriptAgent:
     """The expert, who follows the task's script; exploration noise is on the commands, never on the labels."""
 
-    def __init__(self, episode: Episode) -> None:
+    def __init__(self, episode: PreparedEpisode) -> None:
         self._episode = episode
         self._expert: Expert | None = None
         self._gave_up: GaveUp | None = None

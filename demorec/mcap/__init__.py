@@ -1,7 +1,7 @@
 """Recordings: one MCAP file an episode, readable by ROS 2, Rerun and Foxglove, and the source of everything after.
 
 with open_recording(path) as recording:
-    recording.columns()            # all numbers
+    recording.table()              # all features
     recording.images("front")      # decoded images
 """
 

@@ -60,9 +60,9 @@ def latched_messages(info: EpisodeInfo, tree: FrameTree | None, *, has_labels: b
     """
     if tree is not None:
         yield TF_STATIC, messages.TRANSFORMS, messages.transforms(tree.static)
-        urdf = info.urdf or robot_description(info.robot.urdf, info.scene.robot.scale)
+        urdf = info.urdf or robot_description(info.simulated.robot.urdf, info.simulated.scene.robot.scale)
         yield description_topic(), messages.STRING, encode(messages.STRING, urdf)
-    for body in () if info.simulation is None else info.scene.bodies:
+    for body in () if info.simulation is None else info.simulated.scene.bodies:
         if max(body.shape.extents) <= _BACKDROP_METRES:
             yield description_topic(body.name), messages.STRING, encode(messages.STRING, body_description(body))
     for camera in info.cameras:

@@ -13,9 +13,10 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, without_path
 from demorec.core.files import Closing
-from demorec.core.plain import to_json, to_plain
+from demorec.core.plain import to_json
 from demorec.episode.episode import Outcome, frame_time_ns
 from demorec.episode.info import DEPTH_UNITS, EpisodeInfo
+from demorec.episode.simulated import description_of, has_failed
 from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
 from demorec.mcap.channels import GRIPPER, camera_topic, description_topic, video_topic
@@ -132,19 +133,14 @@ class EpisodeFile(Closing):
 
     def _digest_of_description(self) -> hashlib._Hash:
         """That of the metadata, to go on with: not of the versions and the CPU that made them."""
-        info = self.info if self.info.simulation is None else self.info.with_simulation(cpu="")
-        described = to_plain(info)
-        del described["versions"]
-        result = hashlib.sha256(json.dumps(described, sort_keys=True).encode())
+        result = hashlib.sha256(json.dumps(description_of(self.info), sort_keys=True).encode())
         result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
         return result
 
     @property
     def has_failed(self) -> bool:
         """Whether somebody said so, or a crash cut off an episode that demorec simulated."""
-        if self.outcome is None:
-            return self.info.simulation is not None
-        return self.outcome.success is False
+        return has_failed(self.info, self.outcome)
 
     @property
     def success(self) -> bool | None:

@@ -26,7 +26,7 @@ from demorec.robots.urdf import Urdf
 
 def check_joint_names(info: EpisodeInfo) -> None:
     """Raise RecordingError unless the robot's joints are different ones that its URDF has."""
-    robot = info.robot
+    robot = info.simulated.robot
     known = {joint.name for joint in Urdf.load(asset_path(robot.urdf)).joints if joint.kind != "fixed"}
     if wrong := [name for name in robot.joint_names if name not in known]:
         raise RecordingError(
@@ -41,10 +41,10 @@ class FrameCheck:
     """Checks frame after frame of one episode; takes microseconds, since it is part of every recording."""
 
     def __init__(self, info: EpisodeInfo) -> None:
-        self._joints, self._arm = (len(info.robot.joint_names),), (len(info.robot.arm_joints),)
-        self._objects = {body.name for body in info.scene.movable}
-        self._cameras = {camera.name for camera in info.scene.cameras}
-        self._sensed = {name: (len(row.names(info.robot)),) for name, row in STREAMS.items()}
+        self._joints, self._arm = (len(info.simulated.robot.joint_names),), (len(info.simulated.robot.arm_joints),)
+        self._objects = {body.name for body in info.simulated.scene.movable}
+        self._cameras = {camera.name for camera in info.simulated.scene.cameras}
+        self._sensed = {name: (len(row.names(info.simulated.robot)),) for name, row in STREAMS.items()}
 
     def __call__(self, frame: Frame) -> None:
         """Raise RecordingError for what is wrong with a frame; images are looked at when they are encoded."""

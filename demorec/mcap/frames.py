@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import NO_IMAGE, Action, Columns, Event, Frame, JointSample, Observation
+from demorec.episode.episode import NO_IMAGE, Action, Event, Frame, JointSample, Observation, Table, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import channels, messages
 from demorec.mcap.container import Container, damage_as_recording_error
@@ -31,16 +31,19 @@ def frame_times(num_frames: int, fps: int) -> NDArray[np.int64]:
     return (np.arange(num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
 
 
-def read_columns(
+def read_numbers(
     container: Container, info: EpisodeInfo, num_frames: int, image_topics: Mapping[str, str]
-) -> tuple[Columns, Said]:
-    """The columns of an episode, and its events, which lie among the numbers in the file.
+) -> tuple[Table | Trajectory, Said]:
+    """Read the numbers of an episode, and its events, which lie among the numbers in the file.
 
     Args:
         container: The open file.
         info: Of the episode.
         num_frames: T.
         image_topics: Recorded camera -> topic of its images, in the order of `info`.
+
+    Returns:
+        A trajectory of a simulated episode, the table of any other; and the messages of the events.
 
     Raises:
         RecordingError: A stream is damaged, not at the times of the frames, or a frame holds an image that is none.
@@ -70,27 +73,25 @@ def read_columns(
             misses = _held(said[channels.DELIBERATE_MISS], messages.read_boolean, time_ns, False)
             columns["is_deliberate_miss"] = np.array(misses, dtype=np.bool_)
     if is_simulated:
+        columns |= {name: columns.get(name, {}) for name in ("sensed", "object_poses", "world_from_camera")}
         columns["world_from_camera"] = {name: columns["world_from_camera"][name] for name in image_topics}
-        columns["images"] = dict.fromkeys(image_topics, np.arange(num_frames, dtype=np.int64))
-        columns["image_stamps"] = dict.fromkeys(image_topics, time_ns)
-    else:
-        columns["image_stamps"] = _stamps(container, image_topics)
-        for name, numbers in columns["images"].items():
-            count = len(columns["image_stamps"][name])
-            if len(numbers) and not NO_IMAGE <= int(numbers.min()) <= int(numbers.max()) < count:
-                raise RecordingError(
-                    f"A frame holds an image of the camera {name!r} that is none of its {count}: {container.path}"
-                )
-    return Columns(time_ns=time_ns, **columns), said.get(channels.EVENTS, [])
+        return Trajectory(time_ns=time_ns, **columns), said[channels.EVENTS]
+    columns |= {name: columns.get(name, {}) for name in ("features", "stamps", "images")}
+    columns["image_stamps"] = _stamps(container, image_topics)
+    for name, numbers in columns["images"].items():
+        count = len(columns["image_stamps"][name])
+        if len(numbers) and not NO_IMAGE <= int(numbers.min()) <= int(numbers.max()) < count:
+            raise RecordingError(
+                f"A frame holds an image of the camera {name!r} that is none of its {count}: {container.path}"
+            )
+    return Table(time_ns=time_ns, **columns), []
 
 
 def _merged(
     streams: tuple[FrameStream, ...], times: _Parts, values: _Parts, time_ns: NDArray[np.int64], container: Container
 ) -> dict[str, Any]:
-    """What messages become, as arguments of `Columns`; RecordingError unless each stream has one at each frame."""
-    merged: dict[str, Any] = {
-        name: {} for name in ("sensed", "object_poses", "world_from_camera", "features", "stamps", "images")
-    }
+    """Convert messages to arguments of `Trajectory` or `Table`; RecordingError unless each stream has one a frame."""
+    merged: dict[str, Any] = {}
     for stream in streams:
         found = np.concatenate(times[stream.topic])
         if not np.array_equal(found, time_ns):
@@ -99,7 +100,7 @@ def _merged(
                 f"frames: {container.path}"
             )
         for name, rows in stream.columns(np.concatenate(values[stream.topic])).items():
-            merged[name] = merged[name] | rows if isinstance(rows, Mapping) else rows
+            merged[name] = merged.get(name, {}) | rows if isinstance(rows, Mapping) else rows
     return merged
 
 
@@ -120,7 +121,7 @@ def _stamps(container: Container, topics: Mapping[str, str]) -> dict[str, NDArra
     return {name: np.concatenate(times) for name, times in found.items()}
 
 
-# ------------------------------------------------------------------------------------------------ columns as frames
+# -------------------------------------------------------------------------------------------- trajectories as frames
 
 
 def pose_of(row: Array) -> Pose:
@@ -128,56 +129,56 @@ def pose_of(row: Array) -> Pose:
     return Pose(position=row[:3], quat_xyzw=row[3:])
 
 
-def observation_at(columns: Columns, frame: int) -> Observation:
+def observation_at(trajectory: Trajectory, frame: int) -> Observation:
     """The observation of a frame, bit-exact."""
     return Observation(
-        joint_position=columns.joint_position[frame].copy(),
-        joint_velocity=columns.joint_velocity[frame].copy(),
-        joint_effort=columns.joint_effort[frame].copy(),
-        gripper_width=float(columns.gripper_width[frame]),
-        base_from_tcp=pose_of(columns.base_from_tcp[frame]),
-        object_poses={name: pose_of(rows[frame]) for name, rows in columns.object_poses.items()},
-        contact_force=float(columns.contact_force[frame]),
-        sensed={name: values[frame].copy() for name, values in columns.sensed.items()},
+        joint_position=trajectory.joint_position[frame].copy(),
+        joint_velocity=trajectory.joint_velocity[frame].copy(),
+        joint_effort=trajectory.joint_effort[frame].copy(),
+        gripper_width=float(trajectory.gripper_width[frame]),
+        base_from_tcp=pose_of(trajectory.base_from_tcp[frame]),
+        object_poses={name: pose_of(rows[frame]) for name, rows in trajectory.object_poses.items()},
+        contact_force=float(trajectory.contact_force[frame]),
+        sensed={name: values[frame].copy() for name, values in trajectory.sensed.items()},
     )
 
 
-def action_at(columns: Columns, frame: int, kind: Literal["action", "command"]) -> Action:
+def action_at(trajectory: Trajectory, frame: int, kind: Literal["action", "command"]) -> Action:
     """What the expert wanted at a frame, or the command that was sent to the motors."""
     return Action(
-        joint_target=getattr(columns, f"{kind}_joint_target")[frame].copy(),
-        gripper_target=float(getattr(columns, f"{kind}_gripper")[frame]),
-        base_from_tcp_target=pose_of(getattr(columns, f"{kind}_base_from_tcp")[frame]),
+        joint_target=getattr(trajectory, f"{kind}_joint_target")[frame].copy(),
+        gripper_target=float(getattr(trajectory, f"{kind}_gripper")[frame]),
+        base_from_tcp_target=pose_of(getattr(trajectory, f"{kind}_base_from_tcp")[frame]),
     )
 
 
 def frames_of(
-    columns: Columns, events: Iterable[tuple[int, Event]], joint_samples: Iterable[JointSample]
+    trajectory: Trajectory, events: Iterable[tuple[int, Event]], joint_samples: Iterable[JointSample]
 ) -> Iterator[Frame]:
     """Every frame without its images, bit-exact: numbers, phase, events, and the joint samples before it.
 
     Args:
-        columns: Of a recording.
+        trajectory: Of a recording.
         events: Its events, each with its time_ns.
         joint_samples: Its joint states, those of the frames too.
     """
-    times = columns.time_ns.tolist()
+    times = trajectory.time_ns.tolist()
     found: dict[int, list[Event]] = {}
     for time_ns, event in events:
-        frame = max(int(np.searchsorted(columns.time_ns, time_ns, side="right")) - 1, 0)
+        frame = max(int(np.searchsorted(trajectory.time_ns, time_ns, side="right")) - 1, 0)
         found.setdefault(frame, []).append(event)
     samples = _samples_before_frames(joint_samples, times)
     for index, time_ns in enumerate(times):
         yield Frame(
             frame_index=index,
             time_ns=time_ns,
-            observation=observation_at(columns, index),
-            action=action_at(columns, index, "action"),
-            command=action_at(columns, index, "command"),
-            phase=columns.phase[index],
+            observation=observation_at(trajectory, index),
+            action=action_at(trajectory, index, "action"),
+            command=action_at(trajectory, index, "command"),
+            phase=trajectory.phase[index],
             events=tuple(found.get(index, ())),
             joint_samples=samples.get(index, ()),
-            is_deliberate_miss=bool(columns.is_deliberate_miss[index]),
+            is_deliberate_miss=bool(trajectory.is_deliberate_miss[index]),
         )
 
 

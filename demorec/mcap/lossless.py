@@ -179,11 +179,13 @@ def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:
     PyBullet does: depth first, in the order of the URDF's joints.
     """
     yield BACKGROUND, "background"
-    fixed = [body.name for body in info.scene.fixed]
-    for index, name in enumerate([*fixed, info.robot.name, *(body.name for body in info.scene.movable)]):
+    fixed = [body.name for body in info.simulated.scene.fixed]
+    for index, name in enumerate(
+        [*fixed, info.simulated.robot.name, *(body.name for body in info.simulated.scene.movable)]
+    ):
         if index != len(fixed):
             yield index, name
             continue
-        urdf = Urdf.load(asset_path(info.robot.urdf))
+        urdf = Urdf.load(asset_path(info.simulated.robot.urdf))
         for link_index, link in enumerate([urdf.root, *(joint.child for joint in urdf.depth_first())], start=-1):
             yield index + ((link_index + 1) << _LINK_SHIFT), f"{name}/{link}"

@@ -46,7 +46,7 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
     """
     about = {"instruction": info.instruction, "robot": info.robot_name, "episode_index": str(info.episode_index)}
     if info.simulation is not None:
-        about |= {"task": info.task, "attempt": str(info.attempt), "root_seed": str(info.root_seed)}
+        about |= {"task": info.simulated.task, "attempt": str(info.attempt), "root_seed": str(info.simulated.root_seed)}
     return sealed(
         {
             **about,

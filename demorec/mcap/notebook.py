@@ -14,10 +14,12 @@ from PIL import Image
 
 from demorec.core.errors import MissingDependencyError
 from demorec.core.text import printable
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Table, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import STREAMS
+from demorec.episode.simulated import simulation_facts
 from demorec.mcap.episode_file import EpisodeFile
+from demorec.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -47,7 +49,7 @@ def page_of(recording: EpisodeFile, images: Mapping[str, Iterable[NDArray[np.uin
 def _facts(recording: EpisodeFile) -> Iterator[tuple[str, str]]:
     info, outcome = recording.info, recording.outcome
     yield "", f"{recording.num_frames} frames ({recording.num_frames / info.fps:.1f} s at {info.fps} Hz)"
-    task = info.instruction if info.simulation is None else info.task
+    task = simulation_facts(info).get("task", info.instruction)
     yield "task", f"{task} with {info.robot_name}"
     yield "episode", f"{info.episode_index}, attempt {info.attempt}"
     if outcome is None:
@@ -67,38 +69,39 @@ def _image(pixels: NDArray[np.uint8]) -> str:
     return f"<img style='display: inline' src='data:image/jpeg;base64,{data}'>"
 
 
-def table_of(info: EpisodeInfo, columns: Columns) -> pd.DataFrame:
+def table_of(info: EpisodeInfo, numbers: Table | Trajectory) -> pd.DataFrame:
     """The table of `Recording.to_pandas`."""
     try:
         import pandas as pd
     except ImportError as error:
         raise MissingDependencyError("A table of the frames", "pandas", "pip install pandas") from error
-    table: dict[str, Any] = {"time_ns": columns.time_ns}
-    for feature in info.features:
-        table |= _components(feature.name, columns.features[feature.name], feature.names)
-    if info.simulation is not None:
-        table |= _simulated_table(info, columns)
-    return pd.DataFrame(table, index=pd.RangeIndex(columns.num_frames, name="frame_index"))
+    table: dict[str, Any] = {"time_ns": numbers.time_ns}
+    if isinstance(numbers, Trajectory):
+        table |= _trajectory_columns(info.simulated.robot, numbers)
+    else:
+        for feature in info.features:
+            table |= _components(feature.name, numbers.features[feature.name], feature.names)
+    return pd.DataFrame(table, index=pd.RangeIndex(numbers.num_frames, name="frame_index"))
 
 
-def _simulated_table(info: EpisodeInfo, columns: Columns) -> dict[str, Any]:
-    table: dict[str, Any] = {"phase": columns.phase}
-    joints, arm = info.robot.joint_names, info.robot.arm_joints
+def _trajectory_columns(robot: RobotSpec, trajectory: Trajectory) -> dict[str, Any]:
+    table: dict[str, Any] = {"phase": trajectory.phase}
+    joints, arm = robot.joint_names, robot.arm_joints
     for name in ("joint_position", "joint_velocity", "joint_effort"):
-        table |= _components(name, getattr(columns, name), joints)
-    table |= {"gripper_width": columns.gripper_width, "contact_force": columns.contact_force}
-    for name, values in columns.sensed.items():
-        table |= _components(name, values, STREAMS[name].components(info.robot))
-    table |= _components("base_from_tcp", columns.base_from_tcp, _POSE)
+        table |= _components(name, getattr(trajectory, name), joints)
+    table |= {"gripper_width": trajectory.gripper_width, "contact_force": trajectory.contact_force}
+    for name, values in trajectory.sensed.items():
+        table |= _components(name, values, STREAMS[name].components(robot))
+    table |= _components("base_from_tcp", trajectory.base_from_tcp, _POSE)
     for kind in ("action", "command"):
-        table |= _components(f"{kind}_joint_target", getattr(columns, f"{kind}_joint_target"), arm)
-        table[f"{kind}_gripper"] = getattr(columns, f"{kind}_gripper")
-        table |= _components(f"{kind}_base_from_tcp", getattr(columns, f"{kind}_base_from_tcp"), _POSE)
+        table |= _components(f"{kind}_joint_target", getattr(trajectory, f"{kind}_joint_target"), arm)
+        table[f"{kind}_gripper"] = getattr(trajectory, f"{kind}_gripper")
+        table |= _components(f"{kind}_base_from_tcp", getattr(trajectory, f"{kind}_base_from_tcp"), _POSE)
     for group in ("object_poses", "world_from_camera"):
-        poses: Mapping[str, NDArray[np.float64]] = getattr(columns, group)
+        poses: Mapping[str, NDArray[np.float64]] = getattr(trajectory, group)
         for name, rows in poses.items():
             table |= _components(f"{group}.{name}", rows, _POSE)
-    return {**table, "is_deliberate_miss": columns.is_deliberate_miss}
+    return {**table, "is_deliberate_miss": trajectory.is_deliberate_miss}
 
 
 def _components(name: str, rows: NDArray[np.float64], parts: Sequence[str]) -> dict[str, NDArray[np.float64]]:

@@ -13,14 +13,16 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import NotSimulatedError, RecordingError
+from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json
-from demorec.episode.episode import NO_IMAGE, CameraImages, Columns, Event, Frame, JointSample
+from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointSample, Table, Trajectory
+from demorec.episode.info import NOT_SIMULATED
+from demorec.episode.simulated import simulated_table
 from demorec.mcap import channels, messages, notebook
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.frames import Said, frame_times, frames_of, pose_of, read_columns
+from demorec.mcap.frames import Said, frame_times, frames_of, pose_of, read_numbers
 from demorec.mcap.lossless import LabelDecoder, from_labels
 from demorec.mcap.streams import SUBTASK, frame_streams
 from demorec.mcap.video import Rgb, is_keyframe
@@ -34,8 +36,8 @@ class Recording(EpisodeFile):
     """Context manager over one recording, and the sequence of its frames; one chunk is in memory at a time.
 
     `for frame in recording` gives numbers and images together, `recording[120]`, `recording[-1]` and
-    `recording[::30]` any of them; `columns` gives all numbers at once, which is much faster where images are not
-    needed. Frames are those of a simulation: asking another episode for them raises NotSimulatedError.
+    `recording[::30]` any of them; `table` and `trajectory` give all numbers at once, which is much faster
+    where images are not needed. Frames are those of a simulation: other episodes have a `table` only.
 
     Attributes:
         path: Of the file.
@@ -46,30 +48,54 @@ class Recording(EpisodeFile):
 
     Raises:
         RecordingError: No recording, cut off, damaged, or of another format version; so do all methods.
-        NotSimulatedError: A method was asked for what only a simulated episode has.
     """
 
-    _said: Said | None = None
-    """Messages of all events, once `columns` has come by them: they lie among the numbers in the file."""
-
-    def columns(self) -> Columns:
-        """All numbers, one row a frame, bit-exact as they were written, and which images the frames hold."""
-        return self._columns
+    def table(self) -> Table:
+        """Read the features of every frame, and which images the frames show."""
+        return self._table
 
     @cached_property
-    def _columns(self) -> Columns:
+    def _table(self) -> Table:
+        numbers = self._numbers
+        return simulated_table(numbers, self.info) if isinstance(numbers, Trajectory) else numbers
+
+    def trajectory(self) -> Trajectory:
+        """Read all that was simulated, one row a frame, bit-exact as it was written.
+
+        Raises:
+            RecordingError: demorec did not simulate this episode.
+        """
+        if not isinstance(self._numbers, Trajectory):
+            raise RecordingError(f"{NOT_SIMULATED}: {self.path}")
+        return self._numbers
+
+    @property
+    def time_ns(self) -> NDArray[np.int64]:
+        """(T,) stamps of the frames."""
+        return self._numbers.time_ns
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """T phases of the motion; empty where none are stated."""
+        return self._numbers.phase if isinstance(self._numbers, Trajectory) else ()
+
+    @property
+    def _numbers(self) -> Table | Trajectory:
+        return self._numbers_and_events[0]
+
+    @cached_property
+    def _numbers_and_events(self) -> tuple[Table | Trajectory, Said]:
         """Read once: an export and a check look at them from several sides."""
         topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
-        columns, self._said = read_columns(self._container, self.info, self.num_frames, topics)
-        return columns
+        return read_numbers(self._container, self.info, self.num_frames, topics)
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
         """(frame, what is begun there), in order, as the source states it; empty where nobody said any."""
         found = []
         for time_ns, text in self._read(SUBTASK, messages.read_string):
-            frame = int(np.searchsorted(self._columns.time_ns, time_ns))
-            if frame == self.num_frames or self._columns.time_ns[frame] != time_ns:
+            frame = int(np.searchsorted(self.time_ns, time_ns))
+            if frame == self.num_frames or self.time_ns[frame] != time_ns:
                 raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
             found.append((frame, text))
         return tuple(found)
@@ -87,16 +113,21 @@ class Recording(EpisodeFile):
         raise RecordingError(f"The recording has no description on {topic}: {self.path}")
 
     def joint_samples(self) -> Iterator[JointSample]:
-        """Every recorded joint state in order of time: the frames' own and those between them."""
-        assert self.info.robot, "else NotSimulatedError"
+        """Every recorded joint state of a simulation in order of time: the frames' own and those between them."""
+        if self.info.simulation is None:
+            return
         stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
         read = self._read(channels.JOINT_STATES, lambda data: stream.layout.decode([data]).reshape(3, -1))
         for time_ns, (position, velocity, effort) in read:
             yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
 
     def events(self) -> Iterator[tuple[int, Event]]:
-        """(time_ns, event) in order of time; changes of phase are in `columns().phase`."""
-        for time_ns, data in self._read(channels.EVENTS, bytes) if self._said is None else self._said:
+        """(time_ns, event) in order of time; changes of phase are in `phases`."""
+        if self.info.simulation is None:
+            return
+        # They lie among the numbers, with which they may have been read already.
+        is_read = "_numbers_and_events" in vars(self)
+        for time_ns, data in self._numbers_and_events[1] if is_read else self._read(channels.EVENTS, bytes):
             with damage_as_recording_error(self.path):
                 event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:
@@ -141,7 +172,7 @@ class Recording(EpisodeFile):
     def _shown(self, camera: str) -> NDArray[np.int64]:
         """(T,) number of the image of a camera that each frame holds."""
         self._camera(camera)
-        return self.columns().images[camera] if self.info.simulation is None else np.arange(self.num_frames)
+        return np.arange(self.num_frames) if isinstance(self._numbers, Trajectory) else self._numbers.images[camera]
 
     def image(self, camera: str, frame: int) -> Rgb | None:
         """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
@@ -169,7 +200,7 @@ class Recording(EpisodeFile):
     def to_pandas(self) -> pd.DataFrame:
         """All numbers as a table, one row a frame, bit-exact float64; the index is `frame_index`.
 
-        Columns are named as in `demorec.episode.episode.Columns`, vectors with their component:
+        Columns are named as in `demorec.episode.episode.Trajectory`, vectors with their component:
         `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
         `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.red_cube.z` (m, world frame),
         `phase`. `time_ns` is simulated time since the episode's start. Of an external episode there are the stamps of
@@ -178,14 +209,14 @@ class Recording(EpisodeFile):
         Raises:
             MissingDependencyError: pandas is not installed.
         """
-        return notebook.table_of(self.info, self.columns())
+        return notebook.table_of(self.info, self._numbers)
 
     def __len__(self) -> int:
         return self.num_frames
 
     def __iter__(self) -> Iterator[Frame]:
         images = self._images_from(0, {name: self.images(name) for name in self.cameras})
-        for frame in frames_of(self._columns, self.events(), self.joint_samples()):
+        for frame in frames_of(self.trajectory(), self.events(), self.joint_samples()):
             yield replace(frame, images=next(images))
 
     @overload
@@ -205,7 +236,7 @@ class Recording(EpisodeFile):
     @cached_property
     def _frames(self) -> list[Frame]:
         """All frames without images, kept from the first on that is asked for."""
-        return list(frames_of(self._columns, self.events(), self.joint_samples()))
+        return list(frames_of(self.trajectory(), self.events(), self.joint_samples()))
 
     def _images_from(self, first: int, colors: Mapping[str, Iterator[Rgb]]) -> Iterator[Mapping[str, CameraImages]]:
         """The decoded images of a frame and of those after it, given the colours from that frame on."""
@@ -224,7 +255,7 @@ class Recording(EpisodeFile):
                     color=next(color),
                     depth=next(depth),
                     segmentation=next(labels),
-                    world_from_camera=pose_of(self._columns.world_from_camera[name][index]),
+                    world_from_camera=pose_of(self.trajectory().world_from_camera[name][index]),
                 )
                 for name, (color, depth, labels) in streams.items()
             }
@@ -243,49 +274,35 @@ class Recording(EpisodeFile):
         Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold bit for bit
         the same episode.
         """
-        result = self._digest_of_description()
-        columns = self.columns()
-        if self.info.simulation is None:
-            result.update(columns.time_ns.tobytes())
-            for mapping in (columns.features, columns.stamps, columns.images, columns.image_stamps):
-                for name in sorted(mapping):
-                    result.update(name.encode() + mapping[name].tobytes())
-            for frame, text in self.subtasks:
-                result.update(f"subtask {frame} {text}".encode())
-            for camera in self.info.cameras:
-                for packet in self.packets(camera.name):
-                    result.update(hashlib.sha256(packet.data).digest())
-            return result.hexdigest()
-        for name, value in _column_bytes(columns):
-            result.update(name.encode() + value)
+        result, numbers = self._digest_of_description(), self._numbers
+        for name, data in _content(numbers):
+            result.update(name.encode() + data)
+        for frame, text in self.subtasks:
+            result.update(f"subtask {frame} {text}".encode())
         for sample in self.joint_samples():
             result.update(sample.time_ns.to_bytes(8, "little"))
             for vector in (sample.joint_position, sample.joint_velocity, sample.joint_effort):
                 result.update(vector.tobytes())
         for time_ns, event in self.events():
             result.update(f"{time_ns} {to_json(event)}".encode())
-        for name in self.cameras:
+        for name, streams in self._cameras_in_order:
             result.update(name.encode())
             for packet in self.packets(name):
                 result.update(hashlib.sha256(packet.data).digest())
-            for depth in self.depth(name) if self.has_depth(name) else ():
+            for depth in self.depth(name) if streams.depth and name in self.cameras else ():
                 result.update(depth.tobytes())
-            for labels in self.segmentation(name) if self.has_segmentation(name) else ():
+            for labels in self.segmentation(name) if streams.segmentation else ():
                 result.update(labels.tobytes())
         return result.hexdigest()
 
 
-_NOT_RECORDED = ("features", "stamps", "images", "image_stamps")
-"""Columns that are the same of every simulated episode, and no part of its digest."""
-
-
-def _column_bytes(columns: Columns) -> Iterator[tuple[str, bytes]]:
-    """Name and bytes of every column that was recorded."""
-    for field in (field for field in fields(columns) if field.name not in _NOT_RECORDED):
-        value = getattr(columns, field.name)
+def _content(numbers: Table | Trajectory) -> Iterator[tuple[str, bytes]]:
+    """Name and bytes of every array."""
+    for field in fields(numbers):
+        value = getattr(numbers, field.name)
         if isinstance(value, Mapping):
             for key in sorted(value):
-                yield key if field.name == "sensed" else f"{field.name}/{key}", value[key].tobytes()
+                yield f"{field.name}/{key}", value[key].tobytes()
         else:
             yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
 
@@ -298,11 +315,10 @@ def open_recording(path: str | Path, *, simulated: bool = False) -> Recording:
         simulated: Whether only an episode that demorec simulated will do.
 
     Raises:
-        NotSimulatedError: It was recorded by another robot or program, and that will not do.
-        RecordingError: As `Recording`.
+        RecordingError: As `Recording`, or it was recorded by another robot or program, and that will not do.
     """
     recording = Recording(path)
     if simulated and recording.info.simulation is None:
         recording.close()
-        raise NotSimulatedError("scene", recording.path)
+        raise RecordingError(f"{NOT_SIMULATED}: {recording.path}")
     return recording

@@ -83,7 +83,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
             file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(survey.num_frames)}))
         file.end()
         with Recording(part) as recording:
-            recording.columns()  # a recovered file that cannot be read would be worse than none
+            recording.table()  # a recovered file that cannot be read would be worse than none
         file.publish()
     except BaseException:
         file.discard()  # it holds nothing that the source does not

@@ -103,7 +103,7 @@ def frame_streams(info: EpisodeInfo, tree: FrameTree | None = None) -> tuple[Fra
 
 def _simulated_streams(info: EpisodeInfo) -> Iterator[FrameStream]:
     """The streams of a simulated episode."""
-    robot, scene = info.robot, info.scene
+    robot, scene = info.simulated.robot, info.simulated.scene
     arm_and_gripper = (*robot.arm_joints, GRIPPER_JOINT)
     base = robot.base_link
     joint_state = attrgetter(*(f"observation.{name}" for name in _JOINT_STATE))

@@ -10,6 +10,7 @@ import numpy as np
 from demorec.core.plain import to_plain
 from demorec.episode.episode import NO_IMAGE, Outcome
 from demorec.episode.info import FORMAT_VERSION
+from demorec.episode.simulated import simulation_facts
 from demorec.mcap.recording import Recording, open_recording
 
 
@@ -26,22 +27,22 @@ def summarize(path: Path) -> dict[str, Any]:
         RecordingError: It is none, or damaged.
     """
     with open_recording(path) as recording:
-        info, simulated = recording.info, recording.info.simulation
+        info, facts = recording.info, simulation_facts(recording.info)
         outcome = recording.outcome or Outcome(num_frames=recording.num_frames)
         seconds, rate = _length(recording)
         return {
-            "kind": "external recording" if simulated is None else "recording",
+            "kind": "recording" if facts else "external recording",
             "path": str(path),
             "bytes": path.stat().st_size,
             "format_version": FORMAT_VERSION,
             "episode_index": info.episode_index,
             "attempt": info.attempt,
-            "root_seed": None if simulated is None else simulated.root_seed,
-            "task": None if simulated is None else simulated.task,
+            "root_seed": facts.get("root_seed"),
+            "task": facts.get("task"),
             "instruction": info.instruction,
             "robot": info.robot_name,
-            "has_urdf": simulated is not None or bool(info.urdf),
-            "objects": [] if simulated is None else [body.name for body in simulated.scene.movable],
+            "has_urdf": bool(facts or info.urdf),
+            "objects": facts.get("objects", []),
             "success": outcome.success,
             "is_recovered": recording.is_recovered,
             "failure_phase": outcome.failure_phase,
@@ -51,7 +52,7 @@ def summarize(path: Path) -> dict[str, Any]:
             "drops": dict(outcome.drops),
             "frames": recording.num_frames,
             "fps": info.fps,
-            "physics_hz": None if simulated is None else simulated.physics_hz,
+            "physics_hz": facts.get("physics_hz"),
             "seconds": seconds,
             "rate": rate,
             "features": _features(recording),
@@ -60,7 +61,7 @@ def summarize(path: Path) -> dict[str, Any]:
                 {"topic": topic, "type": kind, "messages": count} for topic, (kind, count) in recording.topics.items()
             ],
             "origin": to_plain(info.origin),
-            "config_digest": "" if simulated is None else simulated.config_digest,
+            "config_digest": facts.get("config_digest", ""),
             "digest": recording.digest(),
             "final_state_digest": outcome.final_state_digest,
             "versions": dict(info.versions),
@@ -69,9 +70,7 @@ def summarize(path: Path) -> dict[str, Any]:
 
 def _length(recording: Recording) -> tuple[float, float]:
     """Seconds, and mean frames per second."""
-    if recording.info.simulation is not None:
-        return recording.num_frames / recording.info.fps, float(recording.info.fps)
-    times = recording.columns().time_ns
+    times = recording.time_ns
     seconds = float(times[-1] - times[0]) / 1e9 if len(times) else 0.0
     return seconds, (len(times) - 1) / seconds if seconds else 0.0
 
@@ -84,14 +83,14 @@ def _features(recording: Recording) -> list[dict[str, Any]]:
             "elements": feature.names,
             "units": feature.units,
             "source": feature.source,
-            "oldest": float(np.abs(recording.columns().age_ns(feature.name)).max(initial=0)) / 1e9,
+            "oldest": float(np.abs(recording.table().age_ns(feature.name)).max(initial=0)) / 1e9,
         }
         for feature in recording.info.features
     ]
 
 
 def _cameras(recording: Recording) -> list[dict[str, Any]]:
-    columns = recording.columns()
+    table = recording.table()
     recorded = {*recording.cameras, *recording.depth_cameras}
     return [
         {
@@ -102,8 +101,8 @@ def _cameras(recording: Recording) -> list[dict[str, Any]]:
             "segmentation": recording.has_segmentation(camera.name),
             "is_kept": bool(camera.kept),
             "images": recording.num_images(camera.name),
-            "frames_without": int((columns.images[camera.name] == NO_IMAGE).sum()),
-            "oldest": float(np.abs(columns.image_age_ns(camera.name)).max(initial=0)) / 1e9,
+            "frames_without": int((table.images[camera.name] == NO_IMAGE).sum()),
+            "oldest": float(np.abs(table.image_age_ns(camera.name)).max(initial=0)) / 1e9,
             "source": camera.source,
         }
         for camera in recording.info.cameras

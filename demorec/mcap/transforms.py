@@ -56,8 +56,12 @@ class FrameTree:
             urdf, self._places = Urdf.parse(info.urdf), joint_places(info.features)
             names: Sequence[str] = [*self._places]
         else:
-            urdf = Urdf.load(asset_path(info.robot.urdf), scale=info.scene.robot.scale)
-            world_from_base, bodies, names = info.scene.robot.world_from_base, info.scene.bodies, info.robot.joint_names
+            urdf = Urdf.load(asset_path(info.simulated.robot.urdf), scale=info.simulated.scene.robot.scale)
+            world_from_base, bodies, names = (
+                info.simulated.scene.robot.world_from_base,
+                info.simulated.scene.bodies,
+                info.simulated.robot.joint_names,
+            )
         self._objects = [body.name for body in bodies if body.movable]
         self._joints = MovingJoints(urdf, names)
         self.moving = (*self._joints.moving, *((WORLD, name) for name in self._objects))

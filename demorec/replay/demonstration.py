@@ -23,6 +23,7 @@ from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, ga
 from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Physics, RobotPlacement, Scene
+from demorec.episode.simulated import simulated_info
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.frames import action_at, frames_of, observation_at
 from demorec.robots.motors import Motors
@@ -136,33 +137,33 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         RecordingError: It is damaged or empty.
         ConfigError: `export_hz` does not divide its rate.
     """
-    info, columns = recording.info, recording.columns()
-    if columns.num_frames == 0:
+    info, trajectory = recording.info, recording.trajectory()
+    if trajectory.num_frames == 0:
         raise RecordingError(f"The recording has no frames: {recording.path}")
     fps = options.export_hz or info.fps
     if info.fps % fps:
         divisors = ", ".join(str(n) for n in range(1, info.fps + 1) if info.fps % n == 0)
         raise OptionError("export_hz", f"is {fps}, which does not divide the recording's {info.fps}: use {divisors}.")
     stride = info.fps // fps
-    rows = np.arange(0, columns.num_frames, stride)
+    rows = np.arange(0, trajectory.num_frames, stride)
     # As the export does: where the arm shall be when the next observation is taken.
-    sent = np.minimum(rows + stride - 1, columns.num_frames - 1)
+    sent = np.minimum(rows + stride - 1, trajectory.num_frames - 1)
     outcome = recording.outcome
-    seen = [seen_in(observation_at(columns, int(row))) for row in rows]
+    seen = [seen_in(observation_at(trajectory, int(row))) for row in rows]
     # Without physics only the states that a world can be put in, and what follows from them.
     compared = [n for n in seen[0] if not options.states or n in (JOINTS, OPENING, EE_POSE) or n.startswith(POSE_OF)]
     return Demonstration(
         name=recording.path.name,
         info=info,
         fps=fps,
-        commands=tuple(action_at(columns, int(row), "command") for row in sent),
+        commands=tuple(action_at(trajectory, int(row), "command") for row in sent),
         compared={name: np.array([values[name] for values in seen]) for name in compared},
         recorded_success=None if outcome is None else outcome.success,
         final_state_digest="" if outcome is None or stride > 1 else outcome.final_state_digest,
         # Placing a body normalises its quaternion once more.
         tolerance=1e-9 if options.states else 0.0,
         digest=recording.digest(),
-        recorded=() if stride > 1 else tuple(frames_of(columns, recording.events(), recording.joint_samples())),
+        recorded=() if stride > 1 else tuple(frames_of(trajectory, recording.events(), recording.joint_samples())),
         recorded_checks=() if outcome is None else outcome.checks,
         gave_up=outcome is not None and gave_up(outcome, [event for _, event in recording.events()], info),
     )
@@ -192,8 +193,8 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
                 raise ConfigError(f"--motor-units belongs to datasets, recordings say their units: {path}")
             if recording.info.simulation is not None:
                 raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
-            info, c = recording.info, recording.columns()
-            motion = motion_of_features(c.features, info.features, info.fps, info.urdf, c.time_ns)
+            info, table = recording.info, recording.table()
+            motion = motion_of_features(table.features, info.features, info.fps, info.urdf, table.time_ns)
         return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=info.episode_index)
     with open_recording(path, simulated=True) as recording:
         return replace(open_demonstration(recording, options), source=path)
@@ -239,7 +240,7 @@ def dataset_demonstrations(
         kind = dataset.action_kind(info)
         if kind is None:
             raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")
-        state, arm = rows[STATE].astype(np.float64), len(info.robot.arm_joints)
+        state, arm = rows[STATE].astype(np.float64), len(info.simulated.robot.arm_joints)
         yield Demonstration(
             name=f"{path.name}_episode_{number:06d}",
             info=info,
@@ -284,18 +285,15 @@ def demonstration_of(
         gripper_width=float(state[0, count]),
     )
     physics = Physics(hz=hz)
-    info = EpisodeInfo(
-        episode_index=episode_index,
-        instruction="",
-        fps=fps,
-        versions=deciding_versions(),
-        simulation=Simulation(
-            root_seed=0,
-            task="",
-            robot=robot,
-            scene=Scene(robot=start, bodies=table_and_floor(), physics=physics),
-            physics_hz=hz,
-        ),
+    simulation = Simulation(
+        root_seed=0,
+        task="",
+        robot=robot,
+        scene=Scene(robot=start, bodies=table_and_floor(), physics=physics),
+        physics_hz=hz,
+    )
+    info = simulated_info(
+        simulation, episode_index=episode_index, instruction="", fps=fps, versions=deciding_versions()
     )
     return Demonstration(
         name=name,

@@ -17,6 +17,7 @@ from demorec.core.geometry import Array
 from demorec.core.seeding import generator
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Action, Frame, Observation, Outcome, SuccessCheck
+from demorec.episode.simulated import with_simulation
 from demorec.loop import Session, SimulatorCache, Step
 from demorec.loop.actions import ActionDecoder
 from demorec.mcap import EpisodeWriter
@@ -86,7 +87,7 @@ def replay(
 
     Args:
         demonstration: What to do.
-        world: Of its robot and rate (`World(info.robot, fps=demonstration.fps)`); is reset.
+        world: Of its robot and rate (`World(info.simulated.robot, fps=demonstration.fps)`); is reset.
         options: How.
         painter: For the images of the frames, or None.
         sink: Is given every frame of the replay before its command is sent.
@@ -95,8 +96,8 @@ def replay(
         The report, and how the replay ended; with `states`, which judge nothing, how the recording did.
     """
     d = demonstration
-    task = None if options.states or d.is_measured else TASKS.load(d.info.task, options.allowed)()
-    session = Session(world, d.info.scene, task, painter=painter)
+    task = None if options.states or d.is_measured else TASKS.load(d.info.simulated.task, options.allowed)()
+    session = Session(world, d.info.simulated.scene, task, painter=painter)
     agent = DemonstrationAgent(d, options)
     seen: list[Observation] = []
     for frame in _placed(session, d) if options.states else session.run(agent):
@@ -207,7 +208,7 @@ def _report(
         first = d.num_steps, "the final state"
     elif is_judged and d.final_state_digest and outcome.checks != d.recorded_checks:
         first = d.num_steps, _other_condition(outcome.checks, d.recorded_checks)
-    arm = np.abs(off[JOINTS][:, : len(d.info.robot.arm_joints)]).max(axis=1)
+    arm = np.abs(off[JOINTS][:, : len(d.info.simulated.robot.arm_joints)]).max(axis=1)
     distances = np.array([np.linalg.norm(off[f"{POSE_OF}{name}"][:, :3], axis=1) for name in d.objects])
     number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
     distance = float(distances[number, step]) if len(distances) else 0.0
@@ -242,7 +243,7 @@ def _report(
 def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
     """As of the report."""
     columns = np.abs(np.column_stack([off[JOINTS], off[OPENING]])).T
-    names = (*d.info.robot.arm_joints, "gripper")
+    names = (*d.info.simulated.robot.arm_joints, "gripper")
     return {name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)}
 
 
@@ -299,12 +300,12 @@ def replay_all(
     with closing(SimulatorCache()) as simulators:
         for demonstration in demonstrations:
             if not (options.states or demonstration.is_measured):
-                TASKS.check_name(demonstration.info.task, options.allowed)  # before anything is made
+                TASKS.check_name(demonstration.info.simulated.task, options.allowed)  # before anything is made
             if out is not None:
                 yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
                 continue
-            blind = replace(demonstration.info.scene, cameras=())
-            info = replace(demonstration.info, fps=demonstration.fps).with_simulation(scene=blind, config={})
+            blind = replace(demonstration.info.simulated.scene, cameras=())
+            info = with_simulation(replace(demonstration.info, fps=demonstration.fps), scene=blind, config={})
             world, _ = simulators.acquire(info)
             yield replay(demonstration, world, options)[0], None
 
@@ -327,10 +328,10 @@ def record_replay(
     view = recorded_view(d.info)
     make_folder(out)
     behaviour = view_behaviour(d.info, view)
-    info = replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}").with_simulation(behaviour=behaviour)
-    video = config_as(d.info.config.get("video", {}), VideoConfig)
+    info = with_simulation(replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}"), behaviour=behaviour)
+    video = config_as(d.info.simulated.config.get("video", {}), VideoConfig)
     world, renderer = simulators.acquire(info)
-    painter = view_painter(renderer, view, d.info.config) if renderer else None
+    painter = view_painter(renderer, view, d.info.simulated.config) if renderer else None
     with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
         writer.finish(outcome)

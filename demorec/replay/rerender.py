@@ -21,9 +21,10 @@ from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
 from demorec.episode.camera_error import true_cameras
-from demorec.episode.episode import Columns, Outcome
+from demorec.episode.episode import Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
+from demorec.episode.simulated import with_simulation
 from demorec.episode.variation import Ranges, resolve
 from demorec.loop import SimulatorCache
 from demorec.mcap import EpisodeWriter, Recording, open_recording
@@ -101,8 +102,8 @@ class SceneView:
 
 def recorded_view(info: EpisodeInfo) -> SceneView:
     """Return the view of a recording, whose extrinsics may be off on purpose, as those of a real camera are."""
-    cameras, errors = true_cameras(info.scene.cameras, info.behaviour)
-    return SceneView(scene=info.scene, true_cameras=cameras, true_from_recorded=errors)
+    cameras, errors = true_cameras(info.simulated.scene.cameras, info.simulated.behaviour)
+    return SceneView(scene=info.simulated.scene, true_cameras=cameras, true_from_recorded=errors)
 
 
 def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
@@ -112,12 +113,12 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
         ConfigError: An unknown camera, or an image size that cannot be coded.
     """
     old = recorded_view(info)
-    names = options.cameras or tuple(camera.name for camera in info.scene.cameras)
+    names = options.cameras or tuple(camera.name for camera in info.simulated.scene.cameras)
     if not names:
         raise ConfigError("The recording has no cameras: name some with --cameras.")
     if len(set(map(camera_name, names))) != len(names):
         raise ConfigError(f"A camera is named twice: {' '.join(names)}.")
-    recorded = {camera.name: camera for camera in info.scene.cameras}
+    recorded = {camera.name: camera for camera in info.simulated.scene.cameras}
     true = {camera.name: camera for camera in old.true_cameras}
     width, height = _default_size(info, options)
     believed_cameras, true_cameras = [], []
@@ -127,14 +128,14 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
             believed, actual = (replace(c, width=w, height=h) for c in (recorded[name], true[name]))
         elif name in CAMERAS.rows or split_name(name) is not None:
             preset = CAMERAS.load(name, options.allowed)
-            believed = actual = preset.camera(camera_name(name), info.robot, width=width, height=height)
+            believed = actual = preset.camera(camera_name(name), info.simulated.robot, width=width, height=height)
         else:
             known = tuple(dict.fromkeys((*recorded, *CAMERAS.rows)))
             raise ConfigError(f"Unknown camera {name!r}.{nearest_match(name, known)} Allowed: {', '.join(known)}.")
         _check_size(believed)
         believed_cameras.append(believed)
         true_cameras.append(actual)
-    scene = replace(info.scene, cameras=tuple(believed_cameras))
+    scene = replace(info.simulated.scene, cameras=tuple(believed_cameras))
     if options.looks is not None:
         rng = generator(
             root_seed=options.looks, episode_index=info.episode_index, attempt=info.attempt, purpose="looks"
@@ -149,15 +150,15 @@ def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
     off = {f"calibration_{name}" for name in view.true_from_recorded}
     return {
         name: value
-        for name, value in info.behaviour.items()
+        for name, value in info.simulated.behaviour.items()
         if not name.startswith("calibration_") or name.rpartition("_")[0] in off
     }
 
 
 def _default_size(info: EpisodeInfo, options: RerenderOptions) -> tuple[int, int]:
-    first = info.scene.cameras[0] if info.scene.cameras else None
-    width = options.width or (first.width if first else int(info.config.get("width", 224)))
-    height = options.height or (first.height if first else int(info.config.get("height", 224)))
+    first = info.simulated.scene.cameras[0] if info.simulated.scene.cameras else None
+    width = options.width or (first.width if first else int(info.simulated.config.get("width", 224)))
+    height = options.height or (first.height if first else int(info.simulated.config.get("height", 224)))
     return width, height
 
 
@@ -195,7 +196,7 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
 
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
     """The recording's config with what the options change about the images."""
-    config = dict(info.config)
+    config = dict(info.simulated.config)
     same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
     changes = {name: getattr(options, name) for name in same_names} | {
         "video": {**config.get("video", {}), **options.video} if options.video else None,
@@ -207,7 +208,7 @@ def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any
 
 def _video_options(info: EpisodeInfo, config: Mapping[str, Any]) -> VideoConfig:
     """Read the video options of a drawing config. Raises ConfigError for impossible ones, recorded or new."""
-    config_as(info.config.get("video", {}), VideoConfig)
+    config_as(info.simulated.config.get("video", {}), VideoConfig)
     try:
         return from_plain(config.get("video", {}), VideoConfig)
     except ValueError as error:
@@ -241,14 +242,18 @@ def rerender(
         raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
     allow_models(options.allowed)
     with open_recording(source, simulated=True) as recording:
-        info, columns = recording.info, recording.columns()
-        if columns.num_frames == 0:
+        info, trajectory = recording.info, recording.trajectory()
+        if trajectory.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
         view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = _video_options(info, config)
-        new_info = replace(info, origin=f"render of {recording.digest()[:16]}").with_simulation(
-            scene=view.scene, behaviour=view_behaviour(info, view), config=config, config_digest=digest(config)
+        new_info = with_simulation(
+            replace(info, origin=f"render of {recording.digest()[:16]}"),
+            scene=view.scene,
+            behaviour=view_behaviour(info, view),
+            config=config,
+            config_digest=digest(config),
         )
         was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
         if not was_there:
@@ -260,13 +265,13 @@ def rerender(
                 world, renderer = warm.acquire(new_info)
                 assert renderer is not None, "a view has cameras"
                 painter = view_painter(renderer, view, config)
-                _write_drawn(writer, recording, columns, painter, RecordedStates(world, view.scene, columns))
+                _write_drawn(writer, recording, trajectory, painter, RecordedStates(world, view.scene, trajectory))
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
         path=out,
-        num_frames=columns.num_frames,
-        num_images=columns.num_frames * len(view.scene.cameras),
+        num_frames=trajectory.num_frames,
+        num_images=trajectory.num_frames * len(view.scene.cameras),
         compared=tuple(compared),
         differing={name: frame for name, frame in compared.items() if frame is not None},
         was_there=was_there,
@@ -274,11 +279,11 @@ def rerender(
 
 
 def _write_drawn(
-    writer: EpisodeWriter, recording: Recording, columns: Columns, painter: Painter, states: RecordedStates
+    writer: EpisodeWriter, recording: Recording, trajectory: Trajectory, painter: Painter, states: RecordedStates
 ) -> None:
     """Write all frames of a recording with new images, and its outcome."""
     painter.setup(states)
-    for frame in frames_of(columns, recording.events(), recording.joint_samples()):
+    for frame in frames_of(trajectory, recording.events(), recording.joint_samples()):
         states.frame = frame.frame_index
         writer.write(replace(frame, images=painter.images()))
     writer.finish(_outcome(recording))
@@ -319,11 +324,14 @@ def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[
     if options.looks is not None:
         return found
     with open_recording(out, simulated=True) as new:
-        how, how_now = ((c.get("renderer"), c.get("antialias", True)) for c in (recording.info.config, new.info.config))
+        how, how_now = (
+            (c.get("renderer"), c.get("antialias", True))
+            for c in (recording.info.simulated.config, new.info.simulated.config)
+        )
         if how != how_now:
             return found
-        before = {camera.name: camera for camera in recording.info.scene.cameras}
-        for camera in new.info.scene.cameras:
+        before = {camera.name: camera for camera in recording.info.simulated.scene.cameras}
+        for camera in new.info.simulated.scene.cameras:
             name = camera.name
             if before.get(name) == camera and new.video_settings(name) == recording.video_settings(name):
                 pairs = zip(recording.packets(name), new.packets(name), strict=True)

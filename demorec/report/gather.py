@@ -158,7 +158,7 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
 
 def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, _Vectors]:
     info, content = recording.info, ExportEpisode(recording, CommonOptions())
-    names = content.columns.phase
+    names = content.recording.phases
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")

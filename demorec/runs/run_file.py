@@ -20,15 +20,14 @@ from demorec.core.errors import (
     ConfigError,
     DemorecError,
     NotGeneratedError,
-    NotSimulatedError,
     RecordingError,
     describe_error,
     resource_error,
 )
 from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sha256_of, sync_path
-from demorec.core.plain import PartValue, digest, from_plain, to_plain
+from demorec.core.plain import digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import NOT_SIMULATED, EpisodeInfo
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
@@ -135,17 +134,13 @@ class Generation:
     export: ExportRecord | None = None
 
 
-def _not_generated(_: str) -> ConfigError:
-    return ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
-
-
 @dataclass(frozen=True, kw_only=True)
 class RunFile:
     """The content of run.json.
 
     Attributes:
-        generation: None of a run whose episodes are external. Its values can be read as those of the run
-            (`run.config`); that raises ConfigError where there are none.
+        generation: None of a run whose episodes are external; its values, read as those of the run, raise ConfigError
+            then.
         robot, fps: Of external episodes: name of the robot, nominal frames per second.
         attempts: Every finished attempt at the episodes that are asked for, ordered by episode and attempt.
         sessions: Every start of the command, or of a program that added episodes.
@@ -157,16 +152,41 @@ class RunFile:
     attempts: tuple[Attempt, ...] = ()
     sessions: tuple[RunSession, ...] = ()
 
-    config = PartValue[GenerateConfig]("generation", _not_generated)
-    versions = PartValue[Mapping[str, str]]("generation", _not_generated)
-    num_episodes = PartValue[int]("generation", _not_generated)
-    beyond = PartValue[tuple[Attempt, ...]]("generation", _not_generated)
-    export = PartValue[ExportRecord | None]("generation", _not_generated)
+    @property
+    def generated(self) -> Generation:
+        """The generation; ConfigError for a run whose episodes are external."""
+        if self.generation is None:
+            raise ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
+        return self.generation
+
+    @property
+    def config(self) -> GenerateConfig:
+        """The configuration of the generation."""
+        return self.generated.config
+
+    @property
+    def versions(self) -> Mapping[str, str]:
+        """The versions of the generation."""
+        return self.generated.versions
+
+    @property
+    def num_episodes(self) -> int:
+        """The number of successes asked for last."""
+        return self.generated.num_episodes
+
+    @property
+    def beyond(self) -> tuple[Attempt, ...]:
+        """The attempts at later episodes than asked for."""
+        return self.generated.beyond
+
+    @property
+    def export(self) -> ExportRecord | None:
+        """The dataset made from the run."""
+        return self.generated.export
 
     def with_generation(self, **changes: Any) -> RunFile:
-        """The same run with other values of its generation, which it must have."""
-        assert self.generation is not None
-        return replace(self, generation=replace(self.generation, **changes))
+        """Return the same run with other values of its generation, which it must have."""
+        return replace(self, generation=replace(self.generated, **changes))
 
     @property
     def config_digest(self) -> str:
@@ -368,7 +388,7 @@ def recorded_line(path: Path) -> tuple[Attempt, EpisodeInfo]:
         line = Attempt(
             episode_index=info.episode_index,
             attempt=info.attempt,
-            seed=info.root_seed if is_simulated else 0,
+            seed=info.simulated.root_seed if is_simulated else 0,
             success=None if outcome is None else outcome.success,
             file=path.name,
             sha256=sha256_of(path),
@@ -396,9 +416,9 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
     """
     attempt, info = recorded_line(path)
     if info.simulation is None:
-        raise NotSimulatedError("scene", path)
+        raise RecordingError(f"{NOT_SIMULATED}: {path}")
     if info.origin:
         raise NotGeneratedError(f"The recording is a {info.origin}, which generate-dataset did not make: {path}")
     if attempt.success is None:
         raise RecordingError(f"The recording was cut off by a crash: {path}")
-    return attempt, info.config, info.versions
+    return attempt, info.simulated.config, info.versions

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.scene import Scene
 from demorec.render import Mount, VisualBody, first_rows
 from demorec.sim.world import World
@@ -17,7 +17,7 @@ class RecordedStates:
     Args:
         world: World of the recording's robot; is reset.
         scene: The recorded scene, or the same with other cameras and appearance.
-        columns: The recorded states.
+        trajectory: The recorded states.
 
     Attributes:
         scene: As given.
@@ -27,10 +27,10 @@ class RecordedStates:
         SceneError: A model file is missing or broken.
     """
 
-    def __init__(self, world: World, scene: Scene, columns: Columns) -> None:
+    def __init__(self, world: World, scene: Scene, trajectory: Trajectory) -> None:
         self.scene = scene
         self.frame = 0
-        self._world, self._columns = world, columns
+        self._world, self._trajectory = world, trajectory
         world.reset(scene)
         self._visuals = world.visuals()
         rows = first_rows(self._visuals)[len(self._visuals) - len(scene.movable) :]
@@ -46,9 +46,9 @@ class RecordedStates:
 
     def poses(self) -> Array:
         """Return the (n, 7) poses of all bodies and links at the present frame, as `Renderer.render` takes them."""
-        recorded = {name: poses[self.frame] for name, poses in self._columns.object_poses.items()}
+        recorded = {name: poses[self.frame] for name, poses in self._trajectory.object_poses.items()}
         self._world.set_state(
-            joint_position=self._columns.joint_position[self.frame],
+            joint_position=self._trajectory.joint_position[self.frame],
             object_poses={name: Pose(position=vector[:3], quat_xyzw=vector[3:]) for name, vector in recorded.items()},
         )
         poses = self._world.poses()

@@ -68,7 +68,7 @@ def import_lerobot(
             info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
             if folder.has(info):
                 continue
-            columns = recording.columns()
+            columns = recording.table()
             rows = range(recording.num_frames)
             frames = ({name: values[row] for name, values in columns.features.items()} for row in rows)
             images = {camera.name: _images(recording, camera) for camera in info.cameras}
@@ -124,4 +124,4 @@ def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:
         return recording.distances(camera.name)
     if camera.kept:
         return (packet.data for packet in recording.packets(camera.name))
-    return islice(recording.images(camera.name), int(recording.columns().images[camera.name][0]), None)
+    return islice(recording.images(camera.name), int(recording.table().images[camera.name][0]), None)

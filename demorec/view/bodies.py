@@ -152,7 +152,7 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
     """
     info, description, positions = episode.info, episode.robot_description, episode.joint_position
     if info.simulation is not None:
-        urdf, meshes = robot_model(info.robot.urdf, info.scene.robot.scale, description)
+        urdf, meshes = robot_model(info.simulated.robot.urdf, info.simulated.scene.robot.scale, description)
     elif description is not None:
         urdf = Urdf.parse(description)
         meshes = _meshes_or_rods(description, urdf)

@@ -113,7 +113,7 @@ class PlayedEpisode:
     @property
     def scene(self) -> Scene | None:
         """The world at the start, where it is known."""
-        return None if self.info.simulation is None else self.info.scene
+        return None if self.info.simulation is None else self.info.simulated.scene
 
     @property
     def world_from_base(self) -> Pose:

@@ -72,7 +72,7 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
         raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
     recording = DatasetRecording(dataset, numbers[0])
     group = root.resolve().name
-    last, fps, times = recording.num_frames - 1, dataset.info.fps, recording.columns().time_ns
+    last, fps, times = recording.num_frames - 1, dataset.info.fps, recording.table().time_ns
     known = {
         "name": f"episode_{episode_index:06d}",
         "group": group,
@@ -94,15 +94,15 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
 
 def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str, Any]) -> PlayedEpisode:
     dataset, root = recording.dataset, recording.path
-    described, columns = dataset.info, recording.columns()
+    described, columns = dataset.info, recording.table()
     export = dict(read_json(root / SIDECAR_DIR / "export.json"))
     info = read_episode_info(row["episode_info"])
     missing = {"observation.state", "action"} - described.features.keys()
     if missing:
         raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
     data = {name: values.astype(np.float64) for name, values in columns.features.items()}
-    num_arm = len(info.robot.arm_joints)
-    widths = {len(state_names(info.robot, kind)) for kind in STATE_KINDS}
+    num_arm = len(info.simulated.robot.arm_joints)
+    widths = {len(state_names(info.simulated.robot, kind)) for kind in STATE_KINDS}
     state = data["observation.state"]
     if not len(state) or state.shape[1] not in widths:
         raise RecordingError(
@@ -112,26 +112,26 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
     if robot is not None:
         check_primitives(robot.urdf)
     base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, robot)
-    fingers = info.robot.gripper.joint_position(state[:, num_arm])
+    fingers = info.simulated.robot.gripper.joint_position(state[:, num_arm])
     ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
     joints = {"position": state}
     if "observation.velocity" in data:
         joints["velocity"] = data["observation.velocity"]
     if export.get("action") == "joint":
         joints["target"] = data["action"]
-    episode = played_episode(recording, known, info)
+    episode = played_episode(recording, known, replace(info, features=recording.info.features))
     return replace(
         episode,
         outcome=_outcome(row, len(state)),
         robot_description=None if robot is None else robot.urdf,
-        joint_position=dict(zip(info.robot.joint_names, [*state[:, :num_arm].T, *fingers.T], strict=True)),
+        joint_position=dict(zip(info.simulated.robot.joint_names, [*state[:, :num_arm].T, *fingers.T], strict=True)),
         base_from_tcp=base_from_tcp,
         object_poses=_object_poses(info, ends, data, described, base_from_tcp),
         end_poses=ends,
         world_from_camera=_camera_poses(recording),
         phase=_phases(row, len(state)),
         curves=simulated_curves(
-            info.robot,
+            info.simulated.robot,
             episode.time_ns,
             {row.quantity: data[name] for name, row in SENSED.items() if name in data},
             joints=joints,
@@ -159,8 +159,8 @@ def _boxes(recording: DatasetRecording, camera: str) -> dict[int, list[tuple[str
 
 def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
     """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
-    spec = info.robot
-    urdf = Urdf.load(asset_path(spec.urdf), scale=info.scene.robot.scale) if robot is None else robot.model
+    spec = info.simulated.robot
+    urdf = Urdf.load(asset_path(spec.urdf), scale=info.simulated.scene.robot.scale) if robot is None else robot.model
     arm = ArmKinematics(
         urdf,
         arm_joints=spec.arm_joints,
@@ -176,12 +176,12 @@ def _object_poses(
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
-        opening, target = data["observation.state"][:, len(info.robot.arm_joints)], data["action"][:, -1]
-        return held_object_poses(info.scene, ends, base_from_tcp, opening, target, int(described.fps))
+        opening, target = data["observation.state"][:, len(info.simulated.robot.arm_joints)], data["action"][:, -1]
+        return held_object_poses(info.simulated.scene, ends, base_from_tcp, opening, target, int(described.fps))
     first = {name: column for column, name in enumerate(described.features[ENVIRONMENT_STATE].names or ())}
-    base, values = info.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
+    base, values = info.simulated.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
     result = {}
-    for body in info.scene.movable:
+    for body in info.simulated.scene.movable:
         column = first[f"{body.name}.pose.x"]
         rows = values[:, column : column + 7]
         result[body.name] = np.array([(base @ Pose(position=p[:3], quat_xyzw=p[3:])).vector() for p in rows])

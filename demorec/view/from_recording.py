@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.recording import DatasetRecording
-from demorec.episode.episode import NO_IMAGE, Columns
+from demorec.episode.episode import NO_IMAGE, Table, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap import Recording, open_recording
@@ -40,27 +40,27 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
         "source": path.name,
     }
     with open_recording(path) as recording:
-        times = recording.columns().time_ns
+        times = recording.time_ns
         statements = tuple((int(times[frame] - times[0]), "subtask", text) for frame, text in recording.subtasks)
         episode = played_episode(recording, known | {"statements": statements}, recording.info)
         yield episode if recording.info.simulation is None else _with_simulation(episode, recording)
 
 
 def _with_simulation(episode: PlayedEpisode, recording: Recording) -> PlayedEpisode:
-    info, columns = recording.info, recording.columns()
+    info, trajectory = recording.info, recording.trajectory()
     return replace(
         episode,
         robot_description=recording.description(),
         body_description=lambda body: (
             recording.description(body) if description_topic(body) in recording.topics else None
         ),
-        joint_position=dict(zip(info.robot.joint_names, columns.joint_position.T, strict=True)),
-        base_from_tcp=columns.base_from_tcp,
-        object_poses=columns.object_poses,
-        world_from_camera=columns.world_from_camera,
-        phase=columns.phase,
+        joint_position=dict(zip(info.simulated.robot.joint_names, trajectory.joint_position.T, strict=True)),
+        base_from_tcp=trajectory.base_from_tcp,
+        object_poses=trajectory.object_poses,
+        world_from_camera=trajectory.world_from_camera,
+        phase=trajectory.phase,
         events=tuple(recording.events()),
-        curves=_curves(recording, columns),
+        curves=_curves(recording, trajectory),
         segmentation={
             name: partial(recording.segmentation, name)
             for name in recording.cameras
@@ -72,10 +72,10 @@ def _with_simulation(episode: PlayedEpisode, recording: Recording) -> PlayedEpis
 
 def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo) -> PlayedEpisode:
     """What every episode has: features and images; `info` may describe its robot."""
-    columns = recording.columns()
-    time_ns = columns.time_ns - (columns.time_ns[0] if columns.num_frames else 0)
+    table = recording.table()
+    time_ns = table.time_ns - (table.time_ns[0] if table.num_frames else 0)
     places = joint_places(info.features)
-    positions: Iterable[Array] = joint_positions(places, columns.features).T if places else ()
+    positions: Iterable[Array] = joint_positions(places, table.features).T if places else ()
     return PlayedEpisode(
         **known,
         info=info,
@@ -85,31 +85,31 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
         joint_position=dict(zip(places, positions, strict=True)),
         curves={
             feature.name: Curves(
-                time_ns=time_ns, values=columns.features[feature.name].astype(np.float64), names=feature.names
+                time_ns=time_ns, values=table.features[feature.name].astype(np.float64), names=feature.names
             )
             for feature in info.features
         },
         videos={
-            camera: video_of(recording, camera, shown_at(columns, camera, time_ns))
+            camera: video_of(recording, camera, shown_at(table, camera, time_ns))
             for camera in recording.cameras
-            if len(columns.image_stamps[camera])
+            if len(table.image_stamps[camera])
         },
         depth={
-            camera: partial(timed, shown_at(columns, camera, time_ns), partial(recording.distances, camera))
+            camera: partial(timed, shown_at(table, camera, time_ns), partial(recording.distances, camera))
             for camera in recording.depth_cameras
-            if len(columns.image_stamps[camera])
+            if len(table.image_stamps[camera])
         },
     )
 
 
-def shown_at(columns: Columns, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """(P,) when each image of a camera is shown: with the first frame that holds it, or the next one after it.
 
     Not at its own stamp, which may be of another clock.
     """
-    frames = np.flatnonzero(columns.images[camera] != NO_IMAGE)
-    numbers = np.maximum.accumulate(columns.images[camera][frames])
-    count = len(columns.image_stamps[camera])
+    frames = np.flatnonzero(table.images[camera] != NO_IMAGE)
+    numbers = np.maximum.accumulate(table.images[camera][frames])
+    count = len(table.image_stamps[camera])
     places = np.minimum(np.searchsorted(numbers, np.arange(count)), max(len(frames) - 1, 0))
     return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
 
@@ -124,21 +124,21 @@ def video_of(recording: Recording | DatasetRecording, camera: str, shown_at: NDA
     return Video(codec=recording.video_settings(camera).codec, packets=packets)
 
 
-def _curves(recording: Recording, columns: Columns) -> dict[str, Curves]:
+def _curves(recording: Recording, trajectory: Trajectory) -> dict[str, Curves]:
     """All plots; joints at the rate at which they were recorded, which may be that of the physics."""
-    robot = recording.info.robot
+    robot = recording.info.simulated.robot
     result = simulated_curves(
         robot,
-        columns.time_ns,
-        ObservationRows.of_columns(columns).sensed,
+        trajectory.time_ns,
+        ObservationRows.of_trajectory(trajectory).sensed,
         joints={
-            "position": columns.joint_position,
-            "velocity": columns.joint_velocity,
-            "target": columns.action_joint_target,
+            "position": trajectory.joint_position,
+            "velocity": trajectory.joint_velocity,
+            "target": trajectory.action_joint_target,
         },
-        opening=columns.gripper_width,
-        target=columns.action_gripper,
-        base_from_tcp=columns.base_from_tcp,
+        opening=trajectory.gripper_width,
+        target=trajectory.action_gripper,
+        base_from_tcp=trajectory.base_from_tcp,
     )
     if recording.topics[JOINT_STATES][1] > recording.num_frames:
         samples = list(recording.joint_samples())

@@ -35,7 +35,7 @@ _FLOOR = 3.0
 def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
     paths = Paths()
-    title = episode.info.robot_name if episode.scene is None else f"{episode.info.task}: the world"
+    title = episode.info.robot_name if episode.scene is None else f"{episode.info.simulated.task}: the world"
     is_known = episode.scene is not None or episode.robot_description is not None
     return _blueprint(
         episode,

@@ -75,7 +75,7 @@ def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
 
 def application_id(episode: PlayedEpisode) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
-    words = ["" if episode.scene is None else episode.info.task, *episode.cameras]
+    words = ["" if episode.scene is None else episode.info.simulated.task, *episode.cameras]
     return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in (episode.group, *words) if word)
 
 
@@ -240,9 +240,9 @@ def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
     if outcome is not None and outcome.success is not None:
         values["success"] = outcome.success
     if info.simulation is not None:
-        values |= {"task": info.task, "seed": info.root_seed, "attempt": info.attempt}
+        values |= {"task": info.simulated.task, "seed": info.simulated.root_seed, "attempt": info.attempt}
         values |= {} if outcome is None else {"retries": outcome.num_retries}
-        values |= {"config_digest": info.config_digest} if info.config_digest else {}
+        values |= {"config_digest": info.simulated.config_digest} if info.simulated.config_digest else {}
     if origin := _origin(episode):
         values["origin"] = origin
     return values
@@ -257,8 +257,8 @@ def _origin(episode: PlayedEpisode) -> str:
 def summary(episode: PlayedEpisode) -> str:
     """Markdown: task, outcome and its checks, the failed ones first."""
     info = episode.info
-    about = [info.robot_name if info.simulation is None else info.task, f"episode {info.episode_index}"]
-    about += [] if info.simulation is None else [f"seed {info.root_seed}"]
+    about = [info.robot_name if info.simulation is None else info.simulated.task, f"episode {info.episode_index}"]
+    about += [] if info.simulation is None else [f"seed {info.simulated.root_seed}"]
     length = f"{episode.duration:.1f} s · {episode.num_frames} frames (nominal {info.fps} Hz)"
     origin, checks = _origin(episode), [] if episode.outcome is None else _checks(episode.outcome)
     parts = [f"**{info.instruction}**", " · ".join(about), length, f"Outcome: **{episode.verdict}**"]

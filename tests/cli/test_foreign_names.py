@@ -18,6 +18,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.plain import to_plain
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.episode.simulated import with_simulation
 from demorec.runs.run_file import RUN_NAME, Generation, RunFile, inspect_recording, save_run_file
 
 SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))
@@ -49,12 +50,13 @@ def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 def recording_of(name: str, path: Path) -> Path:
     """A recording whose task, robot, camera and renderer are called `name`, with a camera that is off its place."""
     spoilt = Spoilt(SAMPLE)
-    camera = spoilt.info.scene.cameras[0].name
+    camera = spoilt.info.simulated.scene.cameras[0].name
     config = GenerateConfig(task=name, robot=name, cameras=(name,), width=64, height=64, variation="full")
-    spoilt.info = spoilt.info.with_simulation(
+    spoilt.info = with_simulation(
+        spoilt.info,
         task=name,
         config=to_plain(config),
-        behaviour={**spoilt.info.behaviour, f"calibration_{camera}_x": 0.01},
+        behaviour={**spoilt.info.simulated.behaviour, f"calibration_{camera}_x": 0.01},
     )
     spoilt.frames = spoilt.frames[:8]
     path.parent.mkdir(parents=True, exist_ok=True)

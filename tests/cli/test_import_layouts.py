@@ -42,25 +42,25 @@ def test_a_suggestion_is_right_unedited(name: str, tmp_path: Path, capsys: pytes
     code = exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run")
     assert (code, warned) == (0, ""), capsys.readouterr().err
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        columns = recording.columns()
+        table = recording.table()
         features = {feature.name: feature.names for feature in recording.info.features}
         assert list(features["observation.state"]) == [label for part in layout.state for label in part.names]
         action = layout.action or layout.state
         assert list(features["action"]) == [label for part in action for label in part.names]
-        times = columns.time_ns.tolist()
+        times = table.time_ns.tolist()
         assert len(times) >= 30
         for row, time_ns in enumerate(times):
-            state = columns.features["observation.state"]
+            state = table.features["observation.state"]
             assert state[row].tolist() == _expected(notes, layout.state, time_ns, layout)
             if layout.action:
-                assert columns.features["action"][row].tolist() == _expected(notes, layout.action, time_ns, layout)
+                assert table.features["action"][row].tolist() == _expected(notes, layout.action, time_ns, layout)
             elif row:
-                assert np.array_equal(columns.features["action"][row - 1], state[row])
+                assert np.array_equal(table.features["action"][row - 1], state[row])
         assert len(recording.info.cameras) == layout.cameras
         for camera in recording.info.cameras:
             topic = camera.source.partition(",")[0]
             stamps = {note.header_ns for note in notes if note.topic == topic and note.header_ns <= times[-1]}
-            assert set(columns.image_stamps[camera.name].tolist()) == stamps
+            assert set(table.image_stamps[camera.name].tolist()) == stamps
 
 
 def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

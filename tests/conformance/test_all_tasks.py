@@ -31,12 +31,12 @@ def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
     for run in runs:
         (path,) = (run / "episodes").glob("*.mcap")
         with Recording(path) as recording:
-            columns, instruction = recording.columns(), recording.info.instruction
+            trajectory, instruction = recording.trajectory(), recording.info.instruction
         item = dataset[row]
         assert item["task"] == instruction
-        expected = np.array([*columns.joint_position[0, :7], columns.gripper_width[0]], np.float32)
+        expected = np.array([*trajectory.joint_position[0, :7], trajectory.gripper_width[0]], np.float32)
         assert np.array_equal(item["observation.state"].numpy(), expected)
-        row += len(columns.time_ns)
+        row += len(trajectory.time_ns)
     assert row == dataset.num_frames
     assert len(dataset.meta.tasks) == len({dataset[i]["task"] for i in dataset.meta.episodes["dataset_from_index"]})
 

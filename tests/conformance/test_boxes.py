@@ -39,7 +39,7 @@ def test_a_thousand_boxes_are_those_of_the_segmentation(run: Path, dataset: Path
     count = 0
     with Recording(path) as recording:
         label_of = {name: label for label, name in recording.segment_names().items()}
-        spoken = [body for body in recording.info.scene.bodies if body.role not in ("fixture", "support")]
+        spoken = [body for body in recording.info.simulated.scene.bodies if body.role not in ("fixture", "support")]
         for camera in recording.cameras:
             images = list(recording.segmentation(camera))
             stored = json.loads((dataset / "demorec" / "boxes" / f"{PREFIX}{camera}.json").read_text())

@@ -100,7 +100,7 @@ def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
     assert "Nothing odd was found." in told
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         assert recording.info.fps == 30
-        times = recording.columns().time_ns.tolist()
+        times = recording.table().time_ns.tolist()
         assert times == [note.header_ns for note in bags.of_topic(notes, FRONT)]
 
 
@@ -124,9 +124,9 @@ def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imp
     assert code == 0
     assert "Nothing odd was found." in told
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        columns = recording.columns()
+        table = recording.table()
     states, grippers = bags.of_topic(notes, STATE), [note for note in notes if note.topic == GRIPPER]
-    for time_ns, values in zip(columns.time_ns.tolist(), columns.features["observation.state"], strict=True):
+    for time_ns, values in zip(table.time_ns.tolist(), table.features["observation.state"], strict=True):
         state = max((note for note in states if note.header_ns <= time_ns), key=lambda note: note.header_ns)
         gripper = max((note for note in grippers if note.log_ns <= time_ns), key=lambda note: note.log_ns)
         assert values.tolist() == [*state.body["position"].tolist(), *gripper.body["data"].tolist()]

@@ -116,7 +116,7 @@ def recording_of(run: Path) -> Path:
 
 def held(recording: Recording, moments: Sequence[int]) -> list[int]:
     """The moments of the images that a recording has."""
-    stamps: list[int] = recording.columns().image_stamps["wrist_depth"].tolist()
+    stamps: list[int] = recording.table().image_stamps["wrist_depth"].tolist()
     assert set(stamps) <= set(moments)
     assert len(stamps) > 10
     return stamps

@@ -71,13 +71,13 @@ def test_numbers_of_robomimic_are_those_of_the_file(robomimic: tuple[Path, Path]
                 "action": file[f"data/{demo}/actions"][:],
             }
             with Recording(path) as recording:
-                columns, info = recording.columns(), recording.info
-            assert columns.features.keys() == expected.keys()
+                table, info = recording.table(), recording.info
+            assert table.features.keys() == expected.keys()
             for name, values in expected.items():
-                assert columns.features[name].dtype == np.float64
-                np.testing.assert_array_equal(columns.features[name], values)
+                assert table.features[name].dtype == np.float64
+                np.testing.assert_array_equal(table.features[name], values)
             assert (info.robot_name, info.fps, info.instruction) == ("Panda", 20, "Lift")
-            assert columns.time_ns.tolist() == [50_000_000 * row for row in range(length)]
+            assert table.time_ns.tolist() == [50_000_000 * row for row in range(length)]
             assert {camera.name: (camera.width, camera.height) for camera in info.cameras} == {
                 "agentview": (WIDTH, HEIGHT),
                 "robot0_eye_in_hand": (WIDTH, HEIGHT),
@@ -115,11 +115,11 @@ def test_aloha_becomes_a_run(is_compressed: bool, tmp_path: Path) -> None:
                 "observation.velocity": file["observations/qvel"][:],
                 "action": np.hstack(actions),
             }
-            columns = recording.columns()
+            table = recording.table()
             for name, values in expected.items():
-                assert columns.features[name].dtype == np.float32
-                np.testing.assert_array_equal(columns.features[name], values)
-            assert columns.time_ns.tolist() == [20_000_000 * row for row in range(8)]
+                assert table.features[name].dtype == np.float32
+                np.testing.assert_array_equal(table.features[name], values)
+            assert table.time_ns.tolist() == [20_000_000 * row for row in range(8)]
             for k, camera in enumerate(ALOHA_CAMERAS):
                 given = images(8, 10 * k)
                 if is_compressed:
@@ -241,9 +241,9 @@ def test_one_observation_more_than_actions_is_left_out(tmp_path: Path, capsys: p
         run = file.with_name("run")
         assert exit_code("import", "hdf5", file, "--mapping", suggested(file), "--out", run) == 0
         with Recording(recordings(run)[0]) as recording:
-            columns = recording.columns()
+            table = recording.table()
             packets = [[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS]
-            found.append((columns.time_ns.tolist(), packets, {n: v.tolist() for n, v in columns.features.items()}))
+            found.append((table.time_ns.tolist(), packets, {n: v.tolist() for n, v in table.features.items()}))
         told = "the last observation of each episode is left out: no action follows it." in capsys.readouterr().out
         assert told == ("The last observation of each episode" in file.with_suffix(".toml").read_text())
         assert told == (folder == "other")

@@ -79,8 +79,8 @@ def imported(
     assert exit_code("import", path, "--mapping", file, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        columns = recording.columns()
-        shown = {name: columns.image_stamps[name][columns.images[name]].tolist() for name in columns.images}
+        table = recording.table()
+        shown = {name: table.image_stamps[name][table.images[name]].tolist() for name in table.images}
     return told, shown
 
 

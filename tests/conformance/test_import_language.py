@@ -47,7 +47,7 @@ def imported(notes: bags.Notes, mapping: str, folder: Path) -> int:
 def row_at(recording: Path, at_s: float) -> int:
     """The first frame that is not before a moment."""
     with Recording(recording) as opened:
-        times = opened.columns().time_ns
+        times = opened.table().time_ns
     return next(row for row, time in enumerate(times.tolist()) if time >= bags.EPOCH_NS + round(at_s * bags.NS))
 
 
@@ -113,7 +113,7 @@ def test_what_was_said_is_shown_when_it_was_said(kind: str, tmp_path: Path) -> N
         place = tmp_path / "dataset"
         export(tmp_path / "run", place, language=("subtask",))
     with Recording(recording) as opened:
-        times = opened.columns().time_ns
+        times = opened.table().time_ns
         expected = [(int(times[frame] - times[0]) / 1e9, text) for frame, text in opened.subtasks]
     assert len(expected) == 3
     assert exit_code("view", place, "--save", tmp_path / "x.rrd") == 0

@@ -67,14 +67,14 @@ def test_numbers_and_tasks_are_those_of_the_dataset(imported: tuple[str, Path, P
     begin = 0
     for number, file in enumerate(recordings(run)):
         with Recording(file) as recording:
-            columns, end = recording.columns(), begin + LENGTHS[number]
+            table, end = recording.table(), begin + LENGTHS[number]
             for name in VECTORS:
-                expected = columns_of(dataset, name)[begin:end].astype(columns.features[name].dtype)
-                np.testing.assert_array_equal(columns.features[name], expected)
-            assert columns.features["observation.single"].dtype == np.float64
-            assert columns.features["observation.counts"].max() > 2**25  # which float32 would round
+                expected = columns_of(dataset, name)[begin:end].astype(table.features[name].dtype)
+                np.testing.assert_array_equal(table.features[name], expected)
+            assert table.features["observation.single"].dtype == np.float64
+            assert table.features["observation.counts"].max() > 2**25  # which float32 would round
             assert recording.info.instruction == ("push it", "pull it")[number % 2]
-            assert columns.time_ns.tolist() == [round(index * 1e9 / 30) for index in range(LENGTHS[number])]
+            assert table.time_ns.tolist() == [round(index * 1e9 / 30) for index in range(LENGTHS[number])]
             begin = end
 
 

@@ -35,7 +35,7 @@ def _begins(run: Path) -> list[float]:
     found = []
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as recording:
-            found.append(round((int(recording.columns().time_ns[0]) - bags.EPOCH_NS) / bags.NS * 20) / 20)
+            found.append(round((int(recording.table().time_ns[0]) - bags.EPOCH_NS) / bags.NS * 20) / 20)
     return found
 
 

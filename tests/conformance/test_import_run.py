@@ -101,34 +101,34 @@ def test_numbers_and_ages(imported: tuple[Layout, bags.Notes, Path]) -> None:
     _, notes, run = imported
     mapping = read_mapping(run.parent / "robot.toml")
     with _open(run) as recording:
-        columns = recording.columns()
-    assert len(columns.time_ns) >= 40
+        table = recording.table()
+    assert len(table.time_ns) >= 40
     for feature, sources in mapping.features.items():
-        values = columns.features[feature]
-        for row, time_ns in enumerate(columns.time_ns.tolist()):
+        values = table.features[feature]
+        for row, time_ns in enumerate(table.time_ns.tolist()):
             taken = [
                 max((n for n in bags.of_topic(notes, s.topic) if n.header_ns <= time_ns), key=lambda n: n.header_ns)
                 for s in sources
             ]
             parts = [_vector(note, source.joints, source.field) for note, source in zip(taken, sources, strict=True)]
             assert values[row].tobytes() == np.array(list(chain(*parts)), dtype=values.dtype).tobytes()
-            assert columns.stamps[feature][row] == min(note.header_ns for note in taken)
+            assert table.stamps[feature][row] == min(note.header_ns for note in taken)
 
 
 def test_images(imported: tuple[Layout, bags.Notes, Path]) -> None:
     layout, notes, run = imported
     with _open(run) as recording:
-        columns = recording.columns()
+        table = recording.table()
         for camera, topic in layout.cameras.items():
             of_topic = bags.of_topic(notes, topic)
             packets = list(recording.packets(camera))
-            stamps = columns.image_stamps[camera]
+            stamps = table.image_stamps[camera]
             by_stamp = {note.header_ns: note for note in of_topic}
-            for row, time_ns in enumerate(columns.time_ns.tolist()):
+            for row, time_ns in enumerate(table.time_ns.tolist()):
                 expected = max(
                     (note for note in of_topic if note.header_ns <= time_ns), key=lambda note: note.header_ns
                 )
-                assert stamps[columns.images[camera][row]] == expected.header_ns
+                assert stamps[table.images[camera][row]] == expected.header_ns
             kept = next(row for row in recording.info.cameras if row.name == camera).kept
             for packet, stamp in zip(packets, stamps.tolist(), strict=True):
                 if kept:
@@ -173,11 +173,11 @@ def test_several_episodes_in_a_bag(cut: str, tmp_path: Path) -> None:
     import_bags([_so101(tmp_path, notes)], mapping, tmp_path / "run")
     with _open(tmp_path / "run") as first, _open(tmp_path / "run", 1) as second:
         assert [first.success, second.success] == outcomes
-        assert first.columns().time_ns[-1] < second.columns().time_ns[0]
+        assert first.table().time_ns[-1] < second.table().time_ns[0]
         if cut == "marker":
             front = [note.header_ns for note in bags.of_topic(notes, "/follower/cam_front/image_raw/compressed")]
             begin = bags.EPOCH_NS + bags.NS // 10
-            assert first.columns().time_ns[0] == min(time for time in front if time >= begin)
+            assert first.table().time_ns[0] == min(time for time in front if time >= begin)
 
 
 def test_two_publishers_on_one_topic(tmp_path: Path) -> None:
@@ -274,7 +274,7 @@ def test_a_image_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
     with _open(tmp_path / "run") as recording:
         assert (
             bags.of_topic(notes, "/follower/cam_front/image_raw/compressed")[12].header_ns
-            not in recording.columns().image_stamps["front"]
+            not in recording.table().image_stamps["front"]
         )
 
 
@@ -355,7 +355,7 @@ def test_a_video_that_begins_between_keyframes(tmp_path: Path) -> None:
     assert "first 7 images" in finding.text
     with _open(tmp_path / "run") as recording:
         assert next(iter(recording.packets("high"))).is_keyframe
-        assert len(list(recording.images("high"))) == len(recording.columns().image_stamps["high"])
+        assert len(list(recording.images("high"))) == len(recording.table().image_stamps["high"])
 
 
 def test_a_video_without_keyframes_is_refused(tmp_path: Path) -> None:

@@ -108,7 +108,7 @@ def assert_imported(root: Path, run: Path) -> None:
     assert len(found) == len(LENGTHS)
     for episode, path in enumerate(found):
         with Recording(path) as recording:
-            np.testing.assert_array_equal(recording.columns().features["observation.state"], state(episode))
+            np.testing.assert_array_equal(recording.table().features["observation.state"], state(episode))
             assert (recording.info.instruction, recording.info.robot_name) == ("push it", "so100")
             assert recording.info.cameras[0].kept == "h264"
             levels = [int(image.mean().round()) for image in recording.images("top")]

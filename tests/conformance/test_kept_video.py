@@ -74,7 +74,7 @@ def expected(notes: bags.Notes, run: Path) -> list[Images]:
     found = []
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as recording:
-            found.append([by_stamp[time] for time in recording.columns().time_ns.tolist()])
+            found.append([by_stamp[time] for time in recording.table().time_ns.tolist()])
     return found
 
 
@@ -157,12 +157,12 @@ def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as given, Recording(tmp_path / "run/episodes" / path.name) as found:
             ours, theirs = (list(recording.packets("high")) for recording in (found, given))
-            length = given.columns().num_frames
+            length = given.table().num_frames
             slices = [[packet.data[packet.data.rfind(b"\0\0\1") :] for packet in packets] for packets in (ours, theirs)]
             assert slices[0] == slices[1][: len(ours)]
-            assert len(ours) - length == found.columns().images["high"][0] > 0
-            times = found.columns().time_ns
-            assert np.array_equal(found.columns().image_stamps["high"][-length:], times)
+            assert len(ours) - length == found.table().images["high"][0] > 0
+            times = found.table().time_ns
+            assert np.array_equal(found.table().image_stamps["high"][-length:], times)
     export(tmp_path / "run", tmp_path / "d")
     assert dataset_digest(tmp_path / "d") == dataset_digest(dataset)
 

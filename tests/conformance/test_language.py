@@ -110,7 +110,7 @@ def test_our_recipe_gives_messages_for_every_frame(dataset: Path) -> None:
 def test_one_subtask_holds_at_every_frame_and_changes_with_the_phase(runs: list[Path], dataset: Path) -> None:
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
-            phase, misses = recording.columns().phase, recording.columns().is_deliberate_miss
+            phase, misses = recording.phases, recording.trajectory().is_deliberate_miss
             times = (np.arange(len(phase)) / recording.info.fps).astype(np.float32).tolist()
         rows = [active(frames[0][0], "subtask", time) for time in times]
         assert all(len(row) == 1 for row in rows)
@@ -130,20 +130,22 @@ def test_one_subtask_holds_at_every_frame_and_changes_with_the_phase(runs: list[
 def test_subtasks_name_the_thing_that_rises_and_the_place_where_it_ends(runs: list[Path], dataset: Path) -> None:
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
-            columns, scene, fps = recording.columns(), recording.info.scene, recording.info.fps
+            trajectory, scene, fps = recording.trajectory(), recording.info.simulated.scene, recording.info.fps
         lifts = 0
         subtasks = [row for row in frames[0][0] if row["style"] == "subtask"]
         for row, after in itertools.pairwise(subtasks):
             first, last = (round(part["timestamp"] * fps) for part in (row, after))
             if row["content"].startswith("lift the "):
-                risen = {name: poses[last, 2] - poses[first, 2] for name, poses in columns.object_poses.items()}
-                now = scene_at(scene, {name: poses[first] for name, poses in columns.object_poses.items()})
+                risen = {name: poses[last, 2] - poses[first, 2] for name, poses in trajectory.object_poses.items()}
+                now = scene_at(scene, {name: poses[first] for name, poses in trajectory.object_poses.items()})
                 assert max(risen, key=lambda name: risen[name]) in meant(phrases(row["content"])[0], now)
                 lifts += 1
             if row["content"].startswith("lower the ") and "gripper" not in row["content"]:
                 _, place = (meant(phrase, scene) for phrase in phrases(row["content"]))
-                tcp = scene.robot.world_from_base.apply(columns.base_from_tcp[last, :3])
-                bodies = {body.name: columns.object_poses.get(body.name) for body in scene.bodies if body.name in place}
+                tcp = scene.robot.world_from_base.apply(trajectory.base_from_tcp[last, :3])
+                bodies = {
+                    body.name: trajectory.object_poses.get(body.name) for body in scene.bodies if body.name in place
+                }
                 for name, poses in bodies.items():
                     where = scene.body(name).world_from_body.position if poses is None else poses[last]
                     assert np.abs(tcp[:2] - where[:2]).max() < 0.5 * max(scene.body(name).shape.extents)
@@ -153,7 +155,7 @@ def test_subtasks_name_the_thing_that_rises_and_the_place_where_it_ends(runs: li
 def test_every_wording_means_the_task_and_nothing_else(runs: list[Path], dataset: Path) -> None:
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
-            scene, instruction = recording.info.scene, recording.info.instruction
+            scene, instruction = recording.info.simulated.scene, recording.info.instruction
         wordings = [row["content"] for row in frames[0][0] if row["style"] == "task_aug"]
         assert all(
             row["role"] == "user" and row["timestamp"] == 0 for row in frames[0][0] if row["style"] == "task_aug"
@@ -175,7 +177,7 @@ def test_motions_are_those_of_the_tcp(runs: list[Path], dataset: Path) -> None:
     axes = {"forward": (0, 1), "backward": (0, -1), "left": (1, 1), "right": (1, -1), "up": (2, 1), "down": (2, -1)}
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
-            columns, fps = recording.columns(), recording.info.fps
+            trajectory, fps = recording.trajectory(), recording.info.fps
         rows = [row for row in frames[0][0] if row["style"] == "motion"]
         starts = [round(row["timestamp"] * fps) for row in rows]
         for row, first, last in zip(rows, starts, [*starts[1:], len(frames) - 1], strict=True):
@@ -183,8 +185,11 @@ def test_motions_are_those_of_the_tcp(runs: list[Path], dataset: Path) -> None:
             for centimetres, direction in re.findall(r"(\d+) cm (\w+)", row["content"]):
                 axis, sign = axes[direction]
                 told[axis] = sign * int(centimetres) / 100
-            assert np.abs(told - (columns.base_from_tcp[last, :3] - columns.base_from_tcp[first, :3])).max() <= 0.005001
-            opened = columns.gripper_width[last] - columns.gripper_width[first]
+            assert (
+                np.abs(told - (trajectory.base_from_tcp[last, :3] - trajectory.base_from_tcp[first, :3])).max()
+                <= 0.005001
+            )
+            opened = trajectory.gripper_width[last] - trajectory.gripper_width[first]
             if match := re.search(r"(open|close) the gripper by ([\d.]+) cm", row["content"]):
                 assert abs(float(match[2]) / 100 * (1 if match[1] == "open" else -1) - opened) <= 0.002501
             else:
@@ -194,7 +199,7 @@ def test_motions_are_those_of_the_tcp(runs: list[Path], dataset: Path) -> None:
 def test_memories_come_when_it_is_done(runs: list[Path], dataset: Path) -> None:
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
-            goals, tutorial = recording.info.scene.goals, recording.info.task == "tutorial"
+            goals, tutorial = recording.info.simulated.scene.goals, recording.info.simulated.task == "tutorial"
         memories = [row for row in frames[0][0] if row["style"] == "memory"]
         subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
         assert {row["timestamp"] for row in memories} <= set(subtasks)
@@ -208,7 +213,7 @@ def test_memories_come_when_it_is_done(runs: list[Path], dataset: Path) -> None:
 def test_fewer_frames_begin_a_subtask_at_the_first_frame_that_is_left(runs: list[Path], tmp_path: Path) -> None:
     export(runs[0], tmp_path / "slow", language=("subtask",), fps=10)
     with _recording(runs[0]) as recording:
-        phase = recording.columns().phase[::3]
+        phase = recording.phases[::3]
     (frames,) = language_of(tmp_path / "slow")
     rows = frames[0][0]
     assert {row["style"] for row in rows} == {"subtask"}
@@ -279,7 +284,7 @@ def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset
             expected = normalize_stage_tau(value, temporal_proportions=shares, subtask_names=stages)
             assert abs(float(expected) - own[frame]) < 2e-3, (run, frame)
         with _recording(run) as recording:
-            misses, phase = recording.columns().is_deliberate_miss, recording.columns().phase
+            misses, phase = recording.trajectory().is_deliberate_miss, recording.phases
         changes = {frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]}
         assert set(starts[1:]) <= changes
         # It falls only where an attempt missed.
@@ -318,14 +323,19 @@ def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], datase
             info, outcome = recording.info, recording.outcome
             assert row["duration_s"] == recording.num_frames / info.fps
         assert outcome is not None
-        body = info.scene.body(info.scene.goals[0].object)
-        assert (row["task_name"], row["seed"], row["split"], row["variation"]) == (info.task, 3, "all", "mild")
+        body = info.simulated.scene.body(info.simulated.scene.goals[0].object)
+        assert (row["task_name"], row["seed"], row["split"], row["variation"]) == (
+            info.simulated.task,
+            3,
+            "all",
+            "mild",
+        )
         assert (row["object_x"], row["object_y"]) == tuple(body.world_from_body.position[:2])
-        assert row["drawn/speed"] == info.behaviour["speed"]
+        assert row["drawn/speed"] == info.simulated.behaviour["speed"]
         assert row["drawn/object_mass"] == body.mass
         found = [check.value for check in outcome.checks if check.name.split(":")[0] == "tilt"]
         assert row["success_checks/tilt"] == max(found)
-        assert (row["success_checks/distance_to_goal"] is None) == (info.task == "tutorial")
+        assert (row["success_checks/distance_to_goal"] is None) == (info.simulated.task == "tutorial")
 
 
 @pytest.mark.slow

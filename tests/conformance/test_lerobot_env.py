@@ -107,10 +107,10 @@ def test_evaluate_records_every_rollout_goes_on_and_refuses_another(
         with Recording(trained / "b" / rollout.file) as recording:
             assert recording.num_frames == 9
             assert recording.info.origin == f"rollout of act {settings.policy_digest}"
-            columns = recording.columns()
-            assert np.array_equal(columns.command_joint_target, columns.action_joint_target)
+            trajectory = recording.trajectory()
+            assert np.array_equal(trajectory.command_joint_target, trajectory.action_joint_target)
             # The commands led from each state to the next: the arm moved towards them.
-            assert np.abs(columns.joint_position[5, :7] - columns.command_joint_target[3]).max() < 0.05
+            assert np.abs(trajectory.joint_position[5, :7] - trajectory.command_joint_target[3]).max() < 0.05
             assert recording.outcome is not None
             assert not recording.outcome.success
     assert load_evaluation(trained / "b").rate.trials == 3
@@ -143,7 +143,7 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
     assert "success       2/2 = 100.0 %" in told
     for path in sorted((trained / "corrections" / "episodes").iterdir()):
         with Recording(path) as recording:
-            phases = recording.columns().phase
+            phases = recording.phases
         assert set(phases[:9]) == {"policy"}
         assert "policy" not in phases[9:]
     assert exit_code(*words, "--num-episodes", "2", "--stuck-seconds", "1", "--out", trained / "corrections") == 2

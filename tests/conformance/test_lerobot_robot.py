@@ -178,7 +178,7 @@ def test_lerobot_teleoperate_drives_the_simulated_arm(ran: Path, run: Path) -> N
         Recording(ran / "driven" / "episode_000000.mcap") as driven,
         Recording(next((run / "episodes").iterdir())) as expert,
     ):
-        found, wanted = driven.columns().command_joint_target, expert.columns().action_joint_target
+        found, wanted = driven.trajectory().command_joint_target, expert.trajectory().action_joint_target
     assert len(found)
     assert np.abs(found - wanted[: len(found)]).max() < 1e-5
 
@@ -191,7 +191,7 @@ def test_lerobot_record_writes_what_the_recording_has(ran: Path) -> None:
     assert tuple(found["features"]["observation.state"]["names"]) == NAMES
     state = np.array(table["observation.state"].to_pylist())
     with Recording(ran / "beside" / "episode_000000.mcap") as recording:
-        radians = recording.columns().joint_position
+        radians = recording.trajectory().joint_position
     assert len(state) == len(radians) > 1
     assert np.abs(state[:, :5] - np.degrees(radians[:, :5])).max() < 0.1
 

@@ -105,8 +105,8 @@ def test_features_are_those_that_lerobot_records(dataset: Path, driver: Callable
 
 def test_values_are_the_radians_of_the_recording(run: Path, dataset: Path) -> None:
     with Recording(next((run / "episodes").iterdir())) as recording:
-        c = recording.columns()
-        jaw = recording.info.robot.gripper.joint_position(c.action_gripper)
+        c = recording.trajectory()
+        jaw = recording.info.simulated.robot.gripper.joint_position(c.action_gripper)
     state, action = columns(dataset)
     for found, radians in ((state, c.joint_position), (action, np.column_stack([c.action_joint_target, jaw]))):
         # A count is 0.088 degrees: LeRobot's whole turn lacks one, and the roll's middle lies half a count off.
@@ -119,7 +119,7 @@ def test_values_are_the_radians_of_the_recording(run: Path, dataset: Path) -> No
 def radians(run: Path) -> np.ndarray[Any, Any]:
     """(T, 6) of the recording, the jaw's last."""
     with Recording(next((run / "episodes").iterdir())) as recording:
-        return recording.columns().joint_position
+        return recording.trajectory().joint_position
 
 
 @pytest.mark.parametrize("units", UNITS)
@@ -157,7 +157,7 @@ def test_what_lerobot_recorded_is_read_as_radians(
     assert exit_code("import", "lerobot", tmp_path / "d", *named, "--out", tmp_path / "again") == 0
     with open_recording(next((tmp_path / "again" / "episodes").iterdir())) as recording:
         feature = next(found for found in recording.info.features if found.name == "observation.state")
-        read = feature.in_si(recording.columns().features["observation.state"])
+        read = feature.in_si(recording.table().features["observation.state"])
         assert 'name="so101' in recording.info.urdf
     assert feature.joints == tuple(OWN)
     expected = radians(run)

@@ -354,12 +354,12 @@ def test_coordinate_frames_are_where_pybullet_has_the_links(
     assert transforms["world"][0] == "tf#/"
     client = pybullet.connect(pybullet.DIRECT)
     try:
-        body = pybullet.loadURDF(str(asset_path(info.robot.urdf)), useFixedBase=True, physicsClientId=client)
+        body = pybullet.loadURDF(str(asset_path(info.simulated.robot.urdf)), useFixedBase=True, physicsClientId=client)
         count = pybullet.getNumJoints(body, physicsClientId=client)
         joints = [pybullet.getJointInfo(body, index, physicsClientId=client) for index in range(count)]
         numbers = {row[1].decode(): row[0] for row in joints}
         for frame in (frames[0], frames[17], frames[-1]):
-            for name, value in zip(info.robot.joint_names, frame.observation.joint_position, strict=True):
+            for name, value in zip(info.simulated.robot.joint_names, frame.observation.joint_position, strict=True):
                 pybullet.resetJointState(body, numbers[name], value, physicsClientId=client)
             tree = {**transforms, **moving[frame.time_ns]}
             for row in joints:

@@ -78,8 +78,8 @@ def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pyte
         with Recording(before) as there, Recording(after) as here:
             assert (here.success, here.info.instruction, here.num_frames) == (there.success, "stack the cups", 12)
             assert here.info.robot_name == "two_joints"
-            for name, values in there.columns().features.items():
-                found = here.columns().features[name]
+            for name, values in there.table().features.items():
+                found = here.table().features[name]
                 np.testing.assert_array_equal(found, values.astype(np.float32) if exporter == "lerobot" else values)
             (state,) = (feature for feature in here.info.features if feature.name == "observation.state")
             assert state.names == ("shoulder.pos", "elbow.pos", "gripper.pos")
@@ -133,7 +133,7 @@ def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[st
             own = [row for row in rows if row["episode_index"] == index]
             said = [entry for entry in own[0]["language_persistent"] if entry["style"] == "subtask"]
             assert [text for _, text in recording.subtasks] == [entry["content"] for entry in said]
-            np.testing.assert_array_equal(recording.columns().features["action"], [row["action"] for row in own])
+            np.testing.assert_array_equal(recording.table().features["action"], [row["action"] for row in own])
     export(again, tmp_path / "b", depth=True, language=())
     imported("lerobot", tmp_path / "b", tmp_path / "third")
     export(tmp_path / "third", tmp_path / "c", depth=True, language=())

@@ -169,12 +169,12 @@ def test_frozen_images_in_a_dataset_that_lerobot_wrote(run: Path, tmp_path: Path
         dataset = LeRobotDataset.create("local/foreign", 30, features, root=tmp_path / name)
         for path in sorted((run / "episodes").glob("*.mcap")):
             with Recording(path) as recording:
-                columns, images = recording.columns(), list(recording.images("front"))
-            for t in range(columns.num_frames):
+                trajectory, images = recording.trajectory(), list(recording.images("front"))
+            for t in range(trajectory.num_frames):
                 dataset.add_frame(
                     {
-                        STATE: columns.joint_position[t, :7].astype(np.float32),
-                        ACTION: columns.action_joint_target[t].astype(np.float32),
+                        STATE: trajectory.joint_position[t, :7].astype(np.float32),
+                        ACTION: trajectory.action_joint_target[t].astype(np.float32),
                         FRONT: images[stuck.start if t in stuck else t],
                         "task": "pick it up",
                     }

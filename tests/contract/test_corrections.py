@@ -89,9 +89,9 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     attempt, path = rollout
     assert attempt.success
     with Recording(path) as recording:
-        phases = recording.columns().phase
+        phases = recording.phases
         assert recording.info.origin == "correction of lazy 0"
-        assert recording.info.behaviour["action_noise"] == 0.0
+        assert recording.info.simulated.behaviour["action_noise"] == 0.0
         assert recording.outcome is not None
         assert recording.outcome.success
         (event,) = [event for _, event in recording.events() if event.name == "take_over"]
@@ -261,20 +261,20 @@ def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Arr
     attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), rules, action="ee")
     assert attempt.success
     with Recording(path) as recording:
-        columns = recording.columns()
-        assert recording.info.behaviour["action_noise"] > 0.0
-    by_policy = np.array([phase == POLICY_PHASE for phase in columns.phase])
+        trajectory = recording.trajectory()
+        assert recording.info.simulated.behaviour["action_noise"] > 0.0
+    by_policy = np.array([phase == POLICY_PHASE for phase in trajectory.phase])
     turns = np.flatnonzero(np.diff(by_policy)) + 1
     assert len(turns) >= 2  # policy, expert, policy
     assert by_policy[0]
-    differs = (columns.action_joint_target != columns.command_joint_target).any(axis=1)
+    differs = (trajectory.action_joint_target != trajectory.command_joint_target).any(axis=1)
     assert not differs[by_policy].any()
     options = ReplayOptions()
     report, _ = next(iter(replay_all([open_file(path, options)], options)))
     assert report.is_identical, report
     export(path, tmp_path / "dataset", intervention=True)
     assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [
-        phase not in (POLICY_PHASE, "halt") for phase in columns.phase
+        phase not in (POLICY_PHASE, "halt") for phase in trajectory.phase
     ]
     checked = check_subject(Subject(path=path, kind="recording"), CheckOptions())
     assert [result.check for result in checked.results if result.level == "fail"] == []

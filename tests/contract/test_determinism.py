@@ -25,7 +25,7 @@ def check(task: str, robot: str, variation: str) -> None:
     with make_world(info) as world:
         run(episode(4, task=task, robot=robot, variation=variation, max_episode_seconds=2.0), world)
         assert run(prepared, world)[1].final_state_digest == outcome.final_state_digest
-        world.reset(info.scene)
+        world.reset(info.simulated.scene)
         for frame in frames:
             assert world.observe().object_poses == frame.observation.object_poses
             world.apply(frame.command)

@@ -45,12 +45,12 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
 def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, features=(name,), episodes="0")
     with Recording(run / "episodes" / "episode_000000.mcap") as recording:
-        columns = recording.columns()
+        trajectory = recording.trajectory()
     expected = {
-        "observation.effort": columns.joint_effort[:, :7],
-        "observation.contact_force": columns.contact_force[:, np.newaxis],
-        "observation.wrench": columns.sensed["wrench"],
-        "command": np.column_stack([columns.command_joint_target, columns.command_gripper]),
+        "observation.effort": trajectory.joint_effort[:, :7],
+        "observation.contact_force": trajectory.contact_force[:, np.newaxis],
+        "observation.wrench": trajectory.sensed["wrench"],
+        "command": np.column_stack([trajectory.command_joint_target, trajectory.command_gripper]),
     }[name]
     assert expected is not None
     assert np.ptp(expected) > 0

@@ -10,7 +10,8 @@ from support.sim import episode, run
 
 from demorec.core.tables import ROBOTS
 from demorec.episode.scene import Shape
-from demorec.loop import Episode, ScriptAgent, Session, make_world
+from demorec.episode.simulated import with_simulation
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world
 
 pytestmark = pytest.mark.slow
 
@@ -18,16 +19,16 @@ SINKING = 1e-3
 """Of each finger, metres, that is too much."""
 
 
-def smallest_opening(made: Episode) -> float:
+def smallest_opening(made: PreparedEpisode) -> float:
     """The gripper's smallest opening, metres, while something is lifted and carried."""
     with make_world(made.info) as world:
         frames = Session.of_episode(world, made).run(ScriptAgent(made))
         return min(frame.observation.gripper_width for frame in frames if frame.phase in ("lift", "transport"))
 
 
-def with_cube(made: Episode, *, side: float, mass: float, friction: float) -> Episode:
+def with_cube(made: PreparedEpisode, *, side: float, mass: float, friction: float) -> PreparedEpisode:
     """The same episode with another cube."""
-    scene = made.info.scene
+    scene = made.info.simulated.scene
     cube = scene.body("red_cube")
     pose = replace(cube.world_from_body, position=cube.world_from_body.position * [1, 1, side / cube.shape.size[2]])
     cube = replace(
@@ -38,7 +39,7 @@ def with_cube(made: Episode, *, side: float, mass: float, friction: float) -> Ep
         lateral_friction=friction,
     )
     bodies = tuple(cube if body.name == cube.name else body for body in scene.bodies)
-    return replace(made, info=made.info.with_simulation(scene=replace(scene, bodies=bodies)))
+    return replace(made, info=with_simulation(made.info, scene=replace(scene, bodies=bodies)))
 
 
 @pytest.mark.parametrize("robot", ROBOTS.names())

@@ -22,7 +22,7 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.gym_env import DemorecEnv, env_id
@@ -52,8 +52,14 @@ def test_things_are_drawn_from_the_named_shelves_and_their_split() -> None:
     flags: dict[str, Any] = {"objects": ("blocks",), "object_split": "eval", "split": "all"}
     env = make("pick_anything", **flags)
     env.reset(seed=3)
-    assert env.episode.info.scene == episode(3, task="pick_anything", variation="mild", **flags).info.scene
-    assert env.episode.info.scene != episode(3, task="pick_anything", variation="mild", split="all").info.scene
+    assert (
+        env.episode.info.simulated.scene
+        == episode(3, task="pick_anything", variation="mild", **flags).info.simulated.scene
+    )
+    assert (
+        env.episode.info.simulated.scene
+        != episode(3, task="pick_anything", variation="mild", split="all").info.simulated.scene
+    )
     env.close()
     plugin = pytest.importorskip("lerobot_env_demorec")
     kwargs = plugin.DemorecEnvConfig(task="pick_anything", objects=["blocks"], object_split="eval").gym_kwargs
@@ -74,11 +80,11 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
 def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_path: Path) -> None:
     """The numbers of the exported features of a file on disk, against those that a policy would see."""
     with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
-        info, columns = recording.info, recording.columns()
-    rows = ObservationRows.of_columns(columns)
-    expected = features.observation_vectors(rows, info.robot, info.scene, privileged=True)
+        info, trajectory = recording.info, recording.trajectory()
+    rows = ObservationRows.of_trajectory(trajectory)
+    expected = features.observation_vectors(rows, info.simulated.robot, info.simulated.scene, privileged=True)
     # The first task to its end, the others until they have touched something.
-    count = columns.num_frames if task == "pick_place" else min(columns.num_frames, 2 * FRAMES)
+    count = trajectory.num_frames if task == "pick_place" else min(trajectory.num_frames, 2 * FRAMES)
 
     env = make(task, split="all")
     observation, _ = env.reset(seed=3)
@@ -87,7 +93,7 @@ def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_pa
         for name, key in env.keys.items():
             assert key == KEYS[name]
             assert np.array_equal(observation[key], expected[name][t]), (name, t)
-        command = np.append(columns.command_joint_target[t], columns.command_gripper[t])
+        command = np.append(trajectory.command_joint_target[t], trajectory.command_gripper[t])
         observation, _, terminated, _, _ = env.step(command)
     assert terminated == (task == "pick_place")
     env.close()
@@ -100,38 +106,38 @@ def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> 
     table = data_table(tmp_path / "ds")
     exported = {name: np.array(table.column(name).to_pylist(), np.float32) for name in (*SENSED, "command", "action")}
     with Recording(path) as recording:
-        columns = recording.columns()
+        trajectory = recording.trajectory()
     env = make(split="all", sensed=tuple(SENSED))
     observation, _ = env.reset(seed=3)
     assert env.observation_space.contains(observation)
     assert np.abs(exported["observation.contact_force"]).max() > 1.0
-    for t in range(columns.num_frames):
+    for t in range(trajectory.num_frames):
         for name in SENSED:
             expected = exported[name][t].reshape(-1)  # a column of one number is a column of scalars
             assert np.array_equal(observation[name.removeprefix("observation.")], expected), (name, t)
-        command = np.append(columns.command_joint_target[t], columns.command_gripper[t])
+        command = np.append(trajectory.command_joint_target[t], trajectory.command_gripper[t])
         observation, *_, found = env.step(command)
         assert np.array_equal(found["command"].astype(np.float32), exported["command"][t])
     env.close()
 
 
 @pytest.fixture(scope="module")
-def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, Columns]:
+def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, Trajectory]:
     """What the expert did in an episode without noise, read from a file."""
     path = simulate(tmp_path_factory.mktemp("expert") / "e.mcap", episode_index=2, variation="none")
     with Recording(path) as recording:
-        return recording.info, recording.columns()
+        return recording.info, recording.trajectory()
 
 
 @pytest.mark.parametrize("kind", ACTION_KINDS)
-def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Columns], kind: features.ActionKind) -> None:
+def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Trajectory], kind: features.ActionKind) -> None:
     """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
-    info, columns = expert
-    actions = features.action_vectors(columns, info.scene, kind)
+    info, trajectory = expert
+    actions = features.action_vectors(trajectory, info.simulated.scene, kind)
     assert actions.dtype == np.float32
     env = make(split="all", variation="none", action=kind)
     env.reset(seed=2)
-    assert env.info.scene == info.scene
+    assert env.info.simulated.scene == info.simulated.scene
     rewards = []
     for action in actions:
         assert env.action_space.contains(action)
@@ -162,10 +168,10 @@ def test_images_are_those_of_the_rollout() -> None:
 
 
 def test_a_recordings_scene_can_be_set_up() -> None:
-    scene = episode(7, seed=99).info.scene
+    scene = episode(7, seed=99).info.simulated.scene
     env = make(split="all")
     env.reset(seed=0, options={"scene": scene, "something of LeRobot's": True})
-    assert env.info.scene == scene
+    assert env.info.simulated.scene == scene
     env.close()
 
 
@@ -186,7 +192,7 @@ def test_time_is_limited_and_nonsense_is_refused() -> None:
     with pytest.raises(RuntimeError, match="reset"):
         env.step(env.action_space.sample())
     env.reset(seed=0)
-    hold = np.append(env.info.scene.robot.joint_position, 0.08)
+    hold = np.append(env.info.simulated.scene.robot.joint_position, 0.08)
     ends = [env.step(hold)[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
     with pytest.raises(ValueError, match="finite"):
@@ -207,8 +213,8 @@ def test_time_is_limited_and_nonsense_is_refused() -> None:
 def test_commands_keep_to_the_limits() -> None:
     env = make()
     env.reset(seed=0)
-    robot = env.info.robot
-    before = np.array(env.info.scene.robot.joint_position)
+    robot = env.info.simulated.robot
+    before = np.array(env.info.simulated.scene.robot.joint_position)
     for target in (np.full(7, 100.0), np.full(7, -100.0)):
         env.step(np.append(target, 5.0))
         frame = env.situation.last_frame
@@ -229,7 +235,7 @@ def test_render_shows_the_world() -> None:
     assert image.shape == (48, 64, 3)
     assert image.std() > 10
     for _ in range(8):
-        env.step(np.append(np.array(env.info.scene.robot.joint_position) + 0.4, 0.08))
+        env.step(np.append(np.array(env.info.simulated.scene.robot.joint_position) + 0.4, 0.08))
     assert not np.array_equal(image, present(env.render()))
     env.close()
 

@@ -63,7 +63,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     recording = run / "episodes" / "episode_000000.mcap"
     with Recording(recording) as opened:
         assert opened.cameras == ("front", "corner")
-        assert opened.info.robot.urdf == "my_robots:xarm6.urdf"  # and no path of this machine
+        assert opened.info.simulated.robot.urdf == "my_robots:xarm6.urdf"  # and no path of this machine
         assert opened.info.versions == load_run_file(run).versions
     assert (run / "dataset" / "videos" / "observation.images.corner").is_dir()
 

@@ -22,13 +22,13 @@ def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch
     for robot in (name for name in ROBOTS.names() if ROBOTS.load(name).task_scale == 1.0):  # its lengths are fixed
         path = simulate(tmp_path / f"{robot}.mcap", task="my_pushing_tasks:PushToMark", robot=robot, seed=3)
         with Recording(path) as recording:
-            columns, outcome, scene = recording.columns(), recording.outcome, recording.info.scene
+            trajectory, outcome, scene = recording.trajectory(), recording.outcome, recording.info.simulated.scene
         assert outcome is not None
         assert outcome.success, outcome
-        assert list(dict.fromkeys(columns.phase)) == ["open", "approach", "descend", "push", "retreat"]
-        start, end = columns.object_poses["red_cube"][0], columns.object_poses["red_cube"][-1]
+        assert list(dict.fromkeys(trajectory.phase)) == ["open", "approach", "descend", "push", "retreat"]
+        start, end = trajectory.object_poses["red_cube"][0], trajectory.object_poses["red_cube"][-1]
         assert 0.09 < math.dist(start[:2], end[:2]) < 0.16
-        assert columns.object_poses["red_cube"][:, 2].max() < start[2] + 0.005  # pushed, not carried
+        assert trajectory.object_poses["red_cube"][:, 2].max() < start[2] + 0.005  # pushed, not carried
         assert math.dist(end[:2], scene.goals[0].onto_from_goal.position[:2]) < 0.02
         options = ReplayOptions(allowed=("my_pushing_tasks",))
         ((report, _),) = replay_all([open_file(path, options)], options)

@@ -49,7 +49,7 @@ def test_a_blow_that_turns_the_cube_into_a_finger_is_no_success() -> None:
 
 def farthest(index: int, **config: Any) -> float:
     """Of the middle of the cubes at the start, seen from above, metres from the base."""
-    scene = episode(index, task="support.odd_tasks:Wide", variation="none", **config).info.scene
+    scene = episode(index, task="support.odd_tasks:Wide", variation="none", **config).info.simulated.scene
     return max(math.hypot(*body.world_from_body.position[:2].tolist()) for body in scene.movable)
 
 
@@ -63,7 +63,7 @@ def test_a_layout_that_is_drawn_anew_is_in_the_held_out_rectangle_too() -> None:
     ranges = Ranges(held_out_x=(0.4, 1.1), held_out_y=(0.0, 0.1))
     for index in range(10):
         made = episode(index, task="support.odd_tasks:Wide", variation="none", split="eval", ranges=ranges)
-        (cube,) = made.info.scene.movable
+        (cube,) = made.info.simulated.scene.movable
         x, y, _ = cube.world_from_body.position.tolist()
         assert 0.4 <= x < 0.83
         assert 0.0 <= y <= 0.1

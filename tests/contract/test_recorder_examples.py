@@ -45,30 +45,30 @@ def first_of(run: Path) -> Recording:
 def test_a_robots_loop(runs: Path) -> None:
     assert [line.success for line in load_any_run_file(runs / "real_robot").attempts] == [True, True]
     with first_of(runs / "real_robot") as recording:
-        columns = recording.columns()
+        table = recording.table()
     targets = np.sin(np.arange(60) / 10)
-    assert columns.features["action"].tolist() == [[target] * 6 for target in targets.tolist()]
+    assert table.features["action"].tolist() == [[target] * 6 for target in targets.tolist()]
     position = 0.0
-    for row, target in zip(columns.features["observation.state"], targets.tolist(), strict=True):
+    for row, target in zip(table.features["observation.state"], targets.tolist(), strict=True):
         assert row.tolist() == [position] * 6
         position += 0.5 * (target - position)
-    held = columns.images["top"]
+    held = table.images["top"]
     assert [int(number) for number in held] == [-1 if step % 3 == 2 else step - step // 3 for step in range(60)]
-    assert (columns.image_age_ns("top") >= 0).all()  # taken before the frame was written
+    assert (table.image_age_ns("top") >= 0).all()  # taken before the frame was written
 
 
 def test_a_simulation_of_ones_own(runs: Path) -> None:
     with first_of(runs / "own_simulation") as recording:
-        columns = recording.columns()
+        table = recording.table()
         state, action = recording.info.features
         assert state.joints == action.joints == tuple(f"lbr_iiwa_joint_{n}" for n in range(1, 8))
         assert "lbr_iiwa_link_7" in recording.info.urdf
         assert recording.info.cameras[0].intrinsics is not None
         assert math.isclose(recording.info.cameras[0].intrinsics[0], 64 / math.tan(math.pi / 6))
         front, side = (next(recording.images(name)) for name in ("front", "side"))
-    assert columns.time_ns.tolist() == [frame * 1_000_000_000 // 30 for frame in range(45)]
-    last, goal = columns.features["observation.state"][-1], columns.features["action"][0]
-    assert np.abs(last - goal).max() < np.abs(columns.features["observation.state"][0] - goal).max()
+    assert table.time_ns.tolist() == [frame * 1_000_000_000 // 30 for frame in range(45)]
+    last, goal = table.features["observation.state"][-1], table.features["action"][0]
+    assert np.abs(last - goal).max() < np.abs(table.features["observation.state"][0] - goal).max()
     assert exit_code("check", str(runs / "own_simulation"), "--strict") == 0
     assert front.std() > 5
     assert np.abs(front.astype(int) - side).mean() > 1
@@ -78,12 +78,12 @@ def test_a_gymnasium_environment(runs: Path) -> None:
     lines = load_any_run_file(runs / "gym_wrapper").attempts
     assert [line.num_frames for line in lines] == [40, 40, 40]
     with first_of(runs / "gym_wrapper") as recording:
-        columns = recording.columns()
-    state = columns.features["observation.state"]  # cosine, sine, angular velocity
+        table = recording.table()
+    state = table.features["observation.state"]  # cosine, sine, angular velocity
     assert state.dtype == np.float32
     assert np.allclose(state[:, 0] ** 2 + state[:, 1] ** 2, 1, atol=1e-6)
     # The pendulum's own equation: frame t's action leads from its observation to the next one.
     angle = np.arctan2(state[:, 1], state[:, 0])
-    torque = np.clip(columns.features["action"][:, 0], -2, 2)
+    torque = np.clip(table.features["action"][:, 0], -2, 2)
     velocity = np.clip(state[:, 2] + (15 * np.sin(angle) + 3 * torque) * 0.05, -8, 8)
     assert np.allclose(state[1:, 2], velocity[:-1], atol=1e-4)

@@ -11,7 +11,7 @@ from support.tasks import tasks_with_slow_ones
 
 from demorec.core.geometry import Array, Pose, quat_multiply
 from demorec.episode.episode import HALT_PHASE
-from demorec.loop import Episode, ScriptAgent, Session, make_world
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, raised
 from demorec.tasks.recovery import TAKE_OVER, is_served
@@ -30,7 +30,7 @@ def apply(world: World, steps: Iterator[Step]) -> list[Step]:
     return done
 
 
-def begin(world: World, prepared: Episode, until: str = "", frames: int = 10_000) -> None:
+def begin(world: World, prepared: PreparedEpisode, until: str = "", frames: int = 10_000) -> None:
     """Run the script until a phase, or for so many frames."""
     session = Session.of_episode(world, prepared)
     for frame in session.run(ScriptAgent(prepared)):
@@ -38,7 +38,7 @@ def begin(world: World, prepared: Episode, until: str = "", frames: int = 10_000
             return
 
 
-def taken_over(world: World, prepared: Episode) -> list[Step]:
+def taken_over(world: World, prepared: PreparedEpisode) -> list[Step]:
     """What the expert does from here on; the joints never jump."""
     before = world.arm.target.copy()
     steps = apply(world, prepared.task.resume(Expert(world, Behaviour(action_noise=0.0))))
@@ -48,7 +48,7 @@ def taken_over(world: World, prepared: Episode) -> list[Step]:
     return steps
 
 
-def failed_conditions(world: World, prepared: Episode) -> list[str]:
+def failed_conditions(world: World, prepared: PreparedEpisode) -> list[str]:
     return [check.name for check in prepared.task.evaluate(world) if not check.passed]
 
 

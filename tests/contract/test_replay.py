@@ -19,6 +19,7 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import Event
+from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
 
@@ -151,7 +152,7 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
     assert exit_code("replay", source, "--out", tmp_path / "out") == 0
     with Recording(source) as a, Recording(tmp_path / "out" / "e.mcap") as b:
         assert b.info.origin == f"replay of {a.digest()[:16]}"
-        x, y = a.columns(), b.columns()
+        x, y = a.trajectory(), b.trajectory()
         assert np.array_equal(x.joint_position, y.joint_position)
         assert np.array_equal(x.action_joint_target, y.action_joint_target)
         assert x.phase == y.phase
@@ -231,8 +232,9 @@ def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytes
 
 def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     info, frames, outcome = make_episode(num_frames=3, cameras=())
-    info = info.with_simulation(
-        robot=replace(info.robot, gripper=replace(info.robot.gripper, joints=(), finger_links=()))
+    info = with_simulation(
+        info,
+        robot=replace(info.simulated.robot, gripper=replace(info.simulated.robot.gripper, joints=(), finger_links=())),
     )
     with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:

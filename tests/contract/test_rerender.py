@@ -47,7 +47,7 @@ def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
             assert np.array_equal(a.pixel_statistics(camera).counts, b.pixel_statistics(camera).counts)
-        x, y = a.columns(), b.columns()
+        x, y = a.trajectory(), b.trajectory()
         for name in ("joint_position", "joint_velocity", "command_joint_target", "action_joint_target"):
             assert np.array_equal(getattr(x, name), getattr(y, name))
         assert np.array_equal(x.world_from_camera["wrist"], y.world_from_camera["wrist"])
@@ -63,7 +63,7 @@ def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
     assert (report.compared, report.differing) == (("front",), {})
     rerender(tmp_path / "again.mcap", tmp_path / "thrice.mcap", RerenderOptions())
     with Recording(source) as first, Recording(tmp_path / "thrice.mcap") as last:
-        assert first.info.scene.cameras == last.info.scene.cameras
+        assert first.info.simulated.scene.cameras == last.info.simulated.scene.cameras
         off = [
             np.abs(a.astype(int) - b.astype(int)).max()
             for a, b in zip(first.images("front"), last.images("front"), strict=True)
@@ -85,8 +85,8 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(
     with Recording(filmed) as a, Recording(out / "filmed.mcap") as b:
         assert b.cameras == ("side", "front")
         assert next(b.images("side")).shape == (96, 128, 3)
-        assert b.info.scene.light != a.info.scene.light
-        assert b.info.scene.goals == a.info.scene.goals
+        assert b.info.simulated.scene.light != a.info.simulated.scene.light
+        assert b.info.simulated.scene.goals == a.info.simulated.scene.goals
 
 
 def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
@@ -96,7 +96,7 @@ def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
             options = RerenderOptions(looks=seed, cameras=("front",))
             rerender(filmed, tmp_path / f"{name}.mcap", options, simulators=simulators)
             with Recording(tmp_path / f"{name}.mcap") as recording:
-                scenes.append((recording.info.scene, recording.digest()))
+                scenes.append((recording.info.simulated.scene, recording.digest()))
     assert scenes[0] == scenes[2]
     assert scenes[0][0] != scenes[1][0]
 
@@ -127,7 +127,7 @@ def test_a_camera_of_ones_own_stands_where_it_is_said(
     assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", *twice) == 2
     assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", twice[0]) == 0
     with Recording(tmp_path / "out" / "filmed.mcap") as recording:
-        (camera,) = recording.info.scene.cameras
+        (camera,) = recording.info.simulated.scene.cameras
     assert camera.name == "side"
     assert camera.mount_from_camera.position.tolist() == [0.5, 0.9, 0.5]
     assert np.degrees(camera.fov_y) == pytest.approx(50)
@@ -167,6 +167,6 @@ def test_every_kind_of_body_is_drawn_as_it_was_recorded(
     with Recording(source) as a, Recording(tmp_path / "again.mcap") as b:
         for camera in a.cameras:
             assert [p.data for p in a.packets(camera)] == [p.data for p in b.packets(camera)]
-            assert np.array_equal(a.columns().world_from_camera[camera], b.columns().world_from_camera[camera])
+            assert np.array_equal(a.trajectory().world_from_camera[camera], b.trajectory().world_from_camera[camera])
             pairs = zip(a.segmentation(camera), b.segmentation(camera), strict=True)
             assert all(np.array_equal(one, two) for one, two in pairs)

@@ -41,7 +41,9 @@ def spec(request: pytest.FixtureRequest) -> RobotSpec:
 
 def test_it_starts_within_its_limits(spec: RobotSpec) -> None:
     """Also where its home lies closer to one than `joint_spread` reaches."""
-    starts = [episode(i, robot=spec.name, variation="full").info.scene.robot.joint_position for i in range(20)]
+    starts = [
+        episode(i, robot=spec.name, variation="full").info.simulated.scene.robot.joint_position for i in range(20)
+    ]
     assert (np.array(starts) >= spec.position_lower).all()
     assert (np.array(starts) <= spec.position_upper).all()
 
@@ -53,7 +55,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(
 
     The fingers' motion stays horizontal: docs/recording.md tells what PyBullet loses otherwise.
     """
-    scene = episode(0, robot=spec.name, variation="none").info.scene
+    scene = episode(0, robot=spec.name, variation="none").info.simulated.scene
     q = np.array(spec.home_q)
     q[-2] += 0.6 if q[-2] + 0.6 < spec.position_upper[-2] else -0.6
     command = Action(joint_target=q, gripper_target=0.04, base_from_tcp_target=arm_kinematics(spec).forward(q))
@@ -106,7 +108,7 @@ def _weight(world: World) -> np.ndarray[Any, Any]:
 @pytest.mark.parametrize("hand", ["no_such_link", "base"])
 def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> None:
     name = spec.base_link if hand == "base" else hand
-    scene = episode(0, robot=spec.name, variation="none").info.scene
+    scene = episode(0, robot=spec.name, variation="none").info.simulated.scene
     with (
         World(replace(spec, hand_link=name)) as world,
         pytest.raises(SceneError, match=f"hand_link '{name}'; its links"),
@@ -117,7 +119,7 @@ def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> 
 def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec: RobotSpec) -> None:
     """Bounding boxes that Bullet tells of (its margin included), the hand pointing down along the world's axes."""
     with World(spec) as world:
-        world.reset(episode(robot=spec.name).info.scene)
+        world.reset(episode(robot=spec.name).info.simulated.scene)
         goal = world.arm.world_from_base.inverse() @ hand_down(spec.task_scale * np.array([0.5, 0.0, 0.2]), 0.0)
         found = world.arm.kinematics.inverse(goal, start=np.array(spec.home_q))
         world.arm.place(present(found), spec.gripper.open_width)

@@ -28,11 +28,11 @@ def test_the_sample_is_read() -> None:
         assert recording.info.instruction == "move the red cube to the green target"
         assert recording.success
         assert recording.num_frames == counts["/wrench"] == counts["/camera/front/h264"] > 100
-        columns = recording.columns()
-        (moved,) = columns.object_poses.values()
+        trajectory = recording.trajectory()
+        (moved,) = trajectory.object_poses.values()
         assert np.abs(moved[-1, :2] - moved[0, :2]).max() > 0.05  # the cube was carried away
-        assert np.ptp(columns.gripper_width) > 0.02
-        assert {"approach", "lift"} <= set(columns.phase)
+        assert np.ptp(trajectory.gripper_width) > 0.02
+        assert {"approach", "lift"} <= set(trajectory.phase)
         for camera in ("front", "wrist"):
             images = list(recording.images(camera))
             assert len(images) == recording.num_frames

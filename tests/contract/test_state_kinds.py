@@ -53,15 +53,15 @@ def states(dataset: Path) -> Vectors:
 def test_the_state_is_joints_gripper_and_the_recorded_pose(run: Path, dataset: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
     with Recording(first) as recording:
-        columns = recording.columns()
-    found = states(dataset)[: columns.num_frames]
-    assert found.shape == (columns.num_frames, 15)
+        trajectory = recording.trajectory()
+    found = states(dataset)[: trajectory.num_frames]
+    assert found.shape == (trajectory.num_frames, 15)
     assert info(dataset)["features"][STATE]["names"][6:10] == ["panda_joint7.pos", "gripper.width", "tcp.x", "tcp.y"]
-    assert np.array_equal(found[:, :7], columns.joint_position[:, :7].astype(np.float32))
-    assert np.array_equal(found[:, 7], columns.gripper_width.astype(np.float32))
-    assert np.array_equal(found[:, 8:11], columns.base_from_tcp[:, :3].astype(np.float32))
+    assert np.array_equal(found[:, :7], trajectory.joint_position[:, :7].astype(np.float32))
+    assert np.array_equal(found[:, 7], trajectory.gripper_width.astype(np.float32))
+    assert np.array_equal(found[:, 8:11], trajectory.base_from_tcp[:, :3].astype(np.float32))
     # A quaternion and its negative are one rotation.
-    np.testing.assert_allclose(np.abs((found[:, 11:] * columns.base_from_tcp[:, 3:]).sum(axis=1)), 1.0, atol=1e-6)
+    np.testing.assert_allclose(np.abs((found[:, 11:] * trajectory.base_from_tcp[:, 3:]).sum(axis=1)), 1.0, atol=1e-6)
     assert (found[:, 11] >= 0).all()
     assert "tool centre point" in (dataset / "README.md").read_text().partition(f"`{STATE}`")[2].partition("\n")[0]
 
@@ -85,15 +85,15 @@ def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path)
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
     export_lerobot([first], tmp_path / "one", SMALL)
     with Recording(first) as recording:
-        columns = recording.columns()
+        trajectory = recording.trajectory()
     config = GenerateConfig(cameras=(), seed=3, variation="none")
     env = DemorecEnv(config=config, state="joint_ee", privileged=False)
     assert env.observation_space["agent_pos"].shape == (15,)
     observation, _ = env.reset(seed=0)
-    for row, command in zip(states(tmp_path / "one"), columns.command_joint_target, strict=True):
+    for row, command in zip(states(tmp_path / "one"), trajectory.command_joint_target, strict=True):
         assert np.array_equal(observation["agent_pos"], row)
         frame = env.situation.frame_index
-        observation, *_ = env.step(np.append(command, columns.command_gripper[frame]))
+        observation, *_ = env.step(np.append(command, trajectory.command_gripper[frame]))
     env.close()
 
 

@@ -48,7 +48,7 @@ def test_instructions_come_in_several_wordings() -> None:
 
 
 def test_a_fixed_layout_is_exact_and_refused_elsewhere() -> None:
-    scenes = [prepare(plan("tutorial", index, fixed=True, variation="none")).info.scene for index in range(3)]
+    scenes = [prepare(plan("tutorial", index, fixed=True, variation="none")).info.simulated.scene for index in range(3)]
     assert scenes[0] == scenes[1] == scenes[2]
     cube = scenes[0].body("red_cube").world_from_body
     np.testing.assert_allclose(cube.position, [1.0, 1.0, 0.1], atol=1e-12)

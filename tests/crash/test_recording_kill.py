@@ -89,7 +89,7 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
             with Recording(recovered.path) as recording:
                 assert recording.outcome is None
                 assert recording.is_recovered
-                assert recording.columns().num_frames == kept
+                assert recording.table().num_frames == kept
                 for camera in recording.cameras:
                     numbers = [frame_number(image) for image in recording.images(camera)]
                     assert numbers == [index % 256 for index in range(kept)]

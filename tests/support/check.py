@@ -20,7 +20,7 @@ import pytest
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.episode.episode import CameraImages, Columns, Event, Frame, Outcome
+from demorec.episode.episode import CameraImages, Event, Frame, Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import EpisodeWriter, Recording
@@ -103,7 +103,7 @@ class Spoilt:
     def __init__(self, path: Path) -> None:
         with Recording(path) as recording:
             self.info: EpisodeInfo = recording.info
-            self.columns: Columns = recording.columns()
+            self.columns: Trajectory = recording.trajectory()
             self.outcome: Outcome | None = recording.outcome
             frames = list(recording)
             self.images: Images = [dict(frame.images) for frame in frames]

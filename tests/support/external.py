@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Outcome, Sample, SampledFrame
-from demorec.episode.info import Camera, EpisodeInfo, Feature
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.mcap import EpisodeWriter
 
 URDF = """<robot name="two_joints">
@@ -73,6 +73,7 @@ def make_external(
         fps=30,
         features=(STATE, ACTION, FORCE),
         cameras=cameras,
+        origin=Origin(),
         versions={"demorec": "0"},
     )
     times = START_NS + np.cumsum(random.integers(20_000_000, 45_000_000, num_frames))

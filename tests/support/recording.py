@@ -28,6 +28,7 @@ from demorec.episode.episode import (
 )
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, SceneCamera, Shape
+from demorec.episode.simulated import simulated_info
 from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import ParallelGripper, RobotSpec
 
@@ -80,22 +81,22 @@ def make_episode(
     sits on the hand.
     """
     specs = tuple(_camera(name, width, height) for name in cameras)
-    info = EpisodeInfo(
+    simulation = Simulation(
+        root_seed=seed,
+        task="pick_place",
+        robot=PANDA,
+        scene=_scene(specs, physics_hz),
+        physics_hz=physics_hz,
+        behaviour={"speed": 0.8 + 0.01 * episode_index, "approach_height": 0.1},
+        config={"task": "pick_place", "seed": seed, "video": {"codec": "h264"}},
+        config_digest="0123456789abcdef",
+    )
+    info = simulated_info(
+        simulation,
         episode_index=episode_index,
-        attempt=0,
         instruction="pick up the red cube and place it on the green target",
         fps=fps,
         versions={"demorec": "0.1.0", "pybullet": "3.2.7", "numpy": "2.2.6"},
-        simulation=Simulation(
-            root_seed=seed,
-            task="pick_place",
-            robot=PANDA,
-            scene=_scene(specs, physics_hz),
-            physics_hz=physics_hz,
-            behaviour={"speed": 0.8 + 0.01 * episode_index, "approach_height": 0.1},
-            config={"task": "pick_place", "seed": seed, "video": {"codec": "h264"}},
-            config_digest="0123456789abcdef",
-        ),
     )
     substeps = physics_hz // fps
     frames = []

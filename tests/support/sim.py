@@ -6,23 +6,23 @@ from typing import Any
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.episode.episode import Frame, Outcome
-from demorec.loop import Episode, ScriptAgent, Session, make_renderer, make_world, prepare
+from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.sim.world import World
 
 
-def episode(index: int = 0, *, attempt: int = 0, **config: Any) -> Episode:
+def episode(index: int = 0, *, attempt: int = 0, **config: Any) -> PreparedEpisode:
     """Prepare an episode; no cameras by default."""
     config.setdefault("cameras", ())
     return prepare(EpisodePlan(config=GenerateConfig(**config), episode_index=index, attempt=attempt))
 
 
-def first_frame(prepared: Episode) -> Frame:
+def first_frame(prepared: PreparedEpisode) -> Frame:
     """What is seen before anything has moved; its images need no episode around them."""
     with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
         return next(Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)))
 
 
-def run(prepared: Episode, world: World | None = None) -> tuple[list[Frame], Outcome]:
+def run(prepared: PreparedEpisode, world: World | None = None) -> tuple[list[Frame], Outcome]:
     """All frames and the outcome, in `world` or in a fresh one."""
     if world is None:
         with make_world(prepared.info) as fresh:

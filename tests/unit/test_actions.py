@@ -18,7 +18,7 @@ from demorec.sim.world import World
 def world() -> Iterator[World]:
     prepared = episode(0)
     with make_world(prepared.info) as made:
-        made.reset(prepared.info.scene)
+        made.reset(prepared.info.simulated.scene)
         yield made
 
 

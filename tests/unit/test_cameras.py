@@ -40,7 +40,7 @@ def scaled(world: World, x: float, y: float, z: float) -> tuple[float, float, fl
 def world(request: pytest.FixtureRequest) -> Iterator[World]:
     prepared = episode(0, robot=request.param, cameras=CAMERAS.names(), variation="none")
     with make_world(prepared.info) as made:
-        made.reset(prepared.info.scene)
+        made.reset(prepared.info.simulated.scene)
         yield made
 
 

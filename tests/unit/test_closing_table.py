@@ -79,7 +79,7 @@ def test_a_run_has_an_environment_state_if_its_scenes_have_as_many_objects(
     counts = set()
     for path in (folder / "episodes").iterdir():
         with Recording(path) as recording:
-            counts.add(len(recording.info.scene.movable))
+            counts.add(len(recording.info.simulated.scene.movable))
     assert (len(counts) > 1) == varies
     result = RunResult(folder=folder, run=load_run_file(folder), made=(), interrupted=False)
     assert has_environment_state(result) is not varies

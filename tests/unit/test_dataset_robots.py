@@ -60,7 +60,7 @@ def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_p
     alone = Path(shutil.copy(urdf_file, tmp_path))
     rows = data_table(exported).to_pylist()
     with Recording(SAMPLE) as recording:
-        recorded = recording.columns().base_from_tcp
+        recorded = recording.trajectory().base_from_tcp
     client = pybullet.connect(pybullet.DIRECT)
     try:
         body = pybullet.loadURDF(str(alone), useFixedBase=True, physicsClientId=client)
@@ -205,7 +205,7 @@ def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(e
     shutil.copytree(exported, strange)
     with open_dataset_episode(exported, 0) as known:
         assert known.info.simulation is not None
-        arm_joints = known.info.robot.arm_joints
+        arm_joints = known.info.simulated.robot.arm_joints
     shutil.rmtree(strange / "demorec")
     with open_dataset_episode(strange, 0) as episode:
         assert episode.info.simulation is None

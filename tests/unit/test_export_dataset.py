@@ -235,21 +235,23 @@ def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -
     export(run, out)
     row = pq.read_table(out / "demorec/episodes/chunk-000/file-000.parquet").to_pylist()[1]
     made, frames, outcome = make_episode(num_frames=15, episode_index=1)
-    assert (row["run_episode_index"], row["root_seed"], row["config_digest"]) == (1, 0, made.config_digest)
+    assert (row["run_episode_index"], row["root_seed"], row["config_digest"]) == (1, 0, made.simulated.config_digest)
     assert row["success"] is True
     assert row["checks"][0]["value"] == outcome.checks[0].value
     assert row["phases"][0] == {"name": "approach", "from": 0, "to": 3}
     assert row["phases"][-1]["to"] == 15
     camera = row["cameras"][0]
     assert camera["name"] == "front"
-    assert camera["intrinsics"] == made.scene.cameras[0].intrinsics.reshape(-1).tolist()
+    assert camera["intrinsics"] == made.simulated.scene.cameras[0].intrinsics.reshape(-1).tolist()
     assert camera["mount_from_camera"] == frames[0].images["front"].world_from_camera.vector().tolist()  # in the world
     assert json.loads(row["episode_info"])["simulation"]["scene"]["bodies"][1]["name"] == "cube"
     poses = pq.read_table(out / "demorec/camera_poses/chunk-000/file-000.parquet")
     assert poses.column_names == ["episode_index", "frame_index", "wrist"]  # the front camera stands still
     assert poses.num_rows == 61
     assert poses.column("wrist")[20 + 7].as_py() == frames[7].images["wrist"].world_from_camera.vector().tolist()
-    assert json.loads((out / "demorec/configs.json").read_text()) == {made.config_digest: made.config}
+    assert json.loads((out / "demorec/configs.json").read_text()) == {
+        made.simulated.config_digest: made.simulated.config
+    }
 
 
 def test_episodes_without_cameras(tmp_path: Path) -> None:

@@ -32,29 +32,29 @@ def test_numbers_are_those_of_the_recording(run: Path, tmp_path: Path) -> None:
         for index in range(3):
             demo = file[f"data/demo_{index}"]
             with recording(run, index) as source:
-                columns = source.columns()
+                trajectory = source.trajectory()
                 assert demo.attrs["model_file"] == source.description()
                 assert demo.attrs["instruction"] == source.info.instruction
-            assert demo.attrs["num_samples"] == columns.num_frames
+            assert demo.attrs["num_samples"] == trajectory.num_frames
             assert demo.attrs["success"]
             observed = {name: data[()] for name, data in demo["obs"].items()}
             recorded = {
-                "robot0_joint_pos": columns.joint_position[:, :7],
-                "robot0_gripper_qpos": columns.gripper_width[:, np.newaxis],
-                "robot0_joint_vel": columns.joint_velocity[:, :7],
-                "robot0_gripper_qvel": columns.joint_velocity[:, 7:].sum(axis=1, keepdims=True),
-                "robot0_eef_pos": columns.base_from_tcp[:, :3],
+                "robot0_joint_pos": trajectory.joint_position[:, :7],
+                "robot0_gripper_qpos": trajectory.gripper_width[:, np.newaxis],
+                "robot0_joint_vel": trajectory.joint_velocity[:, :7],
+                "robot0_gripper_qvel": trajectory.joint_velocity[:, 7:].sum(axis=1, keepdims=True),
+                "robot0_eef_pos": trajectory.base_from_tcp[:, :3],
             }
             for name, expected in recorded.items():
                 assert observed[name].dtype == np.float64
                 np.testing.assert_array_equal(observed[name], expected, err_msg=name)
-            same = (observed["robot0_eef_quat"] * columns.base_from_tcp[:, 3:]).sum(axis=1)
+            same = (observed["robot0_eef_quat"] * trajectory.base_from_tcp[:, 3:]).sum(axis=1)
             np.testing.assert_allclose(np.abs(same), 1, atol=1e-12)  # either sign is the same rotation
-            target = np.column_stack([columns.action_joint_target, columns.action_gripper])
+            target = np.column_stack([trajectory.action_joint_target, trajectory.action_gripper])
             np.testing.assert_array_equal(demo["actions"][()], target)
-            state = [columns.joint_position, columns.joint_velocity, *columns.object_poses.values()]
+            state = [trajectory.joint_position, trajectory.joint_velocity, *trajectory.object_poses.values()]
             np.testing.assert_array_equal(demo["states"][()], np.concatenate(state, axis=1))
-            last = [0] * (columns.num_frames - 1) + [1]
+            last = [0] * (trajectory.num_frames - 1) + [1]
             assert demo["rewards"][()].tolist() == demo["dones"][()].tolist() == last
             assert observed["object"].shape[1] == len(json.loads(demo["obs/object"].attrs["names"]))
 
@@ -77,10 +77,10 @@ def test_fewer_frames(run: Path, tmp_path: Path) -> None:
     """Observations of frames 0 and 3, actions of frames 2 and 4: the last of each group, and of the episode."""
     export(run, tmp_path / "d.hdf5", "hdf5", fps=10, episodes="2")
     with h5py.File(tmp_path / "d.hdf5") as file, recording(run, 2) as source:
-        demo, columns = file["data/demo_0"], source.columns()
+        demo, trajectory = file["data/demo_0"], source.trajectory()
         assert demo.attrs["num_samples"] == 2
-        np.testing.assert_array_equal(demo["states"][:, :9], columns.joint_position[[0, 3]])
-        np.testing.assert_array_equal(demo["actions"][:, :7], columns.action_joint_target[[2, 4]])
+        np.testing.assert_array_equal(demo["states"][:, :9], trajectory.joint_position[[0, 3]])
+        np.testing.assert_array_equal(demo["actions"][:, :7], trajectory.action_joint_target[[2, 4]])
         np.testing.assert_array_equal(demo["obs/front_image"][1], source.image("front", 3))
         assert file["data"].attrs["fps"] == 10
 
@@ -199,7 +199,7 @@ def test_robomimic_reads_it(run: Path, tmp_path: Path) -> None:
             load_next_obs=False,
         )
         with recording(run, index) as source:
-            item, columns = read[1], source.columns()
+            item, trajectory = read[1], source.trajectory()
             np.testing.assert_array_equal(item["obs"]["front_image"][0], source.image("front", 1))
-        np.testing.assert_array_equal(item["obs"]["robot0_eef_pos"], columns.base_from_tcp[1:4, :3])
-        np.testing.assert_array_equal(item["actions"][:, :7], columns.action_joint_target[1:4].astype(np.float32))
+        np.testing.assert_array_equal(item["obs"]["robot0_eef_pos"], trajectory.base_from_tcp[1:4, :3])
+        np.testing.assert_array_equal(item["actions"][:, :7], trajectory.action_joint_target[1:4].astype(np.float32))

@@ -36,22 +36,22 @@ def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
         assert recording.info == episode.info
         assert recording.outcome == episode.outcome
         assert recording.num_frames == num_frames
-        columns = recording.columns()
-    assert columns.time_ns.tolist() == [frame.time_ns for frame in episode.frames]
+        table = recording.table()
+    assert table.time_ns.tolist() == [frame.time_ns for frame in episode.frames]
     for feature in (STATE, ACTION, FORCE):
-        values = columns.features[feature.name]
+        values = table.features[feature.name]
         assert values.dtype == feature.dtype
         assert values.shape == (num_frames, 3)
         assert values.tobytes() == b"".join(frame.samples[feature.name].vector.tobytes() for frame in episode.frames)
-        assert columns.stamps[feature.name].tolist() == [f.samples[feature.name].stamp_ns for f in episode.frames]
+        assert table.stamps[feature.name].tolist() == [f.samples[feature.name].stamp_ns for f in episode.frames]
     for camera in cameras:
         expected = [frame.images.get(camera.name, NO_IMAGE) for frame in episode.frames]
-        assert columns.images[camera.name].tolist() == expected
-        assert columns.image_stamps[camera.name].tolist() == [stamp for stamp, _ in episode.images[camera.name]]
+        assert table.images[camera.name].tolist() == expected
+        assert table.image_stamps[camera.name].tolist() == [stamp for stamp, _ in episode.images[camera.name]]
     if num_frames > 1 and cameras:
-        assert columns.images["wrist"][:3].tolist() == [NO_IMAGE, 0, 0]
-        assert columns.age_ns("observation.state").tolist() == [1_000_000] * num_frames
-        assert columns.image_age_ns("top").tolist() == [7_000_000] * num_frames
+        assert table.images["wrist"][:3].tolist() == [NO_IMAGE, 0, 0]
+        assert table.age_ns("observation.state").tolist() == [1_000_000] * num_frames
+        assert table.image_age_ns("top").tolist() == [7_000_000] * num_frames
 
 
 def _frame(**changes: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.recording import HOME, PANDA
 
 from demorec.core.geometry import Pose
-from demorec.episode.episode import Columns, frame_time_ns
+from demorec.episode.episode import Trajectory, frame_time_ns
 from demorec.episode.features import (
     EE_POSE,
     ENVIRONMENT_STATE,
@@ -144,11 +144,11 @@ def test_the_tcp_quaternion_keeps_its_sign_through_a_turn_of_the_hand() -> None:
     assert np.abs(np.diff(found, axis=0)).max() < 0.05
 
 
-def columns_of(rng: np.random.Generator, count: int) -> Columns:
+def columns_of(rng: np.random.Generator, count: int) -> Trajectory:
     def poses() -> np.ndarray[Any, Any]:
         return np.array([random_pose(rng).vector() for _ in range(count)])
 
-    return Columns(
+    return Trajectory(
         time_ns=np.arange(count), joint_position=rng.normal(size=(count, 9)),
         joint_velocity=np.zeros((count, 9)), joint_effort=np.zeros((count, 9)), gripper_width=np.zeros(count),
         base_from_tcp=poses(), object_poses={}, contact_force=np.zeros(count), sensed={},

@@ -87,11 +87,11 @@ def told(folder: Path, script: list[tuple[str, str, str]], **arguments: object) 
             writer.write(replace(frame, phase=phase, events=events, is_deliberate_miss=False))
         writer.finish(outcome)
     with Recording(path) as recording:
-        columns = recording.columns()
-        rows = np.arange(len(columns.time_ns))
+        trajectory = recording.trajectory()
+        rows = np.arange(len(trajectory.time_ns))
         return [
             (statement.row, statement.kind, statement.text)
-            for statement in episode_statements(recording, columns, rows, ("subtask", "plan", "memory"))
+            for statement in episode_statements(recording, trajectory, rows, ("subtask", "plan", "memory"))
         ]
 
 

@@ -14,17 +14,17 @@ from support.sim import episode, run
 
 from demorec.core.plain import to_json
 from demorec.episode.episode import Frame, Outcome
-from demorec.loop import Episode
+from demorec.loop import PreparedEpisode
 
 
 @pytest.fixture(scope="module")
-def ran() -> tuple[Episode, list[Frame], Outcome]:
+def ran() -> tuple[PreparedEpisode, list[Frame], Outcome]:
     prepared = episode(4)
     frames, outcome = run(prepared)
     return prepared, frames, outcome
 
 
-def test_an_episode_succeeds_strictly(ran: tuple[Episode, list[Frame], Outcome]) -> None:
+def test_an_episode_succeeds_strictly(ran: tuple[PreparedEpisode, list[Frame], Outcome]) -> None:
     prepared, frames, outcome = ran
     assert outcome.success
     assert outcome.failure_phase == outcome.failure_reason == ""
@@ -32,12 +32,12 @@ def test_an_episode_succeeds_strictly(ran: tuple[Episode, list[Frame], Outcome])
     assert all(check.passed for check in outcome.checks)
     # The cube's last seen pose, against the goal, without our checks.
     last = frames[-1].observation.object_poses["red_cube"]
-    goal = prepared.info.scene.goals[0].onto_from_goal
+    goal = prepared.info.simulated.scene.goals[0].onto_from_goal
     assert np.hypot(*(last.position - goal.position)[:2]) < 0.02
     assert frames[-1].observation.contact_force == 0
 
 
-def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Outcome]) -> None:
+def test_observation_comes_before_the_action(ran: tuple[PreparedEpisode, list[Frame], Outcome]) -> None:
     """The joints follow the command of frame t only at frame t + 1."""
     _, frames, _ = ran
     commands = np.array([frame.command.joint_target for frame in frames])
@@ -47,7 +47,9 @@ def test_observation_comes_before_the_action(ran: tuple[Episode, list[Frame], Ou
     assert follows < 0.5 * equal
 
 
-def test_noise_is_on_the_command_only_and_only_in_free_motion(ran: tuple[Episode, list[Frame], Outcome]) -> None:
+def test_noise_is_on_the_command_only_and_only_in_free_motion(
+    ran: tuple[PreparedEpisode, list[Frame], Outcome],
+) -> None:
     _, frames, _ = ran
     noise: dict[str, list[float]] = {phase: [] for phase in {frame.phase for frame in frames}}
     for frame in frames:
@@ -59,7 +61,7 @@ def test_noise_is_on_the_command_only_and_only_in_free_motion(ran: tuple[Episode
         assert max(noise[phase]) < 0.001, phase
 
 
-def test_no_frame_is_idle(ran: tuple[Episode, list[Frame], Outcome]) -> None:
+def test_no_frame_is_idle(ran: tuple[PreparedEpisode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
     # Neither the label nor what is executed moves.
     labels = np.array([[*f.action.joint_target, *f.command.joint_target, f.action.gripper_target] for f in frames])
@@ -89,7 +91,7 @@ print(json.dumps([outcome.final_state_digest, to_json(prepared.info)]))
 
 @pytest.mark.parametrize("coretype", ["Haswell", pytest.param("Nehalem", marks=pytest.mark.slow)])
 def test_another_process_and_another_blas_kernel_give_the_same_bits(
-    ran: tuple[Episode, list[Frame], Outcome], coretype: str
+    ran: tuple[PreparedEpisode, list[Frame], Outcome], coretype: str
 ) -> None:
     prepared, _, outcome = ran
     path = str(Path(__file__).parents[1])

@@ -150,14 +150,14 @@ def test_scenes_name_one_thing_without_doubt_and_take_from_the_shelves_asked_for
     }
     for index in range(30):
         info = episode(index, task="pick_anything", objects=("blocks",), object_split="eval").info
-        names = [body.name for body in info.scene.movable]
+        names = [body.name for body in info.simulated.scene.movable]
         counts[len(names)] += 1
-        (goal,) = info.scene.goals
+        (goal,) = info.simulated.scene.goals
         assert goal.object.replace("_", " ") in info.instruction
         assert len(set(names)) == len(names)
-        assert not {"grey", "black"} & {body.color_name for body in info.scene.movable}
+        assert not {"grey", "black"} & {body.color_name for body in info.simulated.scene.movable}
         targets.add(goal.onto)
-        for body in info.scene.movable:
+        for body in info.simulated.scene.movable:
             assert body.shape.mesh in meshes[KINDS[body.name.split("_")[1]]]
     assert set(counts) == set(range(1, 7))
     assert targets == {"", "blue_tray", "white_bowl", "white_plate"}
@@ -166,7 +166,7 @@ def test_scenes_name_one_thing_without_doubt_and_take_from_the_shelves_asked_for
 def test_distractors_are_of_the_same_shelves_and_grey_or_black() -> None:
     ranges = Ranges(distractors=(2, 2))
     for index in range(4):
-        scene = episode(index, task="pick_anything", objects=("household",), ranges=ranges).info.scene
+        scene = episode(index, task="pick_anything", objects=("household",), ranges=ranges).info.simulated.scene
         others = [body for body in scene.movable if body.color_name in ("grey", "black")]
         assert len(others) == 2
         assert len({body.name for body in scene.bodies}) == len(scene.bodies)
@@ -182,9 +182,9 @@ def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> 
     made = next(
         made
         for made in (episode(number, task="pick_anything") for number in range(100, 140))
-        if made.info.scene.goals[0].onto == target
+        if made.info.simulated.scene.goals[0].onto == target
     )
-    scene = made.info.scene
+    scene = made.info.simulated.scene
     goal, vessel = scene.goals[0], scene.body(target)
     assert f"the {target.replace('_', ' ')}" in made.info.instruction
     with make_world(made.info) as world:
@@ -202,7 +202,7 @@ def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> 
 def test_things_wear_the_texture_of_their_material_in_tints_of_their_colour() -> None:
     worn: dict[str, set[str]] = {}
     for number in range(40):
-        for body in episode(number, task="pick_anything").info.scene.movable:
+        for body in episode(number, task="pick_anything").info.simulated.scene.movable:
             worn.setdefault(body.name.partition("_")[2], set()).add(body.texture.pattern if body.texture else "plain")
             hues = [colorsys.rgb_to_hsv(*color[:3])[:2] for color in (body.rgba, body.mean_color)]
             assert hues[0] == pytest.approx(hues[1])
@@ -214,7 +214,7 @@ def test_things_wear_the_texture_of_their_material_in_tints_of_their_colour() ->
 
 def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
     made = episode(0, task="pick_anything", variation="full", width=160, height=120, cameras=("front",))
-    scene, (camera,) = made.info.scene, made.info.scene.cameras
+    scene, (camera,) = made.info.simulated.scene, made.info.simulated.scene.cameras
     walls = [body for body in scene.bodies if body.name.startswith("wall")]
     assert len({body.texture or body.rgba for body in walls}) == 3
     with make_world(made.info) as world, RENDERERS.load("raster")() as renderer:
@@ -229,7 +229,9 @@ def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
         for body in walls:
             closest = np.abs(body.world_from_body.inverse().position)[0] - 0.01
             assert 1.2 < closest < farthest
-    assert not [body for body in episode(0, task="pick_place").info.scene.bodies if body.name.startswith("wall")]
+    assert not [
+        body for body in episode(0, task="pick_place").info.simulated.scene.bodies if body.name.startswith("wall")
+    ]
 
 
 def test_tasks_with_things_of_their_own_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -266,7 +268,7 @@ def test_a_folder_of_meshes_is_a_shelf_and_a_ring_keeps_its_hole(tmp_path: Path)
     assert len(parts) > 1
     assert not any(part.contains(np.zeros((1, 3)))[0] for part in parts)
     info = episode(task="pick_anything", objects=(f"{tmp_path}/",)).info
-    assert {body.name.split("_", 1)[1] for body in info.scene.movable} <= {"soap_bar", "ring"}
+    assert {body.name.split("_", 1)[1] for body in info.simulated.scene.movable} <= {"soap_bar", "ring"}
     _, outcome = run(episode(task="pick_anything", objects=(f"{tmp_path}/",)))
     assert outcome.success, outcome.failure_reason
 

@@ -10,6 +10,6 @@ from demorec.episode.scene import Scene
 
 
 def test_unknown_keys_are_named_with_their_place() -> None:
-    text = to_json(make_episode(num_frames=1)[0].scene).replace('"mass"', '"mas"')
+    text = to_json(make_episode(num_frames=1)[0].simulated.scene).replace('"mass"', '"mas"')
     with pytest.raises(ValueError, match=r"extra fields found \(mas\).*bodies\[0\]"):
         from_json(text, Scene)

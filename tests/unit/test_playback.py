@@ -15,6 +15,7 @@ from support.recording import make_episode, write_episode
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
+from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.robots import assets
 from demorec.robots.assets import asset_path
@@ -62,7 +63,7 @@ def _column(chunks: list[Any], component: str) -> list[Any]:
 def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], recording: Path) -> None:
     with Recording(recording) as source:
         samples = list(source.joint_samples())
-        num_frames, joints = source.num_frames, len(source.info.robot.arm_joints)
+        num_frames, joints = source.num_frames, len(source.info.simulated.robot.arm_joints)
     assert len(samples) > 7 * (num_frames - 1)  # the physics' rate
     rows = _column(saved["/plots/position"], "Scalars:scalars")
     assert [time for time, _ in rows] == [sample.time_ns for sample in samples]
@@ -130,7 +131,9 @@ BRICK = Body(
 def with_models(tmp_path: Path) -> Path:
     """A recording with a mesh and a URDF beside the table and the cube."""
     info, frames, outcome = make_episode(num_frames=3, cameras=())
-    info = info.with_simulation(scene=replace(info.scene, bodies=(*info.scene.bodies, DUCK, BRICK)))
+    info = with_simulation(
+        info, scene=replace(info.simulated.scene, bodies=(*info.simulated.scene.bodies, DUCK, BRICK))
+    )
     with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames:
             writer.write(frame)

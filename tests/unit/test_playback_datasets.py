@@ -28,7 +28,7 @@ SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 @pytest.fixture(scope="module")
 def recorded() -> Array:
     with Recording(SAMPLE) as recording:
-        return recording.columns().object_poses["red_cube"]
+        return recording.trajectory().object_poses["red_cube"]
 
 
 @pytest.fixture(scope="module")

@@ -52,11 +52,11 @@ def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
             episode.write({"state": states[index], "force": forces[index]}, actions[index], {"top": buffer})
         episode.success = True
     with recording_of(tmp_path / "run") as found:
-        columns = found.columns()
-        assert columns.features["observation.state"].tobytes() == states.tobytes()
-        assert columns.features["observation.force"].tobytes() == forces.tobytes()
-        assert columns.features["action"].tobytes() == actions.tobytes()
-        assert columns.time_ns.tolist() == [1_000_000_000 + 33_000_000 * index for index in range(40)]
+        table = found.table()
+        assert table.features["observation.state"].tobytes() == states.tobytes()
+        assert table.features["observation.force"].tobytes() == forces.tobytes()
+        assert table.features["action"].tobytes() == actions.tobytes()
+        assert table.time_ns.tolist() == [1_000_000_000 + 33_000_000 * index for index in range(40)]
         assert (found.info.robot_name, found.info.instruction, found.info.fps) == ("so101", "stack", 30)
         assert found.outcome is not None
         assert (found.outcome.success, found.outcome.num_frames, found.outcome.drops) == (True, 40, {})
@@ -71,11 +71,11 @@ def test_stamps_of_the_caller_and_missing_or_repeated_images(tmp_path: Path) -> 
         episode.write([2.0], [0.0], {"top": (PIXELS, 150)}, time_ns=300)  # the camera has nothing newer
         episode.write([3.0], [0.0], {"top": (PIXELS, 350)}, time_ns=400)
     with recording_of(tmp_path / "run") as found:
-        columns = found.columns()
-        assert columns.time_ns.tolist() == [100, 200, 300, 400]
-        assert columns.stamps["observation.state"].tolist() == [90, 200, 300, 400]
-        assert columns.images["top"].tolist() == [NO_IMAGE, 0, 0, 1]
-        assert columns.image_stamps["top"].tolist() == [150, 350]
+        table = found.table()
+        assert table.time_ns.tolist() == [100, 200, 300, 400]
+        assert table.stamps["observation.state"].tolist() == [90, 200, 300, 400]
+        assert table.images["top"].tolist() == [NO_IMAGE, 0, 0, 1]
+        assert table.image_stamps["top"].tolist() == [150, 350]
         assert found.outcome is not None
         assert found.outcome.success is None
 
@@ -109,7 +109,7 @@ def test_elements_are_named_by_what_is_known(
     with recording_of(tmp_path / "run") as found:
         assert found.info.urdf == (URDF if robot == URDF else found.info.urdf if robot is PANDA else "")
         values = list(observation.values()) if isinstance(observation, dict) else observation
-        assert found.columns().features["observation.state"][0].tolist() == values
+        assert found.table().features["observation.state"][0].tolist() == values
 
 
 def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
@@ -199,7 +199,7 @@ def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, w
         episode.finish()
     with recording_of(tmp_path / "run") as found:
         expected = [[0.0, 1.0]] if what == "after the end" else [[0.0, 1.0], [2.0, 3.0]]
-        assert found.columns().features["observation.state"].tolist() == expected
+        assert found.table().features["observation.state"].tolist() == expected
 
 
 @pytest.mark.parametrize(
@@ -315,7 +315,7 @@ def test_frames_that_the_encoder_cannot_take_are_counted(tmp_path: Path, monkeyp
     assert line.num_frames == sum(taken)
     assert line.drops == {"frames": 50 - sum(taken)}
     with recording_of(tmp_path / "run") as found:
-        values = found.columns().features["observation.state"][:, 0].tolist()
+        values = found.table().features["observation.state"][:, 0].tolist()
     assert values == [index for index, there in enumerate(taken) if there]
 
 
@@ -373,7 +373,7 @@ def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: si
         assert first.num_frames - 1 == last
         assert first.reason == "interrupted"
     with recording_of(tmp_path / "run") as found:
-        columns = found.columns()
-        assert columns.features["observation.state"][:, 0].tolist() == list(range(first.num_frames))
-        assert columns.images["top"].tolist() == list(range(first.num_frames))
+        table = found.table()
+        assert table.features["observation.state"][:, 0].tolist() == list(range(first.num_frames))
+        assert table.images["top"].tolist() == list(range(first.num_frames))
         assert found.is_recovered == (number == signal.SIGKILL)

@@ -15,6 +15,7 @@ from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Frame
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter
 
 NAN = float("nan")
@@ -104,7 +105,9 @@ def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path
 
 
 def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
-    return info.with_simulation(robot=replace(info.robot, arm_joints=(*names, *info.robot.arm_joints[len(names) :])))
+    return with_simulation(
+        info, robot=replace(info.simulated.robot, arm_joints=(*names, *info.simulated.robot.arm_joints[len(names) :]))
+    )
 
 
 @pytest.mark.parametrize(

@@ -87,9 +87,9 @@ def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_ar
                 writer.write(replace(frame, time_ns=frame.time_ns + later, samples=samples))
             writer.finish(replace(short.outcome, num_frames=count))
         with Recording(tmp_path / f"{count}.mcap") as recording:
-            peaks.append(peak_bytes(recording.columns))
-            columns = recording.columns()
-            arrays = [columns.time_ns, *columns.features.values(), *columns.stamps.values()]
+            peaks.append(peak_bytes(recording.table))
+            table = recording.table()
+            arrays = [table.time_ns, *table.features.values(), *table.stamps.values()]
             num_bytes.append(sum(array.nbytes for array in arrays))
     assert peaks[2] - peaks[1] < 4 * (num_bytes[2] - num_bytes[1])
 
@@ -106,6 +106,6 @@ def test_numbers_of_a_external_episode_are_read_without_its_images(tmp_path: Pat
         writer.finish(given.outcome)
     with Recording(tmp_path / "a.mcap") as recording:
         # A chunk has the images of a second, and is there compressed and unpacked.
-        assert peak_bytes(recording.columns) < num_bytes * 0.7
-        stamps = recording.columns().image_stamps["top"].tolist()
+        assert peak_bytes(recording.table) < num_bytes * 0.7
+        stamps = recording.table().image_stamps["top"].tolist()
     assert stamps == [frame.time_ns for frame in given.frames]

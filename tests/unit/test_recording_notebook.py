@@ -16,7 +16,7 @@ from support.present import present
 from support.recording import Codec, frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
-from demorec.core.errors import NotSimulatedError
+from demorec.core.errors import RecordingError
 from demorec.episode.episode import Frame
 from demorec.mcap import Recording, open_recording
 
@@ -152,17 +152,19 @@ def test_an_external_recording_is_at_home_in_notebooks(tmp_path: Path) -> None:
         assert np.array_equal(table[[f"observation.force.{axis}" for axis in "xyz"]].to_numpy(), np.array(forces))
         assert "stack the cups with two_joints" in repr(recording)
         assert recording._repr_html_().count("<img") == 2 * 5
-        with pytest.raises(NotSimulatedError, match="needs the robot of an episode that demorec simulated"):
+        with pytest.raises(RecordingError, match="needs the scene of an episode that demorec simulated"):
             next(iter(recording))
-    with pytest.raises(NotSimulatedError, match=f"needs the scene .* has none: {tmp_path}"):
+    with pytest.raises(RecordingError, match=f"needs the scene of an episode that demorec simulated.*: {tmp_path}"):
         open_recording(tmp_path / "episode.mcap", simulated=True)
 
 
 def test_a_simulated_recording_says_which_image_each_frame_holds(path: Path) -> None:
     with open_recording(path, simulated=True) as recording:
-        columns, info = recording.columns(), recording.info
+        table, info = recording.table(), recording.info
         for camera in info.cameras:
-            assert columns.images[camera.name].tolist() == list(range(NUM_FRAMES))
-            assert not columns.image_age_ns(camera.name).any()
+            assert table.images[camera.name].tolist() == list(range(NUM_FRAMES))
+            assert not table.image_age_ns(camera.name).any()
         assert [camera.name for camera in info.cameras] == list(recording.cameras)
-        assert np.array_equal(np.reshape(present(info.cameras[0].intrinsics), (3, 3)), info.scene.cameras[0].intrinsics)
+        assert np.array_equal(
+            np.reshape(present(info.cameras[0].intrinsics), (3, 3)), info.simulated.scene.cameras[0].intrinsics
+        )

@@ -15,6 +15,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Event, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
 
@@ -40,7 +41,7 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
         assert recording.info == info
         assert recording.outcome == outcome
         assert recording.num_frames == num_frames
-        columns = recording.columns()
+        trajectory = recording.trajectory()
     observations = [frame.observation for frame in frames]
     expected = {
         "time_ns": [frame.time_ns for frame in frames],
@@ -59,16 +60,16 @@ def test_columns_are_the_frames_to_the_bit(tmp_path: Path, num_frames: int, came
         "is_deliberate_miss": [frame.is_deliberate_miss for frame in frames],
     }
     for name, values in expected.items():
-        found = getattr(columns, name)
+        found = getattr(trajectory, name)
         assert found.tobytes() == np.array(values, dtype=found.dtype).tobytes(), name
-    assert np.array_equal(columns.sensed["wrench"], [o.sensed["wrench"] for o in observations])
-    assert columns.phase == tuple(frame.phase for frame in frames)
-    assert list(columns.object_poses) == ["cube"]
-    assert np.array_equal(columns.object_poses["cube"], [o.object_poses["cube"].vector() for o in observations])
-    assert list(columns.world_from_camera) == list(cameras)
+    assert np.array_equal(trajectory.sensed["wrench"], [o.sensed["wrench"] for o in observations])
+    assert trajectory.phase == tuple(frame.phase for frame in frames)
+    assert list(trajectory.object_poses) == ["cube"]
+    assert np.array_equal(trajectory.object_poses["cube"], [o.object_poses["cube"].vector() for o in observations])
+    assert list(trajectory.world_from_camera) == list(cameras)
     for name in cameras:
         poses = [frame.images[name].world_from_camera.vector() for frame in frames]
-        assert np.array_equal(columns.world_from_camera[name], poses)
+        assert np.array_equal(trajectory.world_from_camera[name], poses)
 
 
 @pytest.mark.parametrize("video", CODECS, ids=lambda video: f"{video.codec}-{video.gop}")
@@ -159,7 +160,7 @@ def test_the_digest_is_of_the_content(tmp_path: Path) -> None:
 
     original = digest("a.mcap")
     assert digest("b.mcap", info=replace(info, versions={"demorec": "9"})) == original
-    assert digest("c.mcap", info=info.with_simulation(root_seed=1)) != original
+    assert digest("c.mcap", info=with_simulation(info, root_seed=1)) != original
     observation = frames[3].observation
     effort = observation.joint_effort.copy()
     effort[2] = np.nextafter(effort[2], 99.0)
@@ -178,7 +179,7 @@ def test_no_frames_at_all(tmp_path: Path) -> None:
     path = record(tmp_path / "a.mcap", [], info, replace(outcome, num_frames=0, success=False))
     with Recording(path) as recording:
         assert recording.num_frames == 0
-        assert recording.columns().joint_position.shape == (0, 9)
+        assert recording.trajectory().joint_position.shape == (0, 9)
         assert recording.cameras == ()
         assert len(recording.digest()) == 64
 
@@ -195,7 +196,7 @@ def test_numbers_are_read_without_touching_the_images(tmp_path: Path, monkeypatc
     monkeypatch.setattr(Container, "_read_at", remember)
     with Recording(path) as recording:
         opened = sum(read)
-        recording.columns()
+        recording.trajectory()
         numbers = sum(read) - opened
         list(recording.packets("front"))
         images = sum(read) - opened - numbers

@@ -219,6 +219,7 @@ def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
     info, ended = json.loads(episode["info"]), json.loads(outcome["outcome"])
     info["instruction"] = info["simulation"]["task"] = HOSTILE
     info["simulation"]["robot"]["name"] += HOSTILE
+    info["robot_name"] += HOSTILE
     info["simulation"]["config"] = {HOSTILE: HOSTILE}
     info["versions"] = {"demorec": HOSTILE}
     ended.update(success=False, failure_phase=HOSTILE, failure_reason=HOSTILE)

@@ -17,7 +17,8 @@ from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body, Shape, ShapeKind
-from demorec.loop import Episode, make_world
+from demorec.episode.simulated import with_simulation
+from demorec.loop import PreparedEpisode, make_world
 from demorec.sim.world import World
 from demorec.tasks.grasping import raised
 from demorec.tasks.script import Behaviour
@@ -39,7 +40,7 @@ def shifted(pose: Pose, x: float = 0.0, z: float = 0.0) -> Pose:
 
 
 @pytest.fixture(scope="module")
-def finished() -> Iterator[tuple[Episode, World]]:
+def finished() -> Iterator[tuple[PreparedEpisode, World]]:
     """A world in which the episode has just ended well."""
     prepared = episode(0)
     with make_world(prepared.info) as world:
@@ -55,12 +56,12 @@ BREAKAGES: dict[str, Callable[[Pose], Pose]] = {
 }
 
 
-def failed(prepared: Episode, world: World) -> set[str]:
+def failed(prepared: PreparedEpisode, world: World) -> set[str]:
     return {check.name for check in prepared.task.evaluate(world) if not check.passed}
 
 
 @pytest.mark.parametrize("name", BREAKAGES)
-def test_a_cube_that_lies_wrong_fails_its_check(finished: tuple[Episode, World], name: str) -> None:
+def test_a_cube_that_lies_wrong_fails_its_check(finished: tuple[PreparedEpisode, World], name: str) -> None:
     prepared, world = finished
     good = world.pose("red_cube")
     world.set_state(object_poses={"red_cube": good})
@@ -72,7 +73,7 @@ def test_a_cube_that_lies_wrong_fails_its_check(finished: tuple[Episode, World],
     world.set_state(object_poses={"red_cube": good})
 
 
-def test_a_cube_that_floats_moves_or_is_held_fails(finished: tuple[Episode, World]) -> None:
+def test_a_cube_that_floats_moves_or_is_held_fails(finished: tuple[PreparedEpisode, World]) -> None:
     prepared, world = finished
     cube, good = body_index(world, "red_cube"), world.pose("red_cube")
     world.set_state(object_poses={"red_cube": raised(good, 0.003)})
@@ -116,7 +117,7 @@ def test_into_a_tray_is_anywhere_in_it() -> None:
         assert {"distance_to_goal", "on_support"} <= breaks(0.14 + half + 0.01, 0.0, z=-0.004)
 
 
-def behave(prepared: Episode, **values: float) -> Episode:
+def behave(prepared: PreparedEpisode, **values: float) -> PreparedEpisode:
     return dataclasses.replace(prepared, behaviour=Behaviour(**values))
 
 
@@ -180,11 +181,11 @@ def test_perception_error_shifts_the_grasp() -> None:
 def test_an_object_out_of_reach_gives_up_with_its_phase() -> None:
     prepared = episode(0)
     far = dataclasses.replace(
-        prepared.info.scene.body("red_cube"), world_from_body=Pose(position=np.array([0.8, 0.6, 0.025]))
+        prepared.info.simulated.scene.body("red_cube"), world_from_body=Pose(position=np.array([0.8, 0.6, 0.025]))
     )
-    bodies = tuple(far if b.name == "red_cube" else b for b in prepared.info.scene.bodies)
-    scene = dataclasses.replace(prepared.info.scene, bodies=bodies)
-    frames, outcome = run(dataclasses.replace(prepared, info=prepared.info.with_simulation(scene=scene)))
+    bodies = tuple(far if b.name == "red_cube" else b for b in prepared.info.simulated.scene.bodies)
+    scene = dataclasses.replace(prepared.info.simulated.scene, bodies=bodies)
+    frames, outcome = run(dataclasses.replace(prepared, info=with_simulation(prepared.info, scene=scene)))
     assert not outcome.success
     assert (outcome.failure_phase, outcome.failure_reason) == ("perceive", "unreachable")
     assert [event.name for frame in frames for event in frame.events] == ["unreachable"]
@@ -192,10 +193,10 @@ def test_an_object_out_of_reach_gives_up_with_its_phase() -> None:
 
 def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries() -> None:
     prepared = episode(0)
-    slippery = dataclasses.replace(prepared.info.scene.body("red_cube"), lateral_friction=0.0, mass=2.0)
-    bodies = tuple(slippery if b.name == "red_cube" else b for b in prepared.info.scene.bodies)
-    scene = dataclasses.replace(prepared.info.scene, bodies=bodies)
-    _, outcome = run(dataclasses.replace(prepared, info=prepared.info.with_simulation(scene=scene)))
+    slippery = dataclasses.replace(prepared.info.simulated.scene.body("red_cube"), lateral_friction=0.0, mass=2.0)
+    bodies = tuple(slippery if b.name == "red_cube" else b for b in prepared.info.simulated.scene.bodies)
+    scene = dataclasses.replace(prepared.info.simulated.scene, bodies=bodies)
+    _, outcome = run(dataclasses.replace(prepared, info=with_simulation(prepared.info, scene=scene)))
     assert not outcome.success
     assert outcome.num_retries == 2
     assert outcome.failure_phase in ("lift", "close", "transport")

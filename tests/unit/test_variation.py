@@ -21,7 +21,10 @@ from demorec.tasks.sampling import stratified_point
 
 
 def cube_starts(count: int, **config: Any) -> NDArray[np.float64]:
-    starts = [episode(index, **config).info.scene.body("red_cube").world_from_body.position for index in range(count)]
+    starts = [
+        episode(index, **config).info.simulated.scene.body("red_cube").world_from_body.position
+        for index in range(count)
+    ]
     return np.array(starts)[:, :2]
 
 
@@ -32,7 +35,8 @@ def test_a_range_of_the_user_wins_over_the_preset() -> None:
     speeds = [episode(i, variation="full", ranges=Ranges(speed=(0.9, 0.95))).behaviour.speed for i in range(20)]
     assert 0.9 <= min(speeds) < max(speeds) <= 0.95
     sides = [
-        episode(i, ranges=Ranges(cube_side=(0.04, 0.041))).info.scene.body("red_cube").shape.size[0] for i in range(9)
+        episode(i, ranges=Ranges(cube_side=(0.04, 0.041))).info.simulated.scene.body("red_cube").shape.size[0]
+        for i in range(9)
     ]
     assert 0.04 <= min(sides) <= max(sides) <= 0.041
 
@@ -40,12 +44,15 @@ def test_a_range_of_the_user_wins_over_the_preset() -> None:
 def test_none_varies_nothing_but_the_layout() -> None:
     first, second = episode(0, variation="none"), episode(1, variation="none")
     assert first.behaviour == second.behaviour
-    assert first.info.scene.light == second.info.scene.light
-    assert first.info.scene.robot == second.info.scene.robot
-    assert first.info.scene.robot.joint_position == first.info.robot.home_q
-    assert first.info.scene.physics == second.info.scene.physics
-    assert first.info.scene.body("table") == second.info.scene.body("table")
-    assert first.info.scene.body("red_cube").world_from_body != second.info.scene.body("red_cube").world_from_body
+    assert first.info.simulated.scene.light == second.info.simulated.scene.light
+    assert first.info.simulated.scene.robot == second.info.simulated.scene.robot
+    assert first.info.simulated.scene.robot.joint_position == first.info.simulated.robot.home_q
+    assert first.info.simulated.scene.physics == second.info.simulated.scene.physics
+    assert first.info.simulated.scene.body("table") == second.info.simulated.scene.body("table")
+    assert (
+        first.info.simulated.scene.body("red_cube").world_from_body
+        != second.info.simulated.scene.body("red_cube").world_from_body
+    )
     frames, outcome = run(first)
     assert outcome.success
     assert all(np.array_equal(f.action.joint_target, f.command.joint_target) for f in frames)
@@ -53,7 +60,7 @@ def test_none_varies_nothing_but_the_layout() -> None:
 
 def test_full_varies_everything_within_its_ranges_and_records_it() -> None:
     episodes = [episode(i, variation="full", cameras=("front", "wrist")) for i in range(60)]
-    scenes = [prepared.info.scene for prepared in episodes]
+    scenes = [prepared.info.simulated.scene for prepared in episodes]
     ranges = PRESETS["full"]
 
     def spans(name: str, values: Sequence[float], share: float = 0.7) -> None:
@@ -62,9 +69,9 @@ def test_full_varies_everything_within_its_ranges_and_records_it() -> None:
         assert max(values) <= high + 1e-9
         assert max(values) - min(values) > share * (high - low), name
 
-    spans("speed", [p.info.behaviour["speed"] for p in episodes])
-    spans("approach_height", [p.info.behaviour["approach_height"] for p in episodes])
-    spans("action_noise", [p.info.behaviour["action_noise"] for p in episodes])
+    spans("speed", [p.info.simulated.behaviour["speed"] for p in episodes])
+    spans("approach_height", [p.info.simulated.behaviour["approach_height"] for p in episodes])
+    spans("action_noise", [p.info.simulated.behaviour["action_noise"] for p in episodes])
     spans("gravity_offset", [scene.physics.gravity[2] + 9.81 for scene in scenes])
     spans("table_height", [-scene.robot.world_from_base.position[2] for scene in scenes])
     spans("light_ambient", [scene.light.ambient for scene in scenes])
@@ -75,7 +82,7 @@ def test_full_varies_everything_within_its_ranges_and_records_it() -> None:
     misses = sum(p.behaviour.misses for p in episodes)
     assert 1 <= misses <= 15
     assert 20 < sum(scene.body("table").texture is not None for scene in scenes) < 50
-    assert all(p.info.behaviour["perception_x"] == 0 for p in episodes)
+    assert all(p.info.simulated.behaviour["perception_x"] == 0 for p in episodes)
     # Red stays the strongest channel of what an instruction calls red.
     assert all(np.argmax(scene.body("red_cube").rgba[:3]) == 0 for scene in scenes)
 
@@ -85,7 +92,7 @@ def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
     """Points all over a distractor lie outside the rectangle of every tray."""
     count = 0
     for index in range(60):
-        scene = episode(index, task=task, variation="full").info.scene
+        scene = episode(index, task=task, variation="full").info.simulated.scene
         trays = [body for body in scene.bodies if body.role == "target"]
         assert trays
         for body in scene.bodies:
@@ -108,7 +115,7 @@ def test_looks_do_not_touch_the_physics() -> None:
         light_turn=(1.0, 1.0), light_ambient=(0.4, 0.4), surface_color=1.0, texture_probability=1.0, object_shade=0.3
     )
     varied = episode(3, ranges=looks)
-    assert varied.info.scene.body("table").texture is not None
+    assert varied.info.simulated.scene.body("table").texture is not None
     assert run(varied)[1].final_state_digest == plain
 
 
@@ -130,7 +137,7 @@ def test_calibration_error_is_between_truth_and_record() -> None:
         error = true.inverse() @ believed
         assert 0 < np.abs(error.position).max() <= 0.01
         assert error != Pose()
-        shift = [prepared.info.behaviour[f"calibration_{name}_{axis}"] for axis in "xyz"]
+        shift = [prepared.info.simulated.behaviour[f"calibration_{name}_{axis}"] for axis in "xyz"]
         assert np.allclose(error.position, shift, atol=1e-9)
         # The image is drawn from where the camera truly is.
         assert np.array_equal(frame.images[name].color, reference.images[name].color)
@@ -165,8 +172,8 @@ def test_train_and_eval_layouts_never_overlap(sampling: str) -> None:
 
 def test_train_and_eval_seeds_never_overlap() -> None:
     config: dict[str, Any] = {"ranges": Ranges(held_out_x=(0.35, 0.65), held_out_y=(-0.25, 0.25))}
-    everywhere = {episode(i, split="eval", **config).info.scene.body("red_cube").mass for i in range(50)}
-    same_seed = {episode(i, split="all", **config).info.scene.body("red_cube").mass for i in range(50)}
+    everywhere = {episode(i, split="eval", **config).info.simulated.scene.body("red_cube").mass for i in range(50)}
+    same_seed = {episode(i, split="all", **config).info.simulated.scene.body("red_cube").mass for i in range(50)}
     assert len(everywhere) == 50
     assert not everywhere & same_seed
     with pytest.raises(ConfigError, match="seed"):

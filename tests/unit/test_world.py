@@ -27,7 +27,7 @@ def world() -> Iterator[World]:
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    return episode(0).info.scene
+    return episode(0).info.simulated.scene
 
 
 def hold(world: World, frames: int) -> None:
@@ -83,7 +83,7 @@ def test_the_wrench_grows_by_the_weight_of_what_is_lifted() -> None:
     lift = next(i for i, f in enumerate(frames) if f.observation.object_poses["red_cube"].position[2] > 0.06)
     free = np.mean([f.observation.sensed["wrench"][2] for f in frames[: lift // 2]])
     held = np.mean([f.observation.sensed["wrench"][2] for f in frames[lift + 10 : lift + 60]])
-    assert abs((free - held) - 9.81 * prepared.info.scene.body("red_cube").mass) < 0.15
+    assert abs((free - held) - 9.81 * prepared.info.simulated.scene.body("red_cube").mass) < 0.15
 
 
 def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(world: World, scene: Scene) -> None:

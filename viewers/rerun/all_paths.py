@@ -25,8 +25,8 @@ def main(run: Path, target: Path) -> None:
     stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for file in files:
         with Recording(file) as recording:
-            base, outcome = recording.info.scene.robot.world_from_base, recording.outcome
-            points = base.apply(recording.columns().base_from_tcp[:, :3])
+            base, outcome = recording.info.simulated.scene.robot.world_from_base, recording.outcome
+            points = base.apply(recording.trajectory().base_from_tcp[:, :3])
         color = GREEN if outcome is not None and outcome.success else RED
         stream.log(f"paths/{file.stem}", rr.LineStrips3D([points], colors=[color], radii=[-1.5]), static=True)
     stream.disconnect()

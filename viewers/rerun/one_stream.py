@@ -19,15 +19,15 @@ from demorec.mcap import Recording
 def main(source: Path, target: Path) -> None:
     file = find_recordings([source])[0]
     with Recording(file) as recording:
-        columns, joints = recording.columns(), recording.info.robot.arm_joints
+        trajectory, joints = recording.trajectory(), recording.info.simulated.robot.arm_joints
     # Action t is reached at t + 1: the target of frame t is compared with the position one frame later.
-    error = columns.joint_position[1:, : len(joints)] - columns.action_joint_target[:-1]
+    error = trajectory.joint_position[1:, : len(joints)] - trajectory.action_joint_target[:-1]
     stream = rr.RecordingStream("tracking", recording_id=file.stem)
     stream.save(target)
     stream.log("tracking_error", rr.SeriesLines(names=list(joints)), static=True)
     stream.send_columns(
         "tracking_error",
-        indexes=[rr.TimeColumn("time", duration=columns.time_ns[1:].astype("timedelta64[ns]"))],
+        indexes=[rr.TimeColumn("time", duration=trajectory.time_ns[1:].astype("timedelta64[ns]"))],
         columns=rr.Scalars.columns(scalars=np.degrees(error)),
     )
     stream.disconnect()

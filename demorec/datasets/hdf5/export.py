@@ -19,7 +19,7 @@ from demorec.datasets.hdf5.file import DATASET, ENVIRONMENT_PREFIX, UNFINISHED, 
 from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Trajectory
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
@@ -138,7 +138,7 @@ def _fill(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
     demo["dones"] = dones
     _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
     if episode.info.simulation is not None:
-        _add_vectors(demo, "states", *_states(episode.columns, episode.rows, episode.info))
+        _add_vectors(demo, "states", *_states(episode.trajectory, episode.rows, episode.info))
     group = demo.create_group("obs")
     for name, (feature, elements) in observations.items():
         _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
@@ -203,10 +203,10 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
     }
     name = _EXTERNAL
     if info.simulation is not None:
-        name = environment_name(info.task)
-        cameras = [camera for camera in info.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
+        name = environment_name(info.simulated.task)
+        cameras = [camera for camera in info.simulated.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
         arguments |= {
-            "physics_hz": info.physics_hz,
+            "physics_hz": info.simulated.physics_hz,
             **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
             "action": options.action,
             "privileged": options.privileged,
@@ -218,16 +218,18 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
     }
 
 
-def _states(columns: Columns, rows: NDArray[np.intp], info: EpisodeInfo) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+def _states(
+    trajectory: Trajectory, rows: NDArray[np.intp], info: EpisodeInfo
+) -> tuple[NDArray[np.float64], tuple[str, ...]]:
     """(T, D) float64 state of the simulated world as recorded, and the names of its components.
 
     Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:
     xyz (m) and quaternion xyzw.
     """
-    parts = [columns.joint_position, columns.joint_velocity, *columns.object_poses.values()]
-    joints = info.robot.joint_names
+    parts = [trajectory.joint_position, trajectory.joint_velocity, *trajectory.object_poses.values()]
+    joints = info.simulated.robot.joint_names
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
-    names += [f"{body}.{axis}" for body in columns.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
+    names += [f"{body}.{axis}" for body in trajectory.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
     return np.concatenate(parts, axis=1)[rows], tuple(names)
 
 

@@ -3,7 +3,7 @@
     dataset = LeRobotDataset(root)
     for number in range(len(dataset)):
         recording = DatasetRecording(dataset, number)
-        recording.info, recording.columns(), recording.packets("front"), recording.subtasks
+        recording.info, recording.table(), recording.packets("front"), recording.subtasks
 
 Formats v3.0, v2.1 and v2.0 are read. What our own exports keep beside the tables (outcome, robot, cameras) is used
 where it is there. Memory is that of an episode's numbers.

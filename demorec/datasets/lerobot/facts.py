@@ -32,7 +32,7 @@ from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 
 if TYPE_CHECKING:
-    from demorec.episode.episode import Columns, SuccessCheck
+    from demorec.episode.episode import SuccessCheck, Trajectory
     from demorec.episode.info import EpisodeInfo
     from demorec.episode.scene import Scene
     from demorec.mcap import Recording
@@ -157,7 +157,7 @@ def fact_columns(root: Path) -> dict[str, pa.DataType]:
     return {item.name: item.type for item in schema if not _LEROBOT_COLUMN.match(item.name)}
 
 
-def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:
+def episode_facts(recording: Recording, trajectory: Trajectory) -> dict[str, Any]:
     """Name -> value for a simulated episode; positions in the world frame at the start, metres."""
     info, outcome = recording.info, recording.outcome
     facts: dict[str, Any] = {
@@ -165,16 +165,16 @@ def episode_facts(recording: Recording, columns: Columns) -> dict[str, Any]:
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "interrupted" if outcome is None else outcome.failure_reason,
         "num_retries": 0 if outcome is None else outcome.num_retries,
-        "has_deliberate_miss": bool(columns.is_deliberate_miss.any()),
-        "duration_s": columns.num_frames / info.fps,
-        "task_name": info.task,
-        "split": str(info.config.get("split", "")),
-        "variation": str(info.config.get("variation", "")),
-        "seed": info.root_seed,
+        "has_deliberate_miss": bool(trajectory.is_deliberate_miss.any()),
+        "duration_s": trajectory.num_frames / info.fps,
+        "task_name": info.simulated.task,
+        "split": str(info.simulated.config.get("split", "")),
+        "variation": str(info.simulated.config.get("variation", "")),
+        "seed": info.simulated.root_seed,
         "run_episode_index": info.episode_index,
         "attempt": info.attempt,
-        "num_goals": len(info.scene.goals),
-        **first_goal(info.scene),
+        "num_goals": len(info.simulated.scene.goals),
+        **first_goal(info.simulated.scene),
     }
     facts |= {f"drawn/{name}": value for name, value in sorted(_drawn(info).items())}
     checks = () if outcome is None else outcome.checks
@@ -194,8 +194,8 @@ def first_goal(scene: Scene | None) -> dict[str, Any]:
 
 def _drawn(info: EpisodeInfo) -> Mapping[str, float]:
     """Values drawn for the episode: behaviour, the first object's size, mass and friction, gravity, light."""
-    scene = info.scene
-    drawn = dict(info.behaviour)
+    scene = info.simulated.scene
+    drawn = dict(info.simulated.behaviour)
     light = scene.light
     drawn |= {"light_ambient": light.ambient, "light_diffuse": light.diffuse, "light_shadow": light.shadow}
     drawn["light_turn"] = math.atan2(light.direction[1], light.direction[0])

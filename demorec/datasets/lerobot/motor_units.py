@@ -8,12 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, RecordingError
 from demorec.datasets.episode import DONE, REWARD, SUCCESS
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS, motor_features
-from demorec.episode.episode import Columns
+from demorec.episode.episode import Table, Trajectory
 from demorec.episode.features import ACTION, EE_POSE, STATE, VELOCITY
+from demorec.episode.info import NOT_SIMULATED
+from demorec.episode.simulated import scene_of
 from demorec.mcap import Recording, open_recording
 from demorec.robots.motors import MotorUnits
 
@@ -36,36 +38,39 @@ class MotorRecording(Recording):
 
     def __init__(self, path: str | Path, units: MotorUnits, calibration: Path | None = None) -> None:
         super().__init__(path)
-        simulated = self.info
-        arm = IN_MOTOR_UNITS.get(simulated.robot_name) if simulated.simulation is not None else None
+        described = self.info
+        arm = IN_MOTOR_UNITS.get(described.robot_name) if scene_of(described) is not None else None
         if arm is None:
             self.close()
             raise ConfigError(
                 f"Motor units are asked for, which simulated episodes of {', '.join(IN_MOTOR_UNITS)} have, not those "
-                f"of {simulated.robot_name or 'an unnamed robot'}: leave --motor-units out: {path}"
+                f"of {described.robot_name or 'an unnamed robot'}: leave --motor-units out: {path}"
             )
-        self._motors, self._spec = arm.motors(units, calibration), simulated.robot
+        simulation = described.simulated
+        self._motors, self._spec = arm.motors(units, calibration), simulation.robot
         self.info = replace(
-            simulated,
+            described,
             robot_name=arm.robot_type,
             urdf=self.description(),
             features=motor_features(self._motors),
-            origin=f"simulated: {simulated.task}, seed {simulated.root_seed}, configuration {simulated.config_digest}",
+            origin=(
+                f"simulated: {simulation.task}, seed {simulation.root_seed}, configuration {simulation.config_digest}"
+            ),
             simulation=None,
         )
 
-    def columns(self) -> Columns:
-        """As of `Recording`: state and action as the servos say them."""
-        return self._converted
+    def trajectory(self) -> Trajectory:
+        """Refuse: nobody knows what was simulated. Raises RecordingError."""
+        raise RecordingError(f"{NOT_SIMULATED}: {self.path}")
 
     @cached_property
-    def _converted(self) -> Columns:
+    def _table(self) -> Table:
         with Recording(self.path) as simulated:  # which knows its scene
-            columns = simulated.columns()
-        jaw = self._spec.gripper.joint_position(columns.action_gripper)
-        targets = np.concatenate([columns.action_joint_target, jaw], axis=1)
-        values = {STATE: self._motors.values(columns.joint_position), ACTION: self._motors.values(targets)}
-        return replace(columns, features=values, stamps=dict.fromkeys(values, columns.time_ns))
+            trajectory, table = simulated.trajectory(), simulated.table()
+        jaw = self._spec.gripper.joint_position(trajectory.action_gripper)
+        targets = np.concatenate([trajectory.action_joint_target, jaw], axis=1)
+        values = {STATE: self._motors.values(trajectory.joint_position), ACTION: self._motors.values(targets)}
+        return replace(table, features=values, stamps=dict.fromkeys(values, table.time_ns))
 
 
 def recording_of(path: Path, options: ExportOptions) -> Recording:

@@ -107,7 +107,7 @@ def _language(episode: ExportEpisode, options: ExportOptions) -> EpisodeLanguage
             Statement(row=frame, kind="subtask", role="assistant", text=text) for frame, text in recording.subtasks
         ]
         return episode_language(stated, fps=episode.fps)
-    statements = episode_statements(recording, episode.columns, episode.rows, options.spoken)
+    statements = episode_statements(recording, episode.trajectory, episode.rows, options.spoken)
     return episode_language(statements, fps=episode.fps)
 
 
@@ -115,10 +115,10 @@ def _facts(episode: ExportEpisode, options: ExportOptions) -> dict[str, Any]:
     """What is known of a simulated episode, its stages among it if they were asked for."""
     if episode.info.simulation is None:
         return {}
-    facts = episode_facts(episode.recording, episode.columns)
+    facts = episode_facts(episode.recording, episode.trajectory)
     if options.progress:
-        runs = dense_runs(episode_timeline(episode.recording, episode.columns), episode.rows)
-        num_goals = len(episode.info.scene.goals)
+        runs = dense_runs(episode_timeline(episode.recording, episode.trajectory), episode.rows)
+        num_goals = len(episode.info.simulated.scene.goals)
         facts |= EpisodeProgress(num_goals=num_goals, runs=tuple(runs)).row()
     return facts
 
@@ -132,9 +132,9 @@ def episode_boxes(episode: ExportEpisode) -> dict[str, SeenByCamera]:
     boxes = {}
     if episode.info.simulation is not None:
         taken = {camera.name for camera in episode.cameras}
-        for camera in episode.info.scene.cameras:
+        for camera in episode.info.simulated.scene.cameras:
             if camera.name in taken and episode.recording.has_segmentation(camera.name):
-                seen = seen_objects(episode.recording, episode.columns, episode.rows, camera)
+                seen = seen_objects(episode.recording, episode.trajectory, episode.rows, camera)
                 entries = tuple(box_entry(item) for item in seen)
                 boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, entries
     if not boxes:

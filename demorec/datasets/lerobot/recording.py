@@ -19,7 +19,7 @@ from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.language import PERSISTENT, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
-from demorec.episode.episode import Columns, Outcome, frame_time_ns
+from demorec.episode.episode import Outcome, Table, frame_time_ns
 from demorec.episode.features import DEPTH_SUFFIX, STATE
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.mcap.frame_check import MAX_SUBTASK
@@ -137,17 +137,17 @@ class DatasetRecording:
                 raise ExportError(f"The column {feature.name} holds {found}, not {claimed}: {self.path}")
         return rows
 
-    def columns(self) -> Columns:
-        """All numbers, one row a frame, each feature in the type that recordings hold it in."""
-        return self._columns
+    def table(self) -> Table:
+        """Read the features of every frame, each in the type that recordings hold it in."""
+        return self._table
 
     @cached_property
-    def _columns(self) -> Columns:
+    def _table(self) -> Table:
         leads = {name: self._lead(name) for name in self.dataset.keys}
         begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
         times = np.array([frame_time_ns(index, fps) for index in range(begin + self.num_frames)], dtype=np.int64)
         features = {item.name: self._rows[item.name].astype(item.dtype) for item in self.dataset.features}
-        return Columns(
+        return Table(
             time_ns=times[begin:],
             features=features,
             stamps=dict.fromkeys(features, times[begin:]),
@@ -172,7 +172,7 @@ class DatasetRecording:
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
-        lead, times = self._lead(camera), self.columns().image_stamps[camera]
+        lead, times = self._lead(camera), self.table().image_stamps[camera]
         if (video := self._video(camera)) is not None:
             for frame, data, is_key in video.packets():
                 number = min(frame + lead, len(times) - 1)

@@ -113,7 +113,7 @@ def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
     name, moving = episode.recording.info.robot_name, episode.moving()
     if episode.info.simulation is None:
         return _robot(name, portable_urdf(text), moving)
-    spec = episode.info.robot
+    spec = episode.info.simulated.robot
     return _robot(name, text, moving, spec=spec)
 
 

@@ -40,7 +40,7 @@ from demorec.datasets.lerobot.writer import write_text
 
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
-    from demorec.episode.episode import Columns
+    from demorec.episode.episode import Trajectory
     from demorec.episode.info import Camera
     from demorec.mcap import Recording
 
@@ -131,7 +131,7 @@ class EpisodeRecord:
         moving: dict[str, Array] = {}
         if (simulation := info.simulation) is not None:
             row |= _simulated_row(episode)
-            poses = episode.columns.world_from_camera
+            poses = episode.trajectory.world_from_camera
             moving = {camera.name: poses[camera.name][rows] for camera in info.cameras if camera.mount != "world"}
         return cls(
             row=row,
@@ -143,26 +143,27 @@ class EpisodeRecord:
 
 def _simulated_row(episode: ExportEpisode) -> dict[str, Any]:
     """What is known of a simulated episode; it failed where its recording ends without an outcome."""
-    info, columns, outcome = episode.info, episode.columns, episode.recording.outcome
+    info, trajectory, outcome = episode.info, episode.trajectory, episode.recording.outcome
     return {
-        "root_seed": info.root_seed,
-        "config_digest": info.config_digest,
+        "root_seed": info.simulated.root_seed,
+        "config_digest": info.simulated.config_digest,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "num_retries": 0 if outcome is None else outcome.num_retries,
         "final_state_digest": "" if outcome is None else outcome.final_state_digest,
         "checks": [] if outcome is None else [to_plain(check) for check in outcome.checks],
-        "phases": _phases(columns, episode.rows),
+        "phases": _phases(trajectory, episode.rows),
         "objects": [
-            {"name": name, "world_from_object_end": poses[-1].tolist()} for name, poses in columns.object_poses.items()
+            {"name": name, "world_from_object_end": poses[-1].tolist()}
+            for name, poses in trajectory.object_poses.items()
         ],
         "episode_info": to_json(info),
     }
 
 
-def _phases(columns: Columns, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
+def _phases(trajectory: Trajectory, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
     """Name, first frame and frame after the last, of each phase."""
     phases = []
-    for name, group in groupby(range(len(rows)), key=lambda index: columns.phase[rows[index]]):
+    for name, group in groupby(range(len(rows)), key=lambda index: trajectory.phase[rows[index]]):
         numbers = list(group)
         phases.append({"name": name, "from": numbers[0], "to": numbers[-1] + 1})
     return phases
@@ -259,5 +260,5 @@ def attempt_row(recording: Recording) -> dict[str, Any]:
         "success": recording.success,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
-        **first_goal(None if info.simulation is None else info.scene),
+        **first_goal(None if info.simulation is None else info.simulated.scene),
     }

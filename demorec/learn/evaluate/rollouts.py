@@ -37,6 +37,7 @@ from demorec.core.tables import ROBOTS, camera_name
 from demorec.episode.episode import Outcome
 from demorec.episode.features import ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, ActionKind, StateKind, state_names
 from demorec.episode.sensed import SENSED
+from demorec.episode.simulated import with_simulation
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Raised
 from demorec.generate.local import LocalExecutor
@@ -247,8 +248,11 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     observation, _ = env.reset(seed=plan.episode_index)
     info, kind = env.info, "rollout"
     if settings.takeover is not None:
-        behaviour = {**info.behaviour, **correcting_behaviour(env.episode, noise=settings.takeover.noise).as_mapping()}
-        info, kind = info.with_simulation(behaviour=behaviour), "correction"
+        behaviour = {
+            **info.simulated.behaviour,
+            **correcting_behaviour(env.episode, noise=settings.takeover.noise).as_mapping(),
+        }
+        info, kind = with_simulation(info, behaviour=behaviour), "correction"
     info = replace(info, origin=f"{kind} of {settings.policy_type} {settings.policy_digest}")
     turns = Turns(env, policy, observation, seed=plan.episode_index, rules=settings.takeover, rehearsal_world=world)
     name = f"episode_{plan.episode_index:06d}.mcap"
@@ -375,7 +379,7 @@ def _with(evaluation: Evaluation, rollouts: list[Attempt]) -> Evaluation:
 @functools.lru_cache(maxsize=100_000)
 def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[str, float]:
     plan = EpisodePlan(config=config, episode_index=episode_index, attempt=attempt)
-    return factors_of(prepare(plan).info.scene)
+    return factors_of(prepare(plan).info.simulated.scene)
 
 
 def _save(evaluation: Evaluation, folder: Path) -> None:

@@ -77,7 +77,7 @@ class Turns:
             self._watch = Watch(rules, env.episode, max_frames=env.max_episode_steps, world=rehearsal_world)
         self._commands: list[Action] = []
         self._is_out_of_time = False
-        self._stages = [0] * len(env.info.scene.goals)
+        self._stages = [0] * len(env.info.simulated.scene.goals)
 
     def frames(self) -> Iterator[Frame]:
         """Each frame, once its command has been carried out."""
@@ -136,7 +136,7 @@ class Turns:
 
     def _step(self, step: Step) -> Frame:
         self._observation, _, self.success, self._is_out_of_time, _ = self._env.act(step)
-        goals = self._env.info.scene.goals
+        goals = self._env.info.simulated.scene.goals
         self._stages = [max(stage, self._reached(goal, stage)) for goal, stage in zip(goals, self._stages, strict=True)]
         frame = self._env.situation.last_frame
         assert frame is not None  # since there was a step
@@ -150,7 +150,7 @@ class Turns:
         position = world.pose(goal.object).position
         if stage == 0:
             return 1 if held else 0
-        start = self._env.info.scene.body(goal.object).world_from_body.position
+        start = self._env.info.simulated.scene.body(goal.object).world_from_body.position
         if stage == 1:
             return 2 if held and position[2] - start[2] > LIFTED else 1
         return 3 if math.dist(position[:2], goal_pose(world, goal).position[:2]) < NEAR_GOAL else 2
@@ -187,7 +187,7 @@ def read_takeover(path: Path) -> TakenOver | None:
         messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
         if not messages:
             return None
-        phases = recording.columns().phase
+        phases = recording.phases
     return TakenOver(
         reasons=tuple(message.removeprefix(_MESSAGE) for message in messages),
         num_frames=sum(phase != POLICY_PHASE for phase in phases),

@@ -16,7 +16,7 @@ from demorec.core.geometry import Array, angle_between
 from demorec.episode.episode import Action, Observation
 from demorec.gym_env import Situation
 from demorec.learn.evaluate import TakeOver
-from demorec.loop import Episode, Session
+from demorec.loop import PreparedEpisode, Session
 from demorec.sim.world import World
 from demorec.tasks.script import Behaviour, Step
 from demorec.tasks.skills import Expert, GaveUp
@@ -27,7 +27,7 @@ _SAME_PLACE = 0.001
 """Metres within which two places of the way are one; the later one counts, since the expert also waits."""
 
 
-def correcting_behaviour(episode: Episode, *, noise: bool) -> Behaviour:
+def correcting_behaviour(episode: PreparedEpisode, *, noise: bool) -> Behaviour:
     """How the expert does it in an episode that it takes over: without a miss on purpose, with `noise` or without."""
     behaviour = replace(episode.behaviour, miss_x=0.0, miss_y=0.0)
     return behaviour if noise else replace(behaviour, action_noise=0.0)
@@ -42,8 +42,8 @@ class Rehearsal:
         commands: What was sent since the episode's start; the way begins after them.
     """
 
-    def __init__(self, world: World, episode: Episode, commands: Sequence[Action]) -> None:
-        session = Session(world, episode.info.scene, episode.task)
+    def __init__(self, world: World, episode: PreparedEpisode, commands: Sequence[Action]) -> None:
+        session = Session(world, episode.info.simulated.scene, episode.task)
         session.reset()
         for command in commands:
             session.step(command)
@@ -83,7 +83,7 @@ class Rehearsal:
         return float(shifts[nearest]), angle, float(max(objects, default=0.0))
 
 
-def _steps(world: World, episode: Episode, *, is_start: bool) -> Iterator[Step]:
+def _steps(world: World, episode: PreparedEpisode, *, is_start: bool) -> Iterator[Step]:
     """What the expert does until it is done or gives up."""
     expert = Expert(world, correcting_behaviour(episode, noise=False))
     try:
@@ -111,7 +111,9 @@ class Watch:
         world: In which the expert's way is rehearsed; needed only where straying counts.
     """
 
-    def __init__(self, rules: TakeOver, episode: Episode, *, max_frames: int, world: World | None = None) -> None:
+    def __init__(
+        self, rules: TakeOver, episode: PreparedEpisode, *, max_frames: int, world: World | None = None
+    ) -> None:
         fps = episode.info.fps
         self._rules, self._episode, self._world = rules, episode, world
         self._limit = min(max_frames, round(rules.after_seconds * fps) or max_frames)

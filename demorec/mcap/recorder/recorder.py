@@ -19,7 +19,7 @@ from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.core.files import Closing
 from demorec.core.registry import nearest_match
 from demorec.episode.episode import Outcome, Sample, SampledFrame
-from demorec.episode.info import Camera, EpisodeInfo, Feature
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.episode.validity import find_problems
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.frame_check import SampledFrameCheck
@@ -343,6 +343,7 @@ class Recorder(Closing):
             fps=self._fps,
             features=features,
             cameras=self._cameras,
+            origin=Origin(),
             versions={"demorec": version("demorec")},
         )
 

@@ -20,6 +20,7 @@ from demorec.core.processes import in_turn
 from demorec.core.tables import RENDERERS
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import with_simulation
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.render import Renderer
@@ -113,8 +114,8 @@ def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
 def _unlike_here(info: EpisodeInfo, allowed: Sequence[str]) -> tuple[str, ...]:
     """Describe in which versions, and in which type of CPU, what made an episode differs from what is here."""
     lines = list(version_differences(info.versions, _versions_here(info, allowed)))
-    if info.cpu != cpu_type():
-        lines.append(f"it was simulated on {info.cpu or 'an unknown CPU'}, this is {cpu_type()}")
+    if info.simulated.cpu != cpu_type():
+        lines.append(f"it was simulated on {info.simulated.cpu or 'an unknown CPU'}, this is {cpu_type()}")
     return tuple(lines)
 
 
@@ -132,7 +133,7 @@ def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateCon
         ConfigError: It is none.
         NotAllowedError: It names something of a module that is not among those `allowed`.
     """
-    config = config_as(info.config, GenerateConfig)
+    config = config_as(info.simulated.config, GenerateConfig)
     config.check_names(allowed)
     config.validate()
     return config
@@ -170,11 +171,11 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     allow_models(allowed)
     options = ReplayOptions(allowed=tuple(allowed))
     demonstration = open_demonstration(recording, options)
-    info = recording.info.with_simulation(config_digest=digest(recording.info.config))
-    RENDERERS.check_name(str(info.config.get("renderer", "raster")))
+    info = with_simulation(recording.info, config_digest=digest(recording.info.simulated.config))
+    RENDERERS.check_name(str(info.simulated.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
     painter = _recorded_painter(info, renderer)
-    with EpisodeWriter(path, info, video=config_as(info.config.get("video", {}), VideoConfig)) as writer:
+    with EpisodeWriter(path, info, video=config_as(info.simulated.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
             recorded = recording.outcome
@@ -192,7 +193,7 @@ def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter |
     """Draws what the recording shows, from where its cameras really were; None without cameras."""
     if renderer is None:
         return None
-    return view_painter(renderer, recorded_view(info), info.config)
+    return view_painter(renderer, recorded_view(info), info.simulated.config)
 
 
 def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[Difference]:

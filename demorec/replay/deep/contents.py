@@ -41,8 +41,8 @@ class Difference:
 
     Attributes:
         stream: A topic, or "metadata NAME", "attachment NAME".
-        field: Of its messages, as `pose.position.x`, or of the metadata, as `info.scene.bodies[1].mass`; "image" for
-            what a camera shows.
+        field: Of its messages, as `pose.position.x`, or of the metadata, as `info.simulation.scene.bodies[1].mass`;
+            "image" for what a camera shows.
         frames: In which, ascending; empty for what belongs to no frame.
         recorded, again: What is recorded and what comes out, at the first of these frames, in words; `again` is ""
             where `recorded` says it all.
@@ -142,7 +142,9 @@ class Contents:
 
 def coded_topics(info: EpisodeInfo) -> dict[str, str]:
     """Topic -> camera, of all streams of coded images."""
-    return {camera_topic(camera.name, stream): camera.name for camera in info.scene.cameras for stream in CODED}
+    return {
+        camera_topic(camera.name, stream): camera.name for camera in info.simulated.scene.cameras for stream in CODED
+    }
 
 
 def content_differences(

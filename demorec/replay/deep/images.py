@@ -93,7 +93,7 @@ def _coded(contents: Contents, topic: str) -> list[bytes]:
 
 
 def _drawn(remade: Recording, world: World, painter: Painter, camera: str) -> Iterator[Rgb]:
-    states = RecordedStates(world, remade.info.scene, remade.columns())
+    states = RecordedStates(world, remade.info.simulated.scene, remade.trajectory())
     painter.setup(states)
     for frame in range(remade.num_frames):
         states.frame = frame

@@ -84,7 +84,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
     @property
     def spec(self) -> RobotSpec:
         """The arm."""
-        return self._env.info.robot
+        return self._env.info.simulated.robot
 
     @cached_property
     def names(self) -> tuple[str, ...]:

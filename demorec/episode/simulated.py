@@ -1,0 +1,156 @@
+"""The description and the table of an episode that demorec simulated, in the form that every episode has."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from demorec.core.plain import to_plain
+from demorec.episode.episode import Outcome, Table, Trajectory
+from demorec.episode.features import (
+    ACTION,
+    COMMAND,
+    EE_POSE,
+    STATE,
+    VELOCITY,
+    action_names,
+    action_vectors,
+    command_vectors,
+    observation_names,
+    observation_vectors,
+)
+from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
+from demorec.episode.scene import Scene
+from demorec.episode.sensed import SENSED, ObservationRows
+
+
+def simulated_info(
+    simulation: Simulation,
+    *,
+    episode_index: int,
+    instruction: str,
+    fps: int,
+    attempt: int = 0,
+    origin: str = "",
+    versions: Mapping[str, str] | None = None,
+) -> EpisodeInfo:
+    """Describe an episode that demorec simulates; arguments as the attributes of `EpisodeInfo`."""
+    return EpisodeInfo(
+        episode_index=episode_index,
+        attempt=attempt,
+        instruction=instruction,
+        robot_name=simulation.robot.name,
+        fps=fps,
+        features=simulated_features(simulation),
+        cameras=simulated_cameras(simulation.scene),
+        origin=origin,
+        versions=versions or {},
+        simulation=simulation,
+    )
+
+
+def with_simulation(info: EpisodeInfo, **changes: Any) -> EpisodeInfo:
+    """Change fields of an episode's `Simulation`, and with it the cameras and the names of elements.
+
+    Raises:
+        RecordingError: demorec did not simulate this episode.
+    """
+    simulation = replace(info.simulated, **changes)
+    listed = {feature.name for feature in info.features}
+    features = tuple(feature for feature in simulated_features(simulation) if feature.name in listed)
+    return replace(info, simulation=simulation, features=features, cameras=simulated_cameras(simulation.scene))
+
+
+def simulated_cameras(scene: Scene) -> tuple[Camera, ...]:
+    """Describe the cameras of a scene."""
+    return tuple(
+        Camera(
+            name=camera.name,
+            width=camera.width,
+            height=camera.height,
+            intrinsics=tuple(np.ravel(camera.intrinsics).tolist()),
+            mount=camera.mount,
+            mount_from_camera=camera.mount_from_camera,
+        )
+        for camera in scene.cameras
+    )
+
+
+def simulated_features(simulation: Simulation) -> tuple[Feature, ...]:
+    """Describe the vectors of a simulated episode; `simulated_table` gives their values."""
+    robot, arm = simulation.robot, simulation.robot.arm_joints
+    names = observation_names(robot, simulation.scene, sensed=SENSED)
+    target_names = action_names(robot, "joint")
+    joints, units = (*arm, ""), (*("rad" for _ in arm), "m")
+    return (
+        Feature(name=STATE, names=names[STATE], units=units, joints=joints),
+        Feature(name=VELOCITY, names=names[VELOCITY], units=(*("rad/s" for _ in arm), "m/s")),
+        Feature(name=EE_POSE, names=names[EE_POSE], units=("m", "m", "m", "", "", "", "")),
+        *(
+            Feature(name=name, names=names[name], units=row.units(robot), source=row.meaning)
+            for name, row in SENSED.items()
+        ),
+        Feature(name=ACTION, names=target_names, units=units, joints=joints),
+        Feature(name=COMMAND, names=target_names, units=units, joints=joints),
+    )
+
+
+def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
+    """Convert a trajectory to the features of its description, in float64; each frame shows the image of its number."""
+    robot, scene = info.simulated.robot, info.simulated.scene
+    rows = ObservationRows.of_trajectory(trajectory)
+    vectors = {
+        **observation_vectors(rows, robot, scene, sensed=SENSED, dtype=np.float64),
+        ACTION: action_vectors(trajectory, scene, "joint", dtype=np.float64),
+        COMMAND: command_vectors(trajectory),
+    }
+    features = {feature.name: vectors[feature.name] for feature in info.features}
+    cameras = list(trajectory.world_from_camera)
+    return Table(
+        time_ns=trajectory.time_ns,
+        features=features,
+        stamps=dict.fromkeys(features, trajectory.time_ns),
+        images=dict.fromkeys(cameras, np.arange(trajectory.num_frames, dtype=np.int64)),
+        image_stamps=dict.fromkeys(cameras, trajectory.time_ns),
+    )
+
+
+def description_of(info: EpisodeInfo) -> dict[str, Any]:
+    """Return the description as plain data, without the versions and the CPU that made the episode."""
+    plain: dict[str, Any] = to_plain(info)
+    del plain["versions"]
+    if info.simulation is not None:
+        del plain["simulation"]["cpu"]
+    return plain
+
+
+def simulation_facts(info: EpisodeInfo) -> Mapping[str, Any]:
+    """Return what people ask about a simulation, as plain data; empty for any other episode.
+
+    Keys: task, root_seed, physics_hz, objects (names of the movable bodies), config_digest.
+    """
+    if info.simulation is None:
+        return {}
+    simulation = info.simulation
+    return {
+        "task": simulation.task,
+        "root_seed": simulation.root_seed,
+        "physics_hz": simulation.physics_hz,
+        "objects": [body.name for body in simulation.scene.movable],
+        "config_digest": simulation.config_digest,
+    }
+
+
+def scene_of(info: EpisodeInfo) -> Scene | None:
+    """Return the world at the start of the episode; None where it is not known."""
+    return None if info.simulation is None else info.simulation.scene
+
+
+def has_failed(info: EpisodeInfo, outcome: Outcome | None) -> bool:
+    """Whether an episode failed: its outcome says so, or a crash cut off a simulation, which always has one."""
+    if outcome is None:
+        return info.simulation is not None
+    return outcome.success is False
