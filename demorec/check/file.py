@@ -89,7 +89,7 @@ def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, 
 def readable(episode: CheckedEpisode) -> Measurement:
     """Decode every message by the layout in the metadata, at its frame's time."""
     words = len(list(episode.recording.events())) + len(episode.recording.subtasks)
-    return Measurement(value=0, detail=f"{episode.num_frames} frames, {words} events and subtasks")
+    return Measurement(value=0, detail=f"{episode.table.num_frames} frames, {words} events and subtasks")
 
 
 @file_check(

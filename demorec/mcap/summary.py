@@ -69,10 +69,12 @@ def summarize(path: Path) -> dict[str, Any]:
 
 
 def _length(recording: Recording) -> tuple[float, float]:
-    """Seconds, and mean frames per second."""
+    """Seconds to the end of the last frame, which takes as long as the nominal rate says, and mean frames per second."""
     times = recording.time_ns
-    seconds = float(times[-1] - times[0]) / 1e9 if len(times) else 0.0
-    return seconds, (len(times) - 1) / seconds if seconds else 0.0
+    if not len(times):
+        return 0.0, 0.0
+    span = float(times[-1] - times[0]) / 1e9
+    return span + 1 / recording.info.fps, (len(times) - 1) / span if span else 0.0
 
 
 def _features(recording: Recording) -> list[dict[str, Any]]:

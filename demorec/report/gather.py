@@ -18,6 +18,7 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import Outcome
 from demorec.episode.features import ACTION, STATE
+from demorec.episode.simulated import simulation_facts
 from demorec.mcap import Recording, open_recording
 from demorec.report.content import (
     CheckSummaries,
@@ -172,7 +173,6 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
     bounds = [0, *changes, len(names)] if names else []
     is_failed = recording.path.parent.name == FAILED
     attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
-    simulated = info.simulation
     episode = ReportedEpisode(
         name=f"episode {info.episode_index}{attempt}",
         problem="A crash cut the recording off; it was recovered." if recording.outcome is None else "",
@@ -180,7 +180,7 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
         outcome=recording.outcome,
         num_frames=recording.num_frames,
         fps=info.fps,
-        seed=None if simulated is None else simulated.root_seed,
+        seed=simulation_facts(info).get("root_seed"),
         phases=tuple((names[first], first, end) for first, end in pairwise(bounds)),
         filmstrip=strip,
         facts=tuple(_facts_of(recording)),
@@ -198,14 +198,14 @@ def _vectors(content: ExportEpisode) -> _Vectors:
 
 
 def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:
-    info, simulated = recording.info, recording.info.simulation
-    if simulated is not None:
-        yield "task", simulated.task
+    info, simulated = recording.info, simulation_facts(recording.info)
+    if simulated:
+        yield "task", simulated["task"]
     yield "robot", info.robot_name
     videos = ((name, recording.video_settings(name)) for name in recording.cameras)
     yield "cameras", ", ".join(f"{name} {video.width}x{video.height}" for name, video in videos) or "none"
-    if simulated is not None:
-        yield "root seed", str(simulated.root_seed)
+    if simulated:
+        yield "root seed", str(simulated["root_seed"])
     yield "made with", f"demorec {info.versions.get('demorec', 'of an unknown version')}"
 
 

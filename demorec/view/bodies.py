@@ -151,8 +151,8 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
         RecordingError: A mesh of the robot's model cannot be read.
     """
     info, description, positions = episode.info, episode.robot_description, episode.joint_position
-    if info.simulation is not None:
-        urdf, meshes = robot_model(info.simulated.robot.urdf, info.simulated.scene.robot.scale, description)
+    if episode.scene is not None:
+        urdf, meshes = robot_model(info.simulated.robot.urdf, episode.scene.robot.scale, description)
     elif description is not None:
         urdf = Urdf.parse(description)
         meshes = _meshes_or_rods(description, urdf)

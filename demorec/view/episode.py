@@ -13,6 +13,7 @@ from demorec.episode.episode import Event, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED
+from demorec.episode.simulated import scene_of
 from demorec.robots.robot import RobotSpec
 
 Distances = NDArray[np.uint16] | NDArray[np.float32]
@@ -113,7 +114,7 @@ class PlayedEpisode:
     @property
     def scene(self) -> Scene | None:
         """The world at the start, where it is known."""
-        return None if self.info.simulation is None else self.info.simulated.scene
+        return scene_of(self.info)
 
     @property
     def world_from_base(self) -> Pose:

@@ -43,7 +43,7 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
         times = recording.time_ns
         statements = tuple((int(times[frame] - times[0]), "subtask", text) for frame, text in recording.subtasks)
         episode = played_episode(recording, known | {"statements": statements}, recording.info)
-        yield episode if recording.info.simulation is None else _with_simulation(episode, recording)
+        yield episode if episode.scene is None else _with_simulation(episode, recording)
 
 
 def _with_simulation(episode: PlayedEpisode, recording: Recording) -> PlayedEpisode:

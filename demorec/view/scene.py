@@ -13,6 +13,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
 from demorec.episode.episode import Outcome
 from demorec.episode.scene import Rgba
+from demorec.episode.simulated import simulation_facts
 from demorec.view.bodies import log_bodies, log_robot
 from demorec.view.cameras import log_cameras
 from demorec.view.episode import Curves, PlayedEpisode, Statements
@@ -239,10 +240,10 @@ def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
     }
     if outcome is not None and outcome.success is not None:
         values["success"] = outcome.success
-    if info.simulation is not None:
-        values |= {"task": info.simulated.task, "seed": info.simulated.root_seed, "attempt": info.attempt}
+    if facts := simulation_facts(info):
+        values |= {"task": facts["task"], "seed": facts["root_seed"], "attempt": info.attempt}
         values |= {} if outcome is None else {"retries": outcome.num_retries}
-        values |= {"config_digest": info.simulated.config_digest} if info.simulated.config_digest else {}
+        values |= {"config_digest": facts["config_digest"]} if facts["config_digest"] else {}
     if origin := _origin(episode):
         values["origin"] = origin
     return values
@@ -256,9 +257,9 @@ def _origin(episode: PlayedEpisode) -> str:
 
 def summary(episode: PlayedEpisode) -> str:
     """Markdown: task, outcome and its checks, the failed ones first."""
-    info = episode.info
-    about = [info.robot_name if info.simulation is None else info.simulated.task, f"episode {info.episode_index}"]
-    about += [] if info.simulation is None else [f"seed {info.simulated.root_seed}"]
+    info, facts = episode.info, simulation_facts(episode.info)
+    about = [facts.get("task", info.robot_name), f"episode {info.episode_index}"]
+    about += [f"seed {facts['root_seed']}"] if facts else []
     length = f"{episode.duration:.1f} s · {episode.num_frames} frames (nominal {info.fps} Hz)"
     origin, checks = _origin(episode), [] if episode.outcome is None else _checks(episode.outcome)
     parts = [f"**{info.instruction}**", " · ".join(about), length, f"Outcome: **{episode.verdict}**"]

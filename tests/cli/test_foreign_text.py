@@ -57,6 +57,7 @@ def _fields(info: dict[str, Any]) -> dict[str, Any]:
     info["origin"] = f"replay of {HOSTILE}"
     info["versions"] = {f"demorec{HOSTILE}": HOSTILE}
     simulation = info["simulation"]
+    info["robot_name"] += HOSTILE
     simulation["task"] += HOSTILE
     simulation["robot"]["name"] += HOSTILE
     simulation["config_digest"] += HOSTILE
