@@ -28,7 +28,7 @@ _SHOWN = 12
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class CheckCommand:
     """Check recordings, runs and datasets: files, times, numbers, motion, images.
 
     Exit code 0: everything passed (warnings allowed); 1: a check failed. `demorec list checks` prints what is measured

@@ -18,7 +18,7 @@ from demorec.sources.formats import IMPORTED
 
 
 @dataclass(frozen=True, kw_only=True)
-class Report:
+class ReportCommand:
     """Write a self-contained HTML page about a run, recordings or a dataset.
 
     It shows outcomes, the results of the checks, the distributions of states and actions, and a filmstrip of every

@@ -13,7 +13,7 @@ from demorec.core.geometry import Array
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Material:
+class ObjMaterial:
     """What colours a face.
 
     Attributes:
@@ -44,7 +44,7 @@ class ObjFile:
     normals: Array
     corners: NDArray[np.int64]
     face_materials: tuple[str, ...]
-    materials: Mapping[str, Material]
+    materials: Mapping[str, ObjMaterial]
 
     @property
     def faces(self) -> NDArray[np.int64]:
@@ -64,7 +64,7 @@ def read_obj(path: Path) -> ObjFile:
     normals: list[list[float]] = []
     corners: list[tuple[int, int, int]] = []
     face_materials: list[str] = []
-    materials: dict[str, Material] = {}
+    materials: dict[str, ObjMaterial] = {}
     material = ""
 
     def parse(corner: str) -> tuple[int, int, int]:
@@ -115,21 +115,21 @@ def _lines(path: Path) -> Iterator[list[str]]:
     return filter(None, map(str.split, path.read_text(errors="replace").splitlines()))
 
 
-def _materials(path: Path) -> dict[str, Material]:
-    """Material name -> material, of an MTL file; a missing file means no materials."""
-    found: dict[str, Material] = {}
+def _materials(path: Path) -> dict[str, ObjMaterial]:
+    """ObjMaterial name -> material, of an MTL file; a missing file means no materials."""
+    found: dict[str, ObjMaterial] = {}
     name = None
     if not path.is_file():
         return found
     for key, *words in _lines(path):
         if key == "newmtl":
             name = " ".join(words)
-            found[name] = Material(color=np.ones(3), texture=None)
+            found[name] = ObjMaterial(color=np.ones(3), texture=None)
         elif name is not None and key == "Kd" and len(words) >= 3:
             color = np.array([float(word) for word in words[:3]])
-            found[name] = Material(color=color, texture=found[name].texture)
+            found[name] = ObjMaterial(color=color, texture=found[name].texture)
         elif name is not None and key == "map_Kd" and words:
             # Options (-s 1 1 1, ...) stand before the name.
             texture = path.parent / words[-1]
-            found[name] = Material(color=found[name].color, texture=texture if texture.is_file() else None)
+            found[name] = ObjMaterial(color=found[name].color, texture=texture if texture.is_file() else None)
     return found

@@ -85,11 +85,11 @@ class Timeline:
         known = self.stamps_ns[self.stamps_ns > 0]
         return len(known) - len(np.unique(known))
 
-    def chosen(self, rows_ns: Int) -> Chosen:
+    def chosen(self, rows_ns: Int) -> ChosenSamples:
         """What rows of these times (R,) take."""
         return choose(self.times_ns, rows_ns, self.sample)
 
-    def sampled(self, chosen: Chosen) -> Numbers:
+    def sampled(self, chosen: ChosenSamples) -> Numbers:
         """(R, D) the numbers of these rows, of a source."""
         stream = self.stream
         return sampled(stream.values, self.order, chosen, unit=stream.unit, quaternions=stream.quaternions)
@@ -140,7 +140,7 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Chosen:
+class ChosenSamples:
     """What rows take from a stream.
 
     Attributes:
@@ -156,7 +156,7 @@ class Chosen:
     reach_ns: Int
 
 
-def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
+def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
     """The messages for some rows.
 
     Args:
@@ -171,21 +171,21 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> Chosen:
     since = np.where(before >= 0, rows_ns - times_ns[np.maximum(before, 0)], MISSING)
     until = np.where(before + 1 < count, times_ns[after] - rows_ns, MISSING)
     if sample == "latest":
-        return Chosen(index=before, fraction=None, age_ns=since, reach_ns=since)
+        return ChosenSamples(index=before, fraction=None, age_ns=since, reach_ns=since)
     if sample == "nearest":
         later = until < since
         age = np.where(later, -until, since)
-        return Chosen(index=np.where(later, after, before), fraction=None, age_ns=age, reach_ns=np.abs(age))
+        return ChosenSamples(index=np.where(later, after, before), fraction=None, age_ns=age, reach_ns=np.abs(age))
     exact = since == 0
     # A row outside of the stream has a neighbour on one side only, and no line to be on.
     is_outside = ~exact & ((before < 0) | (before + 1 >= count))
     reach = np.where(is_outside, MISSING, np.where(exact, 0, np.maximum(since, until)))
     width = np.where(exact | is_outside, 1, times_ns[after] - times_ns[np.maximum(before, 0)])
     fraction = np.where(exact, 0.0, np.clip(since / width, 0.0, 1.0))
-    return Chosen(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
+    return ChosenSamples(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
 
 
-def sampled(values: Numbers, order: Int, chosen: Chosen, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
+def sampled(values: Numbers, order: Int, chosen: ChosenSamples, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
     """(R, D) the numbers of some rows.
 
     Args:

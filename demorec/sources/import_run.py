@@ -40,7 +40,7 @@ def import_bags(
     skip_bad: bool = False,
     tell: Callable[[BagReport], None] = lambda report: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
-) -> Batch:
+) -> ImportBatch:
     """Import bags into a run, by a mapping.
 
     Args:
@@ -71,7 +71,7 @@ def import_bags(
     if known.mapping_digest != mapping.digest:
         raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
     given = list(dict.fromkeys(bag for path in paths for bag in bags_in(path)))
-    batch = Batch(given, known, skips=skip_bad, progress=progress)
+    batch = ImportBatch(given, known, skips=skip_bad, progress=progress)
     with ExitStack() as stack:
         submit: Callable[..., Future[Any]]
         submit = _at_once if workers == 1 else stack.enter_context(process_pool(workers)).submit
@@ -105,7 +105,7 @@ _MAX_REASON = 1000
 """Characters: an error may quote what a bag holds."""
 
 
-class Batch:
+class ImportBatch:
     """The bags of one call: numbered and taken into the run in their order, whoever reads and writes them when.
 
     So what is in the run depends neither on how many processes there are nor on when they were interrupted.

@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.episode.info import DEPTH_UNITS, Kept
 from demorec.sources.bag_files import BagError
-from demorec.sources.clock import MISSING, NS, Chosen, Int, Numbers, Timeline, followed, grid, timeline
+from demorec.sources.clock import MISSING, NS, ChosenSamples, Int, Numbers, Timeline, followed, grid, timeline
 from demorec.sources.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
 from demorec.sources.mapping import ROWS, SourceMapping
 from demorec.sources.streams import BagStreams, Key
@@ -44,7 +44,7 @@ class FeatureRows:
 
     Attributes:
         values: (R, D), float32 where all its sources are, otherwise float64.
-        ages_ns: (R,) of the oldest of its sources, signed as in `Chosen`.
+        ages_ns: (R,) of the oldest of its sources, signed as in `ChosenSamples`.
     """
 
     values: Numbers
@@ -160,7 +160,7 @@ class Timelines:
             follows=follows,
         )
 
-    def _feature(self, name: str, chosen: Mapping[Key, Chosen]) -> FeatureRows:
+    def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples]) -> FeatureRows:
         rows = [(line, chosen[name, index]) for index, line in enumerate(self.sources(name))]
         return FeatureRows(
             values=np.concatenate([line.sampled(of_line) for line, of_line in rows], axis=1),
@@ -247,7 +247,7 @@ def _last(line: Timeline, window: Window) -> int:
     return int(line.times_ns[last]) + age
 
 
-def _too_old(line: Timeline, chosen: Chosen, times: Int) -> str:
+def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
     """Why what the rows take is missing or too old; "" when it is not."""
     ages = chosen.reach_ns
     bad = np.flatnonzero((ages > line.max_age_ns) | (chosen.index < 0))
@@ -261,7 +261,7 @@ def _too_old(line: Timeline, chosen: Chosen, times: Int) -> str:
     )
 
 
-def _unfit(line: Timeline, chosen: Chosen, times: Int) -> str:
+def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
     """Why what the rows take cannot be recorded; "" when it can."""
     stream = line.stream
     if stream.names:

@@ -7,7 +7,7 @@ import unicodedata
 import pytest
 
 from demorec.cli import COMMANDS, generate_dataset_main, main
-from demorec.cli.dataset import Dataset
+from demorec.cli.dataset import DatasetCommand
 from demorec.core.tables import EXPORTERS
 
 PROGRAMS = (
@@ -15,7 +15,7 @@ PROGRAMS = (
     "generate-dataset",
     *(f"demorec {name}" for name in COMMANDS.names() if name not in ("generate", "dataset")),
     *(f"demorec export {name}" for name in EXPORTERS.names()),
-    *(f"demorec dataset {name}" for name in Dataset.commands.names()),
+    *(f"demorec dataset {name}" for name in DatasetCommand.commands.names()),
 )
 
 GROUPS = ("demorec", "demorec dataset")
@@ -56,7 +56,7 @@ def test_every_flag_is_described(
         assert "  " in rows[number] or not below.startswith("-"), rows[number]
 
 
-@pytest.mark.parametrize("name", Dataset.commands.names())
+@pytest.mark.parametrize("name", DatasetCommand.commands.names())
 def test_a_command_of_dataset_has_its_own_flags_and_an_example(
     name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

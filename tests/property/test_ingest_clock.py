@@ -8,14 +8,14 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from demorec.sources.clock import MISSING, Chosen, choose, sampled
+from demorec.sources.clock import MISSING, ChosenSamples, choose, sampled
 
 TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).map(sorted)
 ROWS = st.lists(st.integers(-10, 10**6 + 10), min_size=1, max_size=30, unique=True).map(sorted)
 
 
-def _chosen(index: NDArray[np.int64], fraction: NDArray[np.float64]) -> Chosen:
-    return Chosen(index=index, fraction=fraction, age_ns=np.zeros_like(index), reach_ns=np.zeros_like(index))
+def _chosen(index: NDArray[np.int64], fraction: NDArray[np.float64]) -> ChosenSamples:
+    return ChosenSamples(index=index, fraction=fraction, age_ns=np.zeros_like(index), reach_ns=np.zeros_like(index))
 
 
 @given(TIMES, ROWS)

@@ -22,7 +22,7 @@ from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE
 from demorec.episode.info import Camera, Feature
 from demorec.mcap import Recording
-from demorec.mcap.recorder.encoder import Encoder
+from demorec.mcap.recorder.encoder import BackgroundEncoder
 from demorec.mcap.writer import EpisodeWriter
 from demorec.robots.panda import PANDA
 from demorec.runs.run_file import load_any_run_file
@@ -285,14 +285,14 @@ def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
 
 def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
     """The encoder waits for this."""
-    go_on, write = threading.Event(), Encoder._write
+    go_on, write = threading.Event(), BackgroundEncoder._write
 
-    def waits(self: Encoder, *waiting: Any) -> None:
+    def waits(self: BackgroundEncoder, *waiting: Any) -> None:
         if not go_on.wait(30):
             go_on.set()  # a test that fails shall not wait once more for every frame
         write(self, *waiting)
 
-    monkeypatch.setattr(Encoder, "_write", waits)
+    monkeypatch.setattr(BackgroundEncoder, "_write", waits)
     return go_on
 
 

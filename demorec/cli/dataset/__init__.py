@@ -7,7 +7,7 @@ from typing import Any
 from demorec.core.registry import Registry
 
 
-class Dataset:
+class DatasetCommand:
     """Edit LeRobot datasets: no image is encoded again, the sources stay as they are.
 
     Any LeRobot dataset (v3.0, v2.1) is read; a run stands for its own dataset. The result appears whole or not at all.

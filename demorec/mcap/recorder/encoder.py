@@ -60,7 +60,7 @@ class Buffers:
         self._free[buffer.shape].append(buffer)
 
 
-class Encoder:
+class BackgroundEncoder:
     """Feeds a writer from a queue in a thread of its own.
 
     Args:

@@ -23,7 +23,7 @@ from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.episode.validity import find_problems
 from demorec.mcap import EpisodeWriter
 from demorec.mcap.frame_check import SampledFrameCheck
-from demorec.mcap.recorder.encoder import Buffers, Encoder, WaitingImages, WhenFull
+from demorec.mcap.recorder.encoder import BackgroundEncoder, Buffers, WaitingImages, WhenFull
 from demorec.mcap.recorder.vectors import (
     NamedVectors,
     RobotLike,
@@ -57,13 +57,13 @@ class RecordedEpisode:
         num_frames: Frames that were taken.
     """
 
-    def __init__(self, run: Recorder, info: EpisodeInfo, encoder: Encoder) -> None:
+    def __init__(self, run: Recorder, info: EpisodeInfo, encoder: BackgroundEncoder) -> None:
         self.success: bool | None = None
         self.drops: dict[str, int] = {}
         self.num_frames = 0
         self._run = run
         self._info = info
-        self._encoder: Encoder | None = encoder
+        self._encoder: BackgroundEncoder | None = encoder
         self._check: SampledFrameCheck | None = None
 
     @property
@@ -179,7 +179,7 @@ class RecordedEpisode:
         if encoder is not None:
             encoder.writer.discard()
 
-    def _end(self) -> Encoder | None:
+    def _end(self) -> BackgroundEncoder | None:
         """Take no more frames; the encoder, with all that came, if nobody else has ended it."""
         encoder, self._encoder = self._encoder, None
         if encoder is not None:
@@ -316,7 +316,9 @@ class Recorder(Closing):
         info = self._info(self._features, self._folder.next_index, instruction)
         path = episode_path(self.path, info.episode_index)
         writer = EpisodeWriter(path, info, video=self._video, begins=False)
-        encoder = Encoder(writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait")
+        encoder = BackgroundEncoder(
+            writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait"
+        )
         self._open = RecordedEpisode(self, info, encoder)
         return self._open
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RenderError, describe_error
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
-from demorec.robots.obj import Material, read_obj
+from demorec.robots.obj import ObjMaterial, read_obj
 
 FORMATS = (".obj", ".stl", ".dae")
 
@@ -57,7 +57,7 @@ def load_obj(path: Path) -> RasterMesh:
         uv = np.concatenate([[[0.5, 0.5]], found.uvs])[index[:, :, 1]]
     colors = None
     if texture is None and len({tuple(material.color) for material in materials.values()}) > 1:
-        white = Material(color=np.ones(3), texture=None)
+        white = ObjMaterial(color=np.ones(3), texture=None)
         colors = np.array([materials.get(name, white).color for name in found.face_materials])
     corner_normals = None
     if len(found.normals) and len(faces) and index[:, :, 2].min() > 0:

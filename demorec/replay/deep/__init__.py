@@ -7,6 +7,6 @@ other than what the program itself does wrong each time.
 """
 
 from demorec.replay.deep.check import DeepReport, deep_check, deep_checks, deep_dataset_checks
-from demorec.replay.deep.contents import Difference
+from demorec.replay.deep.contents import RemakeDifference
 
-__all__ = ["DeepReport", "Difference", "deep_check", "deep_checks", "deep_dataset_checks"]
+__all__ = ["DeepReport", "RemakeDifference", "deep_check", "deep_checks", "deep_dataset_checks"]

@@ -25,7 +25,7 @@ from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.render import Renderer
 from demorec.render.painter import Painter
-from demorec.replay.deep.contents import Contents, Difference, coded_topics, content_differences
+from demorec.replay.deep.contents import Contents, RemakeDifference, coded_topics, content_differences
 from demorec.replay.deep.images import image_differences
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
 from demorec.replay.drive import replay
@@ -50,7 +50,7 @@ class DeepReport:
 
     path: Path
     versions: tuple[str, ...] = ()
-    differences: tuple[Difference, ...] = ()
+    differences: tuple[RemakeDifference, ...] = ()
     error: str = ""
     replay: str = ""
     is_derived: bool = False
@@ -196,7 +196,7 @@ def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter |
     return view_painter(renderer, recorded_view(info), info.simulated.config)
 
 
-def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[Difference]:
+def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[RemakeDifference]:
     """Ordered by the first frame."""
     found, made = Contents.of(recording.path), Contents.of(again)
     with open_recording(again, simulated=True) as remade:
@@ -273,7 +273,7 @@ def _episode_differences(
     options: ExportOptions,
     simulators: SimulatorCache,
     allowed: Sequence[str],
-) -> Iterator[Difference]:
+) -> Iterator[RemakeDifference]:
     info = episode.info
     if info.origin:
         raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
@@ -281,4 +281,4 @@ def _episode_differences(
         again = Path(folder) / "again.mcap"
         _generate_again(info, again, simulators, allowed)
         for what, frames in episode_differences(again, options, episode, videos):
-            yield Difference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
+            yield RemakeDifference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")

@@ -36,7 +36,7 @@ Differing = tuple[str, str, int | None, Value | None, Value | None]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Difference:
+class RemakeDifference:
     """One field of one stream that is not what it is when the recording is made again.
 
     Attributes:
@@ -149,7 +149,7 @@ def coded_topics(info: EpisodeInfo) -> dict[str, str]:
 
 def content_differences(
     recorded: Contents, again: Contents, info: EpisodeInfo, fps: int
-) -> tuple[list[Difference], dict[str, list[int]]]:
+) -> tuple[list[RemakeDifference], dict[str, list[int]]]:
     """What differs, less the coded images; and topic -> frames, ascending, whose coded images differ.
 
     Args:
@@ -188,7 +188,7 @@ def _all_differing(
                 yield topic, name, frame, a, b
 
 
-def _gathered(found: Iterable[Differing]) -> Iterator[Difference]:
+def _gathered(found: Iterable[Differing]) -> Iterator[RemakeDifference]:
     """Those of one field over all frames as one, of which the first is shown."""
     groups: dict[tuple[str, str], tuple[str, str, dict[int, None]]] = {}
     largest: dict[tuple[str, str], float] = {}
@@ -201,7 +201,7 @@ def _gathered(found: Iterable[Differing]) -> Iterator[Difference]:
         if (apart := _apart(a, b)) is not None:
             largest[key] = max(apart, largest.get(key, 0.0))
     for (stream, name), (recorded, again, frames) in groups.items():
-        yield Difference(
+        yield RemakeDifference(
             stream=stream,
             field=name,
             frames=tuple(frames),

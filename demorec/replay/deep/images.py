@@ -23,7 +23,7 @@ from demorec.mcap.lossless import decode_depth, decode_labels
 from demorec.mcap.messages import message_fields
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.render.painter import Painter
-from demorec.replay.deep.contents import Contents, Difference
+from demorec.replay.deep.contents import Contents, RemakeDifference
 from demorec.sim.recorded_states import RecordedStates
 from demorec.sim.world import World
 
@@ -42,7 +42,7 @@ def image_differences(
     painter: Painter,
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
-) -> Iterator[Difference]:
+) -> Iterator[RemakeDifference]:
     """One or two differences for each stream whose coded images differ: what shows something else, and what does not.
 
     Args:
@@ -61,7 +61,7 @@ def image_differences(
         else:
             found = dict(_colours(settings, *images, _drawn(remade, world, painter, cameras[topic])))
         if found:
-            yield Difference(
+            yield RemakeDifference(
                 stream=topic,
                 field="image",
                 frames=tuple(found),
@@ -70,7 +70,7 @@ def image_differences(
             )
         coding = tuple(frame for frame in frames if frame not in found)
         if coding:
-            yield Difference(
+            yield RemakeDifference(
                 stream=topic,
                 field="data",
                 frames=coding,
