@@ -69,7 +69,7 @@ def summarize(path: Path) -> dict[str, Any]:
 
 
 def _length(recording: Recording) -> tuple[float, float]:
-    """Seconds to the end of the last frame, which takes as long as the nominal rate says, and mean frames per second."""
+    """Seconds to the end of the last frame, which takes one nominal period, and mean frames per second."""
     times = recording.time_ns
     if not len(times):
         return 0.0, 0.0

@@ -1,4 +1,5 @@
-"""Five commands on everything that can be read: they say the user's path, leave nothing behind, and give the rows."""
+"""Every command that reads episodes, on every kind of episode: it names the user's path, leaves nothing behind, and
+gives each episode and frame."""
 
 from __future__ import annotations
 
@@ -22,13 +23,22 @@ from conformance.test_import_v21 import write_v21
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags, hdf5
 from support.commands import ON_A_PATH, ON_EVERYTHING, exit_code
-from support.export import without_verification
+from support.export import export, make_run, without_verification
+from support.external import TOP, make_external, write_external
 from support.foreign_dataset import write_foreign
 
+from demorec.mcap import open_recording
 from demorec.sources import import_run
 
-COMMANDS = {name: ON_A_PATH[name] for name in ON_EVERYTHING} | {"export": "export hdf5 PATH --out NEW.hdf5"}
+COMMANDS = {name: ON_A_PATH[name] for name in ON_EVERYTHING} | {
+    "export hdf5": "export hdf5 PATH --out NEW.hdf5",
+    "import": "import FORMAT PATH --out NEW",
+}
 ROWS = {
+    "simulation": (1, 24),
+    "run of simulations": (2, 44),
+    "dataset of simulations": (2, 44),
+    "recorder": (1, 45),
     "mcap": (1, 48),
     "mcap with --mapping": (1, 48),
     "rosbag2": (1, 48),
@@ -39,6 +49,18 @@ ROWS = {
     "lerobot v3.0": (2, 16),
 }
 """Kind -> episodes and frames, as its writer made them."""
+CASES = [
+    (command, kind)
+    for command in COMMANDS
+    for kind in ROWS
+    if command != "import" or "simulation" not in kind or "dataset" in kind  # a simulated recording needs no import
+]
+FORMATS = {"robomimic": "hdf5", "aloha": "hdf5", "dataset of simulations": "lerobot"} | dict.fromkeys(
+    ("lerobot v2.1", "lerobot v3.0"), "lerobot"
+)
+"""Kind -> word of `demorec import`; bags and recordings, which are bags too, have none."""
+FRAMES_OF = {"run of simulations": (24, 20)}
+"""Kind -> frames of each episode, where they are listed so."""
 
 
 @pytest.fixture(scope="module")
@@ -51,7 +73,13 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path | st
         bags.write_mcap(notes, folder / "bags" / f"{name}.mcap")
     mapping = bag_mappings.write_mapping(bag_mappings.SO101, folder / "so101.toml")
     bag = bags.write_mcap(notes, folder / "stack.mcap")
+    run = make_run(folder / "run", (24, 20))
+    export(run, folder / "dataset")
     return {
+        "simulation": [run / "episodes" / "episode_000000.mcap"],
+        "run of simulations": [run],
+        "dataset of simulations": [folder / "dataset"],
+        "recorder": [write_external(folder / "recorded.mcap", make_external(cameras=(TOP,)))],
         "mcap": [bag],
         "mcap with --mapping": [bag, "--mapping", mapping],
         "rosbag2": [bags.write_rosbag2(notes, folder / "so101", storage=StoragePlugin.SQLITE3)],
@@ -73,8 +101,7 @@ def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("kind", ROWS)
-@pytest.mark.parametrize("command", COMMANDS)
+@pytest.mark.parametrize(("command", "kind"), CASES)
 def test_a_command_reads_it(
     command: str,
     kind: str,
@@ -84,19 +111,37 @@ def test_a_command_reads_it(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     words: list[str] = []
+    flags: list[str] = []
+    if command == "import" and len(places[kind]) == 1 and FORMATS.get(kind) != "lerobot":
+        code = exit_code("import", *([FORMATS[kind]] if kind in FORMATS else []), places[kind][0], "--suggest")
+        mapping = capsys.readouterr().out
+        assert code == 0
+        (tmp_path / "mapping.toml").write_text(mapping)
+        flags = ["--mapping", str(tmp_path / "mapping.toml")]
     for word in COMMANDS[command].split():
-        words += map(str, places[kind]) if word == "PATH" else [word.replace("NEW", str(tmp_path / "new"))]
-    code = exit_code(*words)
+        if word == "PATH":
+            words += map(str, places[kind])
+        elif word != "FORMAT":
+            words.append(word.replace("NEW", str(tmp_path / "new")))
+        elif kind in FORMATS:
+            words.append(FORMATS[kind])
+    code = exit_code(*words, *flags)
     printed = capsys.readouterr()
-    assert code in ((0, 1) if command == "check" else (0,)), printed  # the small foreign datasets have faults
-    assert str(places[kind][0]) in printed.out or command != "info"
     assert "demorec-reading" not in printed.out + printed.err
     assert not list(scratch.iterdir())
+    assert code in ((0, 1) if command == "check" else (0,)), printed  # the small foreign datasets have faults
+    assert str(places[kind][0]) in printed.out or command != "info"
     episodes, frames = ROWS[kind]
     if command == "info":
         assert f"{episodes} " in printed.out
-        assert f"{frames} (" in printed.out
+        assert all(str(count) in printed.out for count in FRAMES_OF.get(kind, (frames,)))
+    if command == "import":
+        recordings = sorted((tmp_path / "new" / "episodes").glob("*.mcap"))
+        assert [len(recordings), sum(_num_frames(file) for file in recordings)] == [episodes, frames]
     if command == "export":
+        told = json.loads((tmp_path / "new" / "meta" / "info.json").read_text())
+        assert [told["total_episodes"], told["total_frames"]] == [episodes, frames]
+    if command == "export hdf5":
         with h5py.File(tmp_path / "new.hdf5") as file:
             assert len(file["data"]) == episodes
             assert sum(len(file[f"data/{name}/actions"]) for name in file["data"]) == frames
@@ -108,6 +153,11 @@ def test_a_command_reads_it(
         assert "failed:" not in page  # nobody said so
     if command == "view":
         assert len(list(tmp_path.glob("new*.rrd"))) == episodes
+
+
+def _num_frames(recording: Path) -> int:
+    with open_recording(recording) as opened:
+        return opened.num_frames
 
 
 @pytest.mark.parametrize(("kind", "word"), [("robomimic", "hdf5"), ("aloha", "hdf5"), ("lerobot v3.0", "lerobot")])
