@@ -158,7 +158,7 @@ class Import:
             kinds = ", ".join(sorted(set(odd)))
             say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
         else:
-            above = f"No findings; {counted(notes, 'note')} above of images in two rows, or in none, by design."
+            above = f"No findings; {counted(notes, 'note')} above."
             say(above if notes else "Nothing odd was found.")
         if not result.skipped:
             return 0

@@ -12,7 +12,7 @@ from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
 from demorec.core.errors import ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX
-from demorec.runs.find import Found, expect
+from demorec.runs.find import Found, expect, find
 
 if TYPE_CHECKING:
     from demorec.runs.run_file import RunFile
@@ -40,8 +40,11 @@ class Info:
     def run(self) -> int:
         """Read and print; 1 when something among several paths cannot be read."""
         need_paths(self.paths, "info")
-        with reading(self.paths, self.mapping) as paths:
-            self._show([_describe(path) for path in paths])
+        bags = [path for path in self.paths if self.mapping is None and find(path).kind == "rosbag"]
+        others = [path for path in self.paths if path not in bags]
+        with reading(others, self.mapping) as read:
+            places = dict(zip(others, read, strict=True))
+            self._show([_describe(places[path]) if path in places else _bag_or_bags(path) for path in self.paths])
         return 0
 
     def _show(self, found: Sequence[tuple[dict[str, Any], list[str]]]) -> None:
@@ -62,6 +65,47 @@ def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
         plain["unfinished"] = [str(file) for file in found.unfinished]
         lines += ["", f"Left out: {found.left}."]
     return plain, lines
+
+
+def _bag_or_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """A bag, or each one of a folder of bags."""
+    from demorec.sources.bag import bags_in
+
+    found = [_bag(bag) for bag in bags_in(path)]
+    if len(found) == 1:
+        return found[0]
+    plain = {"kind": "bags", "path": str(path), "bags": [plain for plain, _ in found]}
+    lines = [f"{len(found)} bags in {path}"]
+    for _, described in found:
+        lines += ["", *described]
+    return plain, lines
+
+
+def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
+    from demorec.sources.bag_summary import summarize_bag
+
+    bag = summarize_bag(path)
+    plain = {
+        "kind": "bag",
+        "path": str(path),
+        "bytes": bag.num_bytes,
+        "seconds": bag.span_s,
+        "messages": bag.num_messages,
+        "topics": [
+            {"topic": name, "type": topic.type, "messages": topic.count, "rate": topic.rate_hz}
+            for name, topic in bag.topics.items()
+        ],
+        "problems": list(bag.problems),
+    }
+    length = f"{bag.span_s:.2f} s, {counted(bag.num_messages, 'message')}"
+    facts = [("bag", f"{path} ({size_in_words(bag.num_bytes)})"), ("length", length)]
+    facts += [("problem", problem) for problem in bag.problems[:_MOST_PROBLEMS]]
+    rows = [
+        (name, str(topic.count), f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else "", topic.type)
+        for name, topic in bag.topics.items()
+    ]
+    lines = [*aligned(facts), "", *aligned([("topic", "messages", "rate", "type"), *rows])]
+    return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
 
 
 def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:

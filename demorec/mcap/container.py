@@ -83,7 +83,7 @@ class Container:
         if size == 0:
             raise RecordingError(f"The file is empty, so no recording: {self.path}")
         if self._read_at(0, min(size, len(MCAP_MAGIC))) != MCAP_MAGIC:
-            raise RecordingError(f"The file is no MCAP file, so no recording: {self.path}")
+            raise RecordingError(f"This is not an MCAP file, so not a recording: {self.path}")
         tail_bytes = _FOOTER_BYTES + len(MCAP_MAGIC)
         if size < tail_bytes + len(MCAP_MAGIC) or self._read_at(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise RecordingError(

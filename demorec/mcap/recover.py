@@ -148,7 +148,7 @@ def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
             size = file.seek(0, 2)
             file.seek(0)
             if file.read(len(MCAP_MAGIC)) != MCAP_MAGIC:
-                yield "the file is empty" if size == 0 else "the file is no MCAP file"
+                yield "the file is empty" if size == 0 else "the file is not an MCAP file"
                 return
             with damage_as_recording_error(source):
                 yield from scan(file)

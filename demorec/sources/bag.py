@@ -156,7 +156,8 @@ def _magic_of(path: Path) -> bytes:
         if head.startswith(magic):
             return magic
     _refuse_other_formats(path)
-    raise BagError(f"This is no bag: MCAP, .db3 and .bag files and rosbag2 folders are read: {path}")
+    what = "This is not an MCAP file" if path.suffix == ".mcap" else "This is not a bag"
+    raise BagError(f"{what}: MCAP, .db3 and .bag files and rosbag2 folders are read: {path}")
 
 
 def _refuse_other_formats(path: Path) -> None:

@@ -48,27 +48,43 @@ def read_sqlite(path: Path, topics: Topics, report: Report) -> Iterator[ScannedM
     if journal.is_file() and journal.stat().st_size:
         report(f"messages in {journal.name} are not read: open a copy of the bag with sqlite3, which takes them in")
     reader = Sqlite3Reader(Path(quote(str(path.resolve()))))  # which makes a URI of it
-    yield from _rosbags_messages(reader, path, topics, report, advice="")
-
-
-def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
-    """Read a bag of ROS 1 in the order of the times of recording; BagError when it is damaged, or has no index."""
-    from rosbags.rosbag1 import Reader
-
-    advice = f"; rosbag reindex {path.name} restores the index of one that was not finished"
-    yield from _rosbags_messages(Reader(path), path, topics, report, advice=advice)
-
-
-def _rosbags_messages(
-    reader: Any, path: Path, topics: Topics, report: Report, *, advice: str
-) -> Iterator[ScannedMessage]:
-    """Read messages with a reader of `rosbags`; BagError with `advice` when it cannot open the file."""
     try:
         reader.open()
     except (MemoryError, OSError):
         raise
     except Exception as error:  # its own errors, and those of what it does not foresee
-        raise BagError(f"The bag is damaged ({describe_error(error).rstrip('.')}){advice}: {path}") from error
+        raise BagError(f"The bag is damaged ({describe_error(error).rstrip('.')}): {path}") from error
+    yield from _rosbags_messages(reader, topics, report)
+
+
+def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read a bag of ROS 1 in the order of the times of recording, or of the file where its index is missing."""
+    from rosbags.rosbag1 import Reader
+
+    reader = Reader(path)
+    try:
+        reader.open()
+    except (MemoryError, OSError):
+        raise
+    except Exception as error:  # its own errors, and those of what it does not foresee
+        report(f"it was not finished ({describe_error(error).rstrip('.')}), so it is read without its index")
+        yield from _unindexed_messages(path, topics, report)
+        return
+    yield from _rosbags_messages(reader, topics, report)
+
+
+def _unindexed_messages(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    from demorec.sources.ros1_scan import scan_ros1
+
+    channels: dict[int, ScannedChannel] = {}
+    for connection, time_ns, data in scan_ros1(path, report):
+        if topics is None or connection.topic in topics:
+            channel = channels.get(connection.id) or channels.setdefault(connection.id, _channel(connection))
+            yield ScannedMessage(channel, time_ns, data)
+
+
+def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read the messages of an open reader of `rosbags`, and close it."""
     try:
         wanted = [connection for connection in reader.connections if topics is None or connection.topic in topics]
         channels = {connection.id: _channel(connection) for connection in wanted}

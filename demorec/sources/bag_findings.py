@@ -25,6 +25,8 @@ _EPOCH_S = 1e8
 """Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
 _RESTS = 0.02
 """Of the range of all elements, within which they stay while a robot stands still."""
+MAX_ENCODER_NOISE = 1e-3
+"""Range of a joint that stands still: radians or metres, or the same share of larger values in degrees or counts."""
 _SLOW = 1.15
 """Periods of the rows, from which on a stream is called slower than they are."""
 
@@ -50,6 +52,7 @@ def _findings(bag: Timelines) -> Iterator[Finding]:
     yield from _offset_findings(lines)
     yield from _mixed_findings(bag, lines)
     yield from _frozen_findings(lines)
+    yield from _still_findings(lines)
     yield from _slow_findings(regular, bag.mapping.clock.fps)
 
 
@@ -135,6 +138,23 @@ def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
             yield of_stream(line.stream, "frozen", text)
 
 
+def _still_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """A robot of which nothing moves in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
+    measured = [line for line in lines if line.stream.names and len(line.times_ns) > 1]
+    if measured and not any(_moves(line) for line in measured):
+        text = f"nothing moves: no number of {', '.join(line.stream.label for line in measured)} changes in this bag"
+        yield Finding(kind="still", stream="", text=text)
+
+
+def _moves(line: Timeline) -> bool:
+    values = line.stream.values.astype(np.float64)
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < 2:
+        return False
+    noise = MAX_ENCODER_NOISE * np.maximum(np.abs(values).max(axis=0), 1.0)
+    return bool((np.ptp(values, axis=0) > noise).any())
+
+
 def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
     """Whether all that is measured of the robot stands still in a time; False where nothing is."""
     moves = []
@@ -175,6 +195,25 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
             break
     for name in lines.mapping.cameras if episodes else ():
         yield from _use_findings(name, lines, episodes)
+    if episodes and not lines.mapping.cameras:
+        yield from _skip_notes(lines, episodes)
+
+
+def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+    """Streams of numbers of which many messages are in no row; cameras, where there are any, decide on the rows."""
+    for line in (line for line in lines.lines.values() if line.stream.names and line.is_regular):
+        num_used = num_messages = 0
+        for rows in episodes:
+            shown = line.chosen(rows.times_ns).index
+            num_used += len(np.unique(shown))
+            num_messages += int(shown[-1] - shown[0]) + 1
+        if num_messages - num_used > RATE * num_messages:
+            share = 100 * (num_messages - num_used) / num_messages
+            text = (
+                f"{share:.3g} % of its messages are in no row, since it comes {NS / line.period_ns:.1f} times a second "
+                f"and rows {lines.mapping.clock.fps} times"
+            )
+            yield of_stream(line.stream, NOTE, text)
 
 
 def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:

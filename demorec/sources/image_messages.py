@@ -6,6 +6,7 @@ bilinear interpolation, ITU-R BT.601 with limited range."""
 from __future__ import annotations
 
 import io
+import re
 from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -275,19 +276,36 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
     return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
 
 
-_sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
-"""(codec, parameter sets) -> width and height of the keyframes, one of which was decoded for it."""
+_shapes: dict[tuple[str, bytes], tuple[int, int, str]] = {}
+"""(codec, parameter sets) -> width, height and pixel format of the keyframes, one of which was decoded for it."""
+_DEEP_GRAY = re.compile(r"gray(9|1\d|f32)")
+"""FFmpeg's pixel formats of one value of more than 8 bits: depth or another measurement."""
+
+
+class NoColorError(FieldError):
+    """Encoded images hold a measurement, whose unit nobody states, in place of colours."""
 
 
 def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
-    """Width and height of a keyframe; FieldError when it gives no image."""
+    """Return width and height of a keyframe.
+
+    Raises:
+        FieldError: It gives no image.
+        NoColorError: Its pixels are not colours.
+    """
     key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
-    if key not in _sizes:
+    if key not in _shapes:
         frame = next(_frames(codec, [data]), None)
         if frame is None:
             raise FieldError(f"its {codec} keyframe gives no image")
-        _sizes[key] = (frame.width, frame.height)
-    return _sizes[key]
+        _shapes[key] = (frame.width, frame.height, frame.format.name)
+    width, height, pixel_format = _shapes[key]
+    if _DEEP_GRAY.match(pixel_format):
+        raise NoColorError(
+            f"its {codec} video holds {pixel_format}, which is depth or another measurement and not colour: leave the "
+            "topic out, or record the distances as 16UC1 or 32FC1 images"
+        )
+    return width, height
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:

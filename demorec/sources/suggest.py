@@ -25,7 +25,7 @@ from demorec.sources.candidates import Candidate, Choice, candidates_of, choose_
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
 from demorec.sources.fields import FieldError, follow, stamp_of
-from demorec.sources.image_messages import ImageHead, image_head
+from demorec.sources.image_messages import ImageHead, NoColorError, image_head
 from demorec.sources.mapping import Clock
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
@@ -171,7 +171,11 @@ def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> N
         topic.skew_ns = topic.skew_ns or message.log_ns - stamp
         topic.stamps_ns.append(stamp)
     if topic.first is None:
-        topic.first, topic.head = values, _head(values)
+        try:
+            topic.first, topic.head = values, _head(values)
+        except NoColorError as error:
+            topic.problem = str(error)
+            return
     if topic.head is None:
         topic.candidates = topic.candidates or candidates_of(topic.name, topic.type, values)
         for candidate in topic.candidates:
@@ -192,8 +196,11 @@ def _names(candidate: Candidate, values: Values) -> tuple[str, ...]:
 
 
 def _head(values: Values) -> ImageHead | None:
+    """The head of an image; None for a message that holds none, NoColorError for one that is no picture."""
     try:
         return image_head(values)
+    except NoColorError:
+        raise
     except FieldError:
         return None
 
@@ -273,7 +280,8 @@ def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequ
     }
     colour = colour or rates
     slowest = min(colour, key=lambda topic: colour[topic], default="")
-    rate = colour.get(slowest, min([30.0, *(hz for part in parts if (hz := topics[part.topic].rate_hz))]))
+    part_rates = [hz for part in parts if (hz := topics[part.topic].rate_by(stamp))]
+    rate = colour.get(slowest, min([30.0, *part_rates]))
     lines = [f"fps = {max(1, round(rate))}"]
     if slowest:
         lines += [f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic']

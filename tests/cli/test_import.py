@@ -19,7 +19,7 @@ BAD: dict[str, tuple[int, str]] = {
     "no toml": (2, "The mapping is no valid TOML"),
     "unknown encoding": (1, "the encoding 'cbor' is not read"),
     "two types on a topic": (1, "has messages of several types"),
-    "a text file": (1, "This is no bag"),
+    "a text file": (1, "This is not "),
     "an empty file": (1, "The bag is empty"),
     "somebody's folder": (2, "choose another"),
     "a URDF that is not there": (2, "The URDF cannot be read"),

@@ -73,7 +73,7 @@ def _moved(path: Path) -> Path:
 
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "empty": (lambda path: path.write_bytes(b""), "The bag is empty"),
-    "text": (lambda path: path.write_text("hello"), "This is no bag"),
+    "text": (lambda path: path.write_text("hello"), "This is not "),
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:2000]), "The bag holds no messages"),
     "no camera": (
         lambda path: _bag(path, change=lambda notes: [note for note in notes if note.topic != FRONT]),

@@ -209,3 +209,52 @@ def test_simulated_time_that_jumps_is_found(imports: Imports) -> None:
     _, told, _ = imports(jumping, MAPPING)
     assert any(line.startswith("  clock_jump: ") and ACTION in line for line in told.splitlines())
     assert np.all([FRONT not in line for line in told.splitlines() if line.startswith("  clock_")])
+
+
+@pytest.mark.parametrize("factor", [0.4, 0.7, 2.0])
+def test_simulated_time_without_a_camera(factor: float, imports: Imports, tmp_path: Path) -> None:
+    """Rows follow the headers' rate, whatever the recorder's clock says: no message is lost."""
+    notes = bags.joints(STATE, ("a", "b"), bags.times(25, 6.0, jitter=0, seed=1))
+    simulated = [
+        replace(note, log_ns=WALL_NS + round((note.log_ns - bags.EPOCH_NS) / factor), header_ns=note.header_ns)
+        for note in notes
+    ]
+    code, told, _ = imports(bags.in_order(simulated), "suggested")
+    assert code == 0
+    assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == 25
+    assert "are in no row" not in told
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        assert recording.num_frames >= len(notes) - 2
+
+
+def test_numbers_that_are_in_no_row_are_told(imports: Imports) -> None:
+    notes = bags.in_order(bags.joints(STATE, ("a", "b"), bags.times(25, 6.0, jitter=0, seed=1)))
+    mapping = MAPPING.partition("[[features.action]]")[0].replace("fps = 30", "fps = 10")
+    mapping += '[[features.action]]\nnext = "observation.state"\n'
+    _, told, _ = imports(notes, mapping)
+    assert "% of its messages are in no row, since it comes 25.0 times a second and rows 10 times" in told
+    assert "Nothing odd" not in told
+
+
+def test_a_robot_that_moves_a_little_is_not_still(imports: Imports) -> None:
+    notes = [
+        bags.with_body(note, position=np.array([0.3, -1.2 + 0.004 * (k > 100)]))
+        for k, note in enumerate(note for note in isaac() if note.topic != FRONT)
+    ]
+    _, told, _ = imports(bags.in_order(notes), MAPPING.partition("[cameras.front]")[0])
+    assert "  still: " not in told
+
+
+@pytest.mark.parametrize("size", [0.0, 5e-4])
+def test_a_bag_in_which_nothing_moves(size: float, imports: Imports) -> None:
+    """A robot that was never switched on, with or without the noise of its encoders."""
+    random = np.random.default_rng(0)
+    notes = [
+        bags.with_body(note, position=np.array([0.3, -1.2]) + size * random.uniform(-0.5, 0.5, 2))
+        for note in isaac()
+        if note.topic != FRONT
+    ]
+    mapping = MAPPING.partition("[cameras.front]")[0]
+    _, told, _ = imports(bags.in_order(notes), mapping)
+    (line,) = [line for line in told.splitlines() if line.startswith("  still: ")]
+    assert "nothing moves" in line

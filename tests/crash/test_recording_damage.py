@@ -226,8 +226,8 @@ def test_recovering_damaged_files(tmp_path: Path, capsys: pytest.CaptureFixture[
     [
         (b"", "The file is empty, so no recording"),
         (b"\x89MCAP0\r\n", "cut off"),
-        (b"\x89MC", "no MCAP file"),
-        (b"PK\x03\x04 a zip file, or so it says" * 99, "no MCAP file"),
+        (b"\x89MC", "not an MCAP file"),
+        (b"PK\x03\x04 a zip file, or so it says" * 99, "not an MCAP file"),
         (b"\x89MCAP0\r\n" + bytes(500) + b"\x89MCAP0\r\n", "damaged"),
     ],
 )

@@ -1,0 +1,77 @@
+"""A ROS 1 bag without an index, read from its front as far as it goes, by the records that `rosbags` understands.
+
+The format: http://wiki.ros.org/Bags/Format/2.0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from pathlib import Path
+from typing import BinaryIO, NamedTuple
+
+from rosbags.interfaces import Connection
+from rosbags.rosbag1.reader import Header, Reader, ReaderError, RecordType, decompressors, read_uint32
+
+from demorec.core.errors import describe_error
+from demorec.core.files import open_regular
+
+_UNCOMPRESSED = "none"
+
+
+class Ros1Message(NamedTuple):
+    """A message of an unindexed bag."""
+
+    connection: Connection
+    time_ns: int
+    data: bytes
+
+
+def scan_ros1(path: Path, report: Callable[[str], None]) -> Iterator[Ros1Message]:
+    """Read the messages of a bag in the order of the file.
+
+    Args:
+        path: The bag.
+        report: Called with the reason where the bag ends early or is damaged; nothing behind that place is read.
+    """
+    reader = Reader(path)
+    with open_regular(path) as file:
+        file.readline()  # "#ROSBAG V2.0"
+        try:
+            yield from _records(file, reader, {}, report)
+        except MemoryError:
+            raise
+        except Exception as error:  # decompressors have errors of their own
+            report(f"it is damaged or cut off ({describe_error(error).rstrip('.')})")
+
+
+def _records(
+    file: BinaryIO, reader: Reader, connections: dict[int, Connection], report: Callable[[str], None]
+) -> Iterator[Ros1Message]:
+    """Read the records of a file, or of a chunk in memory; ReaderError where one is not whole."""
+    while True:
+        place = file.tell()
+        if not file.read(1):
+            return
+        file.seek(place)
+        header = Header.read(file)
+        kind = header.get_uint8("op")
+        if kind == RecordType.CONNECTION:
+            file.seek(place)
+            reader.bio = file
+            connection = reader.read_connection()
+            connections[connection.id] = connection
+            continue
+        size = read_uint32(file)
+        data = file.read(size)
+        if kind == RecordType.CHUNK:
+            compression = header.get_string("compression")
+            if len(data) < size:
+                report(f"it is cut off within a chunk, of which {len(data):,} of {size:,} bytes are there")
+                if compression != _UNCOMPRESSED:
+                    return
+            yield from _records(BytesIO(decompressors[compression](data)), reader, connections, report)
+        elif len(data) < size:
+            raise ReaderError(f"Got only {len(data)} of requested {size} bytes.")
+        elif kind == RecordType.MSGDATA and (number := header.get_uint32("conn")) in connections:
+            yield Ros1Message(connections[number], header.get_time("time"), data)
