@@ -59,8 +59,8 @@ def test_a_bag_that_is_cut_off_is_listed_as_far_as_it_goes(
 def test_a_text_file_is_no_mcap(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "Dockerfile.mcap"
     path.write_text("FROM ros:jazzy\nRUN apt-get update\n")
-    flags = {"view": ["--save", tmp_path / "x.rrd"], "import": ["--suggest"]}.get(command, [])
-    assert exit_code(command, path, *flags) in (1, 2)
+    flags: dict[str, list[object]] = {"view": ["--save", tmp_path / "x.rrd"], "import": ["--suggest"]}
+    assert exit_code(command, path, *flags.get(command, [])) in (1, 2)
     printed = capsys.readouterr()
     assert "not an MCAP file" in printed.out + printed.err
     assert "demorec made" not in printed.out + printed.err
