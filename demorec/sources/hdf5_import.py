@@ -295,7 +295,7 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
         Hdf5Error: There are none, not those of the mask, or one of them twice.
     """
     group = episodes.group.strip("/")
-    if not group:
+    if not episodes.group:
         return [""]
     kinds = file.children(group)
     names = [name for name, kind in kinds.items() if kind != "dataset"]
@@ -305,18 +305,22 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
             raise Hdf5Error(f"mask/{episodes.mask} lists {missing[0]!r}, which is not in {group}: {file.path}")
         names = [name for name in names if name in wanted]
     if not names:
-        raise Hdf5Error(f"There are no episodes in {group}: {file.path}")
+        raise Hdf5Error(f"There are no episodes in {group or 'the root'}: {file.path}")
     if others := [name for name in names if kinds[name] == "other"]:
         raise Hdf5Error(
-            f"{group}/{others[0]} is a link or a type, only groups within the file are episodes: {file.path}"
+            f"{_below(group, others[0])} is a link or a type, only groups within the file are episodes: {file.path}"
         )
-    places = [f"{group}/{name}" for name in sorted(names, key=in_natural_order)]
+    places = [_below(group, name) for name in sorted(names, key=in_natural_order)]
     seen: dict[int, str] = {}
     for place in places:
         first = seen.setdefault(file.address(place), place)
         if first != place:
             raise Hdf5Error(f"{place} is the same group as {first}, an episode stands in a file once: {file.path}")
     return places
+
+
+def _below(group: str, name: str) -> str:
+    return f"{group}/{name}" if group else name
 
 
 def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:

@@ -1,12 +1,14 @@
-"""A mapping from what is in an HDF5 file of robomimic's or ALOHA's layout: everything listed, every number placed.
+"""A mapping suggested from the contents of an HDF5 file: every dataset listed, every number placed.
 
-Both layouts name what they hold: robomimic's observations are called as robosuite calls them, ALOHA's as its recorder
-does. What the file does not say, and the layout does not either, is commented out.
+Known are the layouts of robomimic, Isaac Lab (robomimic's, with the simulator's state), ALOHA, and episodes that are
+groups at the root. What neither the file nor the layout specifies is commented out.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,8 +22,12 @@ from demorec.sources.hdf5_import import episode_places, found_attribute, stated_
 from demorec.sources.mapping import Episodes
 from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 
-_ROBOMIMIC, _OBSERVATIONS = "data", "obs"
-_FOLDERS = (f"{_OBSERVATIONS}/", "observations/")
+_ROBOMIMIC = "data"
+_ARTICULATION = re.compile(r"states/articulation/[^/]+/joint_position")
+"""Absolute joint positions of Isaac Lab, whose observation joint_pos is relative to the default pose."""
+_ISAAC_QUATERNION = re.compile(r"(^|_)(quat|orientation)$")
+_ISAAC_POSE = re.compile(r"(^|/)root_pose$")
+_W_FIRST = ("qw", "qx", "qy", "qz")
 _ALOHA_FPS = 50
 """ALOHA's recorders take a row every `DT = 0.02` seconds; nothing in their files says so."""
 _ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
@@ -39,6 +45,46 @@ _PARTS = {
     "qvel": VELOCITY,
 }
 """How an observation's name ends -> the feature that it is a part of; others are features of their own."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Layout:
+    """Where a file holds its episodes and what they name their datasets.
+
+    Attributes:
+        group: Value of `episodes.group`.
+        actions: Names of datasets that are parts of the action.
+        folder: Prefix of the names of observations; "" where every other dataset is one.
+        states: Names of datasets that are the state, where observations are known by no other name.
+        is_aloha: Whether a file is one episode of ALOHA's recorder.
+    """
+
+    group: str
+    actions: tuple[str, ...]
+    folder: str
+    states: tuple[str, ...] = ()
+    is_aloha: bool = False
+
+
+_ALOHA = _Layout(group="", actions=("action", "base_action"), folder="observations/", is_aloha=True)
+_LAYOUT_OF_ROBOMIMIC = _Layout(group=_ROBOMIMIC, actions=("actions",), folder="obs/")
+_GROUPS_AT_ROOT = _Layout(
+    group="/",
+    actions=("action", "actions"),
+    folder="",
+    states=("state", "states", "observation", "observations", "obs", "qpos"),
+)
+
+
+def _layout_of(file: ForeignFile) -> _Layout | None:
+    """Find the layout of a file; None for an unknown one."""
+    if file.has("action") and file.is_group("observations"):
+        return _ALOHA
+    if file.is_group(_ROBOMIMIC):
+        return _LAYOUT_OF_ROBOMIMIC
+    groups = [name for name, kind in file.children("").items() if kind == "group"]
+    has_actions = [any(file.has(f"{group}/{name}") for name in _GROUPS_AT_ROOT.actions) for group in groups]
+    return _GROUPS_AT_ROOT if groups and all(has_actions) else None
 
 
 class _Contents:
@@ -73,23 +119,23 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
     """
     expect(path, "hdf5")
     with ForeignFile(path) as file:
-        is_aloha = file.has("action") and file.is_group("observations")
-        if not is_aloha and not file.is_group(_ROBOMIMIC):
+        layout = _layout_of(file)
+        if layout is None:
             held = ", ".join(list(file.children(""))[:SHOWN]) or "nothing"
             raise Hdf5Error(
-                "This is neither robomimic's layout (data/demo_0/actions) nor ALOHA's (action, observations/qpos), it "
-                f"holds {held}: write the mapping by hand (docs/import.md): {path}"
+                "The layout is not robomimic's or Isaac Lab's (data/demo_0/actions), ALOHA's (action, "
+                "observations/qpos), nor one with a group with actions for each episode; the file holds "
+                f"{held}: write the mapping by hand (docs/import.md): {path}"
             )
-        episodes = Episodes(group="" if is_aloha else _ROBOMIMIC)
-        places = episode_places(file, episodes)
+        places = episode_places(file, Episodes(group=layout.group))
         contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
-        lines += [*_listed(contents, len(places)), *_last_row(contents, is_aloha), "", *_left_out(contents)]
-        lines += ["[robot]", f"name = {quoted(_robot(contents, is_aloha))}", *_model(contents), ""]
+        lines += [*_listed(contents, len(places)), *_last_row(contents, layout), "", *_left_out(contents, layout)]
+        lines += ["[robot]", f"name = {quoted(_robot(contents, layout))}", *_model(contents), ""]
         lines += ["[task]", *_task(contents, path), ""]
-        lines += ["[clock]", *_clock(contents, is_aloha), ""]
-        lines += ["[episodes]", *_episodes(contents, places, is_aloha)]
-        lines += [*_features(contents, is_aloha), *_cameras(contents)]
+        lines += ["[clock]", *_clock(contents, layout), ""]
+        lines += ["[episodes]", *_episodes(contents, places, layout)]
+        lines += [*_features(contents, layout), *_cameras(contents, layout)]
     return lines
 
 
@@ -109,25 +155,31 @@ def _listed(contents: _Contents, count: int) -> Iterator[str]:
         yield f"#   {reason}"
 
 
-def _last_row(contents: _Contents, is_aloha: bool) -> Iterator[str]:
+def _is_observed(name: str, layout: _Layout) -> bool:
+    return name not in layout.actions and name.startswith(layout.folder)
+
+
+def _last_row(contents: _Contents, layout: _Layout) -> Iterator[str]:
     """Where observations have one row more than actions, what becomes of it."""
-    action = contents.arrays.get("action" if is_aloha else "actions")
-    observed = [len(array) for name, array in contents.arrays.items() if name.startswith(_FOLDERS)]
+    action = next((contents.arrays[name] for name in layout.actions if name in contents.arrays), None)
+    observed = [len(array) for name, array in contents.arrays.items() if _is_observed(name, layout)]
     if action is not None and observed and min(observed) == len(action) + 1:
         yield "# The last observation of each episode is left out: no action follows it."
 
 
-def _left_out(contents: _Contents) -> Iterator[str]:
+def _left_out(contents: _Contents, layout: _Layout) -> Iterator[str]:
     """The key that leaves out cameras that are no observations, as those of next_obs."""
-    others = dict.fromkeys(name.partition("/")[0] for name in contents.cameras if not name.startswith(_FOLDERS))
+    others = dict.fromkeys(name.partition("/")[0] for name in contents.cameras if not _is_observed(name, layout))
     if others:
         yield f"leave_out = [{', '.join(map(quoted, others))}]  # has cameras that are not imported"
         yield ""
 
 
-def _robot(contents: _Contents, is_aloha: bool) -> str:
+def _robot(contents: _Contents, layout: _Layout) -> str:
     found = (found_attribute(contents.file, contents.place, name) for name in _ROBOTS)
-    return next((name for name in found if isinstance(name, str) and name.strip()), "aloha" if is_aloha else "robot")
+    return next(
+        (name for name in found if isinstance(name, str) and name.strip()), "aloha" if layout.is_aloha else "robot"
+    )
 
 
 def _model(contents: _Contents) -> list[str]:
@@ -148,20 +200,20 @@ def _task(contents: _Contents, path: Path) -> list[str]:
     return [f"text = {quoted(text)}  # what the robot was asked to do", "# file_name = true"]
 
 
-def _clock(contents: _Contents, is_aloha: bool) -> list[str]:
+def _clock(contents: _Contents, layout: _Layout) -> list[str]:
     rate = stated_rate(contents.file, contents.place)
     if rate is not None:
         return [f"# fps = {rate:g}  # as the file says"]
-    if is_aloha:
+    if layout.is_aloha:
         return [f"fps = {_ALOHA_FPS}  # of ALOHA's recorders (DT = 0.02); the file does not say it"]
     return ["# fps = 20  # rows a second, which the file does not say: look it up"]
 
 
-def _episodes(contents: _Contents, places: Sequence[str], is_aloha: bool) -> Iterator[str]:
-    if is_aloha:
+def _episodes(contents: _Contents, places: Sequence[str], layout: _Layout) -> Iterator[str]:
+    if layout.is_aloha:
         yield "# The file is one episode."
         return
-    yield f"group = {quoted(_ROBOMIMIC)}"
+    yield f"group = {quoted(layout.group)}"
     masks = list(contents.file.children("mask")) if contents.file.is_group("mask") else []
     if masks:
         yield f"# mask = {quoted(masks[0])}  # only those that one of these lists: {', '.join(map(quoted, masks))}"
@@ -171,23 +223,28 @@ def _episodes(contents: _Contents, places: Sequence[str], is_aloha: bool) -> Ite
         yield '# success = "rewards"  # where the last one above 0 means a success'
 
 
-def _features(contents: _Contents, is_aloha: bool) -> Iterator[str]:
-    actions = ["action", "base_action"] if is_aloha else ["actions"]
-    folder = "observations/" if is_aloha else f"{_OBSERVATIONS}/"
+def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
     vectors = [name for name in contents.arrays if contents.is_vector(name)]
-    observed: dict[str, list[str]] = {}
-    for name in (name for name in vectors if name.startswith(folder)):
-        last = name.removeprefix(folder)
+    absolute = [name for name in vectors if _ARTICULATION.fullmatch(name)]
+    observed: dict[str, list[str]] = {STATE: absolute} if absolute else {}
+    if absolute:
+        yield from ("", "# Isaac Lab: obs/joint_pos is relative to the default pose, so the state is the simulator's;")
+        yield "# its quaternions are w, x, y, z."
+    for name in (name for name in vectors if _is_observed(name, layout)):
+        last = name.removeprefix(layout.folder)
         known = (feature for end, feature in _PARTS.items() if last == end or last.endswith(f"_{end}"))
-        observed.setdefault(next(known, f"observation.{_word(last)}"), []).append(name)
+        feature = STATE if last in layout.states else next(known, f"observation.{_word(last)}")
+        if absolute and feature == STATE:
+            feature = f"observation.{_word(last)}"
+        observed.setdefault(feature, []).append(name)
     if STATE not in observed and EE_POSE in observed:
         observed[STATE] = observed.pop(EE_POSE)
     if STATE not in observed:
         yield from ("", "# Nothing says that it is the robot's state: take one of those above.")
     for feature in sorted(observed, key=lambda name: name != STATE):
-        yield from _parts(feature, sorted(observed[feature], key=_order), contents)
-    yield from _parts("action", [name for name in actions if name in vectors], contents)
-    if "states" in vectors:
+        yield from _parts(feature, sorted(observed[feature], key=_order), contents, is_isaac=bool(absolute))
+    yield from _parts("action", [name for name in layout.actions if name in vectors], contents)
+    if "states" in vectors and not _is_observed("states", layout):
         yield from (f"# {line}" if line else "" for line in _parts("observation.simulator", ["states"], contents))
 
 
@@ -205,18 +262,23 @@ def _word(name: str) -> str:
     return word if word[:1].isalpha() else f"x_{word}"
 
 
-def _parts(feature: str, names: Sequence[str], contents: _Contents) -> Iterator[str]:
+def _parts(feature: str, names: Sequence[str], contents: _Contents, *, is_isaac: bool = False) -> Iterator[str]:
     key = feature if "." not in feature else quoted(feature)
     for name in names:
         yield from ("", f"[[features.{key}]]", f"dataset = {quoted(name)}")
+        count = int(np.prod(contents.arrays[name].shape[1:]))
+        if is_isaac and count == 4 and _ISAAC_QUATERNION.search(name):
+            yield f"names = [{', '.join(map(quoted, _W_FIRST))}]"
+        elif is_isaac and count == 7 and _ISAAC_POSE.search(name):
+            yield f"names = [{', '.join(map(quoted, ('x', 'y', 'z', *_W_FIRST)))}]"
         if name in ("observations/qpos", "action") and contents.arrays[name].shape[1:] == (2 * len(_ALOHA_JOINTS),):
             joints = [f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_JOINTS]
             yield f"# names = [{', '.join(map(quoted, joints))}]  # of ALOHA's two arms"
 
 
-def _cameras(contents: _Contents) -> Iterator[str]:
+def _cameras(contents: _Contents, layout: _Layout) -> Iterator[str]:
     taken: list[str] = []
-    for name in (name for name in contents.cameras if name.startswith(_FOLDERS)):
+    for name in (name for name in contents.cameras if _is_observed(name, layout)):
         camera = unique_name(_word(name.rpartition("/")[2].removesuffix("_image")), taken)
         taken.append(camera)
         yield from ("", f"[cameras.{camera}]", f"dataset = {quoted(name)}")

@@ -206,7 +206,8 @@ class Episodes:
         discard: Texts of markers that leave out the episode under way, or else the one before.
         ignore: Texts of markers that mean nothing here; any other text is an error.
         gap_s: A pause of all streams longer than that ends an episode.
-        group: Of which every group in an HDF5 file is an episode; "" where the file itself is one.
+        group: Of which every group in an HDF5 file is an episode, "/" for those at its root; "" where the file itself
+            is one.
         mask: Only those that the dataset of that name in `mask` lists.
         times_s: [begin, end] of each episode, seconds from the bag's first message.
     """

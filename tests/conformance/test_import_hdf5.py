@@ -20,6 +20,8 @@ from support.hdf5 import (
     images,
     jpeg,
     write_aloha,
+    write_groups_at_root,
+    write_isaac,
     write_robomimic,
 )
 
@@ -488,7 +490,7 @@ def test_jpeg_files_must_be_whole(name: str, tmp_path: Path, capsys: pytest.Capt
         (("import", "hdf5", "demo.hdf5"), "An import needs --mapping and --out"),
         (("import", "hdf5", "demo.toml", "--suggest"), "The file is no recording"),
         (("import", "hdf5", "none.hdf5", "--suggest"), "There is no such file"),
-        (("import", "hdf5", "other.hdf5", "--suggest"), "This is neither robomimic's layout"),
+        (("import", "hdf5", "other.hdf5", "--suggest"), "The layout is not robomimic's or Isaac Lab's"),
         (("import", "hdf5", "demo.hdf5", "demo.hdf5", "--mapping", "demo.toml", "--out", "run"), "given twice"),
         (("import", "hdf5", "demo.hdf5", "--mapping", "bad.toml", "--out", "run"), "Did you mean 'dataset'?"),
     ],
@@ -508,3 +510,40 @@ def test_wrong_requests_are_refused(
     out, err = capsys.readouterr()
     assert told in err
     assert (err.count("\n"), out) == (1, "")
+
+
+@pytest.mark.parametrize("robot", ["robot", "franka", "left_arm"])
+def test_the_state_of_isaac_lab_is_the_absolute_one(robot: str, tmp_path: Path) -> None:
+    """obs/joint_pos is relative to a pose that the file does not hold; the simulator's state is absolute."""
+    file = write_isaac(tmp_path / "demo.hdf5", robot=robot)
+    result, run = imported(file, changes={"# fps = 20 ": "fps = 50 "})
+    assert result.num_episodes == 2
+    with h5py.File(file) as source:
+        for demo, path in zip(("demo_0", "demo_1"), recordings(run), strict=True):
+            absolute = source[f"data/{demo}/states/articulation/{robot}/joint_position"][:]
+            relative = source[f"data/{demo}/obs/joint_pos"][:]
+            assert np.abs(absolute - relative).max() > 0.1
+            with Recording(path) as recording:
+                table, info = recording.table(), recording.info
+            np.testing.assert_array_equal(table.features["observation.state"], absolute)
+            np.testing.assert_array_equal(table.features["observation.joint_pos"], relative)
+            pose = np.hstack([source[f"data/{demo}/obs/{name}"][:] for name in ("eef_pos", "eef_quat")])
+            np.testing.assert_array_equal(table.features["observation.ee_pose"], pose)
+            names = {feature.name: feature.names for feature in info.features}
+            assert names["observation.ee_pose"][3:] == ("qw", "qx", "qy", "qz")
+
+
+@pytest.mark.parametrize("action", ["action", "actions"])
+@pytest.mark.parametrize("state", ["observation", "obs", "state", "qpos"])
+def test_episodes_that_are_groups_at_the_root(action: str, state: str, tmp_path: Path) -> None:
+    file = write_groups_at_root(tmp_path / "demo.hdf5", action=action, state=state, others=("contact", "force"))
+    result, run = imported(file, changes={"# fps = 20 ": "fps = 20 "})
+    assert result.num_episodes == 3
+    with h5py.File(file) as source:
+        for demo, path in zip(("demo_0", "demo_2", "demo_10"), recordings(run), strict=True):
+            with Recording(path) as recording:
+                features = recording.table().features
+            np.testing.assert_array_equal(features["action"], source[f"{demo}/{action}"][:])
+            np.testing.assert_array_equal(features["observation.state"], source[f"{demo}/{state}"][:])
+            for other in ("contact", "force"):
+                np.testing.assert_array_equal(features[f"observation.{other}"], source[f"{demo}/{other}"][:])
