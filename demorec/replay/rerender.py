@@ -28,7 +28,7 @@ from demorec.episode.simulated import with_simulation
 from demorec.episode.variation import Ranges, resolve
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.mcap.frames import frames_of
-from demorec.render import Renderer
+from demorec.render import Renderer, RenderSetup
 from demorec.render.painter import Painter, WarmRenderer
 from demorec.robots.assets import allow_models
 from demorec.sim.recorded_states import RecordedStates
@@ -262,8 +262,10 @@ def rerender(
                 nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
                 EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
-                painter = view_painter(warm.of(str(config.get("renderer", "raster"))), view, config)
-                _write_drawn(writer, recording, trajectory, painter, states)
+                renderer = warm.of(str(config.get("renderer", "raster")))
+                _write_drawn(writer, recording, trajectory, view_painter(renderer, view, config), states)
+                # Free the image buffers before the simulator poses the states of the next recording.
+                renderer.setup(RenderSetup(bodies=(), cameras=()))
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
