@@ -21,6 +21,7 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording
+from demorec.render.painter import WarmRenderer
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
 
@@ -45,7 +46,7 @@ def main() -> None:
     cpu: dict[str, float] = defaultdict(float)
     identical = same_pictures = 0
     stack = ExitStack()
-    simulators, warm = SimulatorCache(), SimulatorCache()
+    simulators, warm = SimulatorCache(), WarmRenderer()
     stack.callback(simulators.close)
     stack.callback(warm.close)
     simulated = filmed = 0.0
@@ -77,7 +78,7 @@ def main() -> None:
         if arguments.images:
             warming = Path(folder) / "warm_images.mcap"
             generate(warming, config, 10_000, simulators)
-            rerender(warming, Path(folder) / "warm_again.mcap", RerenderOptions(), simulators=warm)
+            rerender(warming, Path(folder) / "warm_again.mcap", RerenderOptions(), renderers=warm)
         for index in range(arguments.images):
             path = Path(folder) / f"filmed_{index}.mcap"
             start = time.process_time()
@@ -87,12 +88,12 @@ def main() -> None:
             rerender(path, Path(folder) / f"as_it_was_{index}.mcap", RerenderOptions())
             timed("draw anew, as it was", start)
             start = time.process_time()
-            drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions(), simulators=warm)
+            drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions(), renderers=warm)
             timed("draw anew", start)
             same_pictures += not drawn.differing
             start = time.process_time()
             small = RerenderOptions(cameras=("front",), width=96, height=96)
-            rerender(path, Path(folder) / f"small_{index}.mcap", small, simulators=warm)
+            rerender(path, Path(folder) / f"small_{index}.mcap", small, renderers=warm)
             timed("draw one camera, 96x96", start)
             for images in (False, True):
                 start = time.process_time()

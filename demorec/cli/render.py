@@ -21,7 +21,7 @@ from demorec.core.registry import modules_of
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:
-    from demorec.loop import SimulatorCache
+    from demorec.render.painter import WarmRenderer
     from demorec.replay.rerender import RerenderOptions, RerenderReport
 
 
@@ -153,12 +153,12 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
 def _draw(options: RerenderOptions, overwrite: bool, job: tuple[Path, Path]) -> RerenderReport:
     from demorec.replay.rerender import rerender
 
-    return rerender(*job, options, overwrite=overwrite, simulators=_simulators())
+    return rerender(*job, options, overwrite=overwrite, renderers=_renderers())
 
 
 @cache
-def _simulators() -> SimulatorCache:
-    """Return the world and renderer of this process, which draws one recording after the other."""
-    from demorec.loop import SimulatorCache
+def _renderers() -> WarmRenderer:
+    """Return the renderer of this process, which draws one recording after the other."""
+    from demorec.render.painter import WarmRenderer
 
-    return SimulatorCache()
+    return WarmRenderer()

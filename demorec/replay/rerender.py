@@ -7,7 +7,7 @@ looks the images come out again as they were before coding, so the coded packets
 from __future__ import annotations
 
 from collections.abc import Mapping
-from contextlib import closing, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -26,11 +26,10 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.simulated import with_simulation
 from demorec.episode.variation import Ranges, resolve
-from demorec.loop import SimulatorCache
 from demorec.mcap import EpisodeWriter, Recording, open_recording
 from demorec.mcap.frames import frames_of
-from demorec.render import Renderer
-from demorec.render.painter import Painter
+from demorec.render import Renderer, RenderSetup
+from demorec.render.painter import Painter, WarmRenderer
 from demorec.robots.assets import allow_models
 from demorec.sim.recorded_states import RecordedStates
 from demorec.tasks.vary import vary_looks
@@ -221,7 +220,7 @@ def rerender(
     options: RerenderOptions,
     *,
     overwrite: bool = False,
-    simulators: SimulatorCache | None = None,
+    renderers: WarmRenderer | None = None,
 ) -> RerenderReport:
     """Draw a recording anew, unless `out` is what the same call has made before.
 
@@ -230,7 +229,7 @@ def rerender(
         out: The file to be made.
         options: What is to change.
         overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
-        simulators: Gives world and renderer, warm from one recording to the next; None makes and frees them.
+        renderers: Gives the renderer, warm from one recording to the next; None makes and frees one.
 
     Raises:
         RecordingError: The source is damaged or empty.
@@ -257,15 +256,16 @@ def rerender(
         )
         was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
         if not was_there:
+            states = RecordedStates(info.simulated.robot, view.scene, trajectory)
             make_folder(out.parent)
             with (
-                nullcontext(simulators) if simulators is not None else closing(SimulatorCache()) as warm,
+                nullcontext(renderers) if renderers is not None else WarmRenderer() as warm,
                 EpisodeWriter(out, new_info, video=video, overwrite=overwrite) as writer,
             ):
-                world, renderer = warm.acquire(new_info)
-                assert renderer is not None, "a view has cameras"
-                painter = view_painter(renderer, view, config)
-                _write_drawn(writer, recording, trajectory, painter, RecordedStates(world, view.scene, trajectory))
+                renderer = warm.of(str(config.get("renderer", "raster")))
+                _write_drawn(writer, recording, trajectory, view_painter(renderer, view, config), states)
+                # Free the image buffers before the simulator poses the states of the next recording.
+                renderer.setup(RenderSetup(bodies=(), cameras=()))
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,

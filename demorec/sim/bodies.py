@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import functools
 import os
-import re
 import tempfile
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from demorec.episode.scene import Body, Texture
 from demorec.render import Visual, VisualBody, VisualKind
 from demorec.robots.assets import asset_path, collision_file, mesh_path, surface_file
 from demorec.robots.inertials import check_masses, with_massless_frames
+from demorec.robots.urdf import parse_xml, read_links
 from demorec.sim.client import silence
 
 
@@ -142,24 +144,30 @@ def urdf_file(name: str, *, has_frames: bool = False) -> Iterator[str]:
     """
     path = asset_path(name)
     text = path.read_text()
-    loaded = with_massless_frames(text) if has_frames else text
-    if ":" not in name and loaded == text:  # of pybullet_data, meshes beside it
-        yield str(path)
-        return
     descriptor, copy = tempfile.mkstemp(suffix=".urdf", prefix="demorec_")
     try:
         with os.fdopen(descriptor, "w") as file:
-            file.write(_with_absolute_meshes(loaded, path.parent))
+            file.write(_without_visual_meshes(with_massless_frames(text) if has_frames else text, path.parent))
         yield copy
     finally:
         Path(copy).unlink()
 
 
 @functools.cache
-def _with_absolute_meshes(text: str, folder: Path) -> str:
-    return re.sub(
-        r'(<mesh\s+filename=")([^"]+)"', lambda match: f'{match.group(1)}{mesh_path(folder, match.group(2))}"', text
-    )
+def _without_visual_meshes(text: str, folder: Path) -> str:
+    """Return a URDF with a box in place of each visual mesh, and the absolute paths of all other meshes.
+
+    PyBullet would read the visual meshes at each load (50 ms and 60 MB for a Panda), but the renderers draw from the
+    files.
+    """
+    robot = parse_xml(text)
+    meshes = {mesh: mesh_path(folder, mesh.attrib["filename"]) for mesh in robot.iter("mesh")}
+    for mesh, path in meshes.items():
+        mesh.set("filename", str(path))
+    for geometry in robot.iterfind("link/visual/geometry"):
+        if geometry.find("*") in meshes:
+            geometry[:] = [ET.Element("box", size="1 1 1")]
+    return ET.tostring(robot, encoding="unicode")
 
 
 ShapeRows = tuple[tuple[Any, ...], ...]
@@ -172,7 +180,12 @@ def shape_rows(client: Any) -> ShapeRows:
 
 
 def visual_bodies(
-    client: Any, rows: ShapeRows, *, names: Mapping[int, str], textures: Mapping[int, Texture]
+    client: Any,
+    rows: ShapeRows,
+    *,
+    names: Mapping[int, str],
+    textures: Mapping[int, Texture],
+    models: Mapping[int, tuple[str, float]],
 ) -> tuple[VisualBody, ...]:
     """The bodies of a client.
 
@@ -181,6 +194,7 @@ def visual_bodies(
         rows: Its `shape_rows`.
         names: Body -> name; others are called as PyBullet calls them.
         textures: Body -> procedural texture: PyBullet cannot be asked for the pixels of one.
+        models: Body -> URDF and scale, of the bodies that `load_urdf` has loaded.
 
     Raises:
         RenderError: A shape of a kind that no renderer draws.
@@ -190,16 +204,34 @@ def visual_bodies(
         dynamics = client.getDynamicsInfo(body, -1)
         name = names.get(body) or client.getBodyInfo(body)[1].decode()
         inertial_from_base = base_from_inertial(client, body).inverse()
+        visuals = [_visual(client, row, name, inertial_from_base) for row in rows if row[0] == body]
+        if body in models:
+            visuals = list(_with_urdf_meshes(client, body, visuals, *models[body]))
         bodies.append(
             VisualBody(
                 name=name,
                 num_links=client.getNumJoints(body),
                 is_fixed=dynamics[0] == 0,
-                visuals=tuple(_visual(client, row, name, inertial_from_base) for row in rows if row[0] == body),
+                visuals=tuple(visuals),
                 texture=textures.get(body),
             )
         )
     return tuple(bodies)
+
+
+def _with_urdf_meshes(client: Any, body: int, visuals: Sequence[Visual], model: str, scale: float) -> Iterator[Visual]:
+    """Yield the visuals of a body with the meshes of its URDF, for which PyBullet has boxes."""
+    path = asset_path(model)
+    shapes = {link.name: iter(link.visuals) for link in read_links(path.read_text(), scale=scale)}
+    links = {-1: client.getBodyInfo(body)[0].decode()}
+    for joint in range(client.getNumJoints(body)):
+        links[joint] = client.getJointInfo(body, joint)[12].decode()
+    for visual in visuals:
+        shape = next(shapes[links[visual.link]], None)  # None where PyBullet shows the collision shape
+        if shape is not None and shape.kind == "mesh":
+            yield replace(visual, kind="mesh", size=shape.size, file=str(mesh_path(path.parent, shape.file)))
+        else:
+            yield visual
 
 
 def base_from_inertial(client: Any, body: int) -> Pose:

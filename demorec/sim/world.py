@@ -210,8 +210,13 @@ class World:
         if rows != self._shape_rows or not self._visuals:
             names = {index: name for name, index in self._bodies.items()} | {self.arm.body: self.robot.name}
             textures = {self._bodies[body.name]: body.texture for body in self.scene.bodies if body.texture is not None}
+            models = {
+                self._bodies[body.name]: (body.shape.file, body.shape.scale)
+                for body in self.scene.bodies
+                if body.shape.kind == "urdf"
+            } | {self.arm.body: (self.robot.urdf, self.scene.robot.scale)}
             self._shape_rows = rows
-            self._visuals = visual_bodies(self.client, rows, names=names, textures=textures)
+            self._visuals = visual_bodies(self.client, rows, names=names, textures=textures, models=models)
         return self._visuals
 
     def mounts(self) -> dict[str, Mount]:

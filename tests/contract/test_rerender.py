@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +10,8 @@ import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
 
-from demorec.loop import SimulatorCache
 from demorec.mcap import Recording
+from demorec.render.painter import WarmRenderer
 from demorec.replay.deep import deep_check
 from demorec.replay.rerender import RerenderOptions, rerender
 
@@ -91,10 +90,10 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(
 
 def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
     scenes = []
-    with closing(SimulatorCache()) as warm:  # "c" is drawn in a world that showed other colours before
-        for name, seed, simulators in (("a", 1, None), ("b", 2, warm), ("c", 1, warm)):
+    with WarmRenderer() as warm:  # "c" is drawn by a renderer that drew other colours before
+        for name, seed, renderers in (("a", 1, None), ("b", 2, warm), ("c", 1, warm)):
             options = RerenderOptions(looks=seed, cameras=("front",))
-            rerender(filmed, tmp_path / f"{name}.mcap", options, simulators=simulators)
+            rerender(filmed, tmp_path / f"{name}.mcap", options, renderers=renderers)
             with Recording(tmp_path / f"{name}.mcap") as recording:
                 scenes.append((recording.info.simulated.scene, recording.digest()))
     assert scenes[0] == scenes[2]

@@ -46,7 +46,7 @@ def setup(
     client: Any, *cameras: SceneCamera, textures: dict[int, Texture] | None = None, **changes: Any
 ) -> RenderSetup:
     """A setup of a client's bodies, with depth and segmentation."""
-    bodies = visual_bodies(client, shape_rows(client), names={}, textures=textures or {})
+    bodies = visual_bodies(client, shape_rows(client), names={}, textures=textures or {}, models={})
     fields: dict[str, Any] = {"bodies": bodies, "cameras": cameras, "depth": True, "segmentation": True, **changes}
     return RenderSetup(**fields)
 
@@ -60,7 +60,7 @@ class ClientWorld:
         self.scene = Scene(robot=home, bodies=())
 
     def visuals(self) -> tuple[VisualBody, ...]:
-        return visual_bodies(self.client, shape_rows(self.client), names={}, textures={})
+        return visual_bodies(self.client, shape_rows(self.client), names={}, textures={}, models={})
 
     def mounts(self) -> dict[str, Mount]:
         return {}

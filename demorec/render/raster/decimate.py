@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -19,15 +21,18 @@ _CELL = 2.0
 a mesh keeps 9 triangles for each pixel."""
 
 
-def decimated(mesh: RasterMesh, target: int, *, key: str) -> RasterMesh:
+def decimated(read: Callable[[], RasterMesh], num_faces: int, target: int, *, key: str) -> RasterMesh:
     """The mesh with about `target` faces, from the cache when it was made before.
 
     Args:
+        read: Reads the whole mesh.
+        num_faces: Of the whole mesh.
+        target: Wanted number of faces.
         key: Digest of the mesh's source, under which it is cached.
     """
-    if mesh.num_faces <= max(target, SMALLEST):
-        return mesh
-    return cached_mesh(f"{key} {target}", lambda: decimate(mesh, target))
+    if num_faces <= max(target, SMALLEST):
+        return read()
+    return cached_mesh(f"{key} {target}", lambda: decimate(read(), target))
 
 
 def decimate(mesh: RasterMesh, target: int) -> RasterMesh:

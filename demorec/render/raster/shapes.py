@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -81,12 +81,20 @@ class Model:
 
     Attributes:
         key: Digest of what it was made from: equal keys, equal meshes.
-        mesh: All its triangles.
+        read: Reads all its triangles, which are not kept: those of a Panda take 17 MB.
+        points: (v, 3) corners of all its triangles.
+        num_faces: Number of all its triangles.
+        has_uv: Whether it has texture coordinates.
+        texture: Image that covers it, or None.
         coarse: For the shadow map, of a primitive; primitives are always drawn whole.
     """
 
     key: str
-    mesh: RasterMesh
+    read: Callable[[], RasterMesh]
+    points: Floats
+    num_faces: int
+    has_uv: bool
+    texture: Path | None
     coarse: RasterMesh | None = None
     _pieces: dict[Any, Piece] = field(default_factory=dict)
     _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
@@ -97,7 +105,7 @@ class Model:
             target = None
         place = (target, textured)
         if place not in self._pieces:
-            mesh = self.mesh if target is None else decimated(self.mesh, target, key=self.key)
+            mesh = self.read() if target is None else decimated(self.read, self.num_faces, target, key=self.key)
             self._pieces[place] = make_piece(mesh, textured=textured)
         return self._pieces[place]
 
@@ -113,10 +121,22 @@ class Model:
         """Centre (3,) and radius of a sphere around the scaled mesh."""
         place = scale.tobytes()
         if place not in self._spheres:
-            points = self.mesh.points * scale
+            points = self.points * scale
             centre = (points.min(0) + points.max(0)) / 2
             self._spheres[place] = centre, float(np.sqrt(((points - centre) ** 2).sum(1).max()))
         return self._spheres[place]
+
+
+def _model_of(mesh: RasterMesh, *, key: str, read: Callable[[], RasterMesh], coarse: RasterMesh | None = None) -> Model:
+    return Model(
+        key=key,
+        read=read,
+        points=mesh.points,
+        num_faces=mesh.num_faces,
+        has_uv=mesh.uv is not None,
+        texture=mesh.texture,
+        coarse=coarse,
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -172,16 +192,19 @@ class ModelStore:
         place = (str(path), stat.st_mtime_ns, stat.st_size)
         if place not in self._models:
             digest = _source_digest(path)
-            mesh = cached_mesh(digest, lambda: load_mesh(path))
-            colors = None
-            if mesh.texture is not None and mesh.uv is not None:
-                image = self.image(mesh.texture)
-                digest += hashlib.sha256(image.tobytes()).hexdigest()
-                colors = palette_colors(mesh, image)
-            if colors is not None:
-                mesh = replace(mesh, colors=colors, texture=None)
-            self._models[place] = Model(key=digest, mesh=mesh)
+            mesh, key = self._read_file(path, digest)
+            self._models[place] = _model_of(mesh, key=key, read=lambda: self._read_file(path, digest)[0])
         return self._models[place]
+
+    def _read_file(self, path: Path, digest: str) -> tuple[RasterMesh, str]:
+        """Return the mesh of a file, a palette's colours on its faces, and the digest of the file and its texture."""
+        mesh = cached_mesh(digest, lambda: load_mesh(path))
+        if mesh.texture is None or mesh.uv is None:
+            return mesh, digest
+        image = self.image(mesh.texture)
+        colors = palette_colors(mesh, image)
+        key = digest + hashlib.sha256(image.tobytes()).hexdigest()
+        return mesh if colors is None else replace(mesh, colors=colors, texture=None), key
 
     def primitive(self, name: str, *size: float) -> Model:
         """A box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
@@ -191,7 +214,7 @@ class ModelStore:
             mesh = coarse = make(*size)
             if name not in ("box", "plane"):  # which have no curves
                 coarse = make(*size, segments=primitives.COARSE_SEGMENTS)
-            self._models[place] = Model(key=repr(place), mesh=mesh, coarse=coarse)
+            self._models[place] = _model_of(mesh, key=repr(place), read=lambda: mesh, coarse=coarse)
         return self._models[place]
 
     def procedural(self, texture: Texture) -> Pixels:
@@ -278,8 +301,8 @@ def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
 
 def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Pixels | None:
     """The image that covers a shape: one that was set on it, else the mesh file's own."""
-    if texture is not None and model.mesh.uv is not None:
+    if texture is not None and model.has_uv:
         return store.procedural(texture)
-    if model.mesh.texture is not None and model.mesh.uv is not None:
-        return store.image(model.mesh.texture)
+    if model.texture is not None and model.has_uv:
+        return store.image(model.texture)
     return None

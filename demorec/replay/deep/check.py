@@ -204,11 +204,11 @@ def _differences(recording: Recording, again: Path, simulators: SimulatorCache) 
             made.cut_off(found)
         differences, images = content_differences(found, made, remade.info, recording.info.fps)
         if images:
-            world, renderer = simulators.acquire(remade.info)
+            _, renderer = simulators.acquire(remade.info)
             painter = _recorded_painter(remade.info, renderer)
             assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
-            differences += image_differences(found, made, remade, world, painter, cameras, images)
+            differences += image_differences(found, made, remade, painter, cameras, images)
     yield from sorted(differences, key=lambda difference: difference.first_frame)
 
 

@@ -25,7 +25,6 @@ from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyfr
 from demorec.render.painter import Painter
 from demorec.replay.deep.contents import Contents, RemakeDifference
 from demorec.sim.recorded_states import RecordedStates
-from demorec.sim.world import World
 
 _BLOCK = 8
 """Pixels a side: those of a transform in H.264."""
@@ -38,7 +37,6 @@ def image_differences(
     recorded: Contents,
     again: Contents,
     remade: Recording,
-    world: World,
     painter: Painter,
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
@@ -48,7 +46,6 @@ def image_differences(
     Args:
         recorded, again: The two files.
         remade: The one made again, open.
-        world: World of its robot; is reset.
         painter: Draws what it shows.
         cameras: Topic -> camera, of streams of coded images.
         differing: Topic -> frames whose coded images differ.
@@ -59,7 +56,7 @@ def image_differences(
         if topic.rpartition("/")[2] in ("depth", "segmentation"):
             found = dict(_lossless(topic, *images, (settings.height, settings.width)))
         else:
-            found = dict(_colours(settings, *images, _drawn(remade, world, painter, cameras[topic])))
+            found = dict(_colours(settings, *images, _drawn(remade, painter, cameras[topic])))
         if found:
             yield RemakeDifference(
                 stream=topic,
@@ -92,8 +89,8 @@ def _coded(contents: Contents, topic: str) -> list[bytes]:
     return images
 
 
-def _drawn(remade: Recording, world: World, painter: Painter, camera: str) -> Iterator[Rgb]:
-    states = RecordedStates(world, remade.info.simulated.scene, remade.trajectory())
+def _drawn(remade: Recording, painter: Painter, camera: str) -> Iterator[Rgb]:
+    states = RecordedStates(remade.info.simulated.robot, remade.info.simulated.scene, remade.trajectory())
     painter.setup(states)
     for frame in range(remade.num_frames):
         states.frame = frame
