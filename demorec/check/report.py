@@ -121,8 +121,9 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
             if find(path / DATASET).kind == "dataset":
                 found.append(Subject(path=path / DATASET, kind="dataset"))
         else:
-            expect_recordings(there, there.recordings)
-            found += [Subject(path=file, kind="recording") for file in there.recordings]
+            failed = there.failed if there.kind == "evaluation" else ()
+            expect_recordings(there, (*there.recordings, *failed))
+            found += [Subject(path=file, kind="recording") for file in (*there.recordings, *failed)]
     return list(dict.fromkeys(found))
 
 

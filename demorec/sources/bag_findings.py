@@ -173,14 +173,16 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
 
 
 def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
-    """Streams that are slower than the rows; cameras only where none has an image for each row."""
+    """Streams that are slower than the rows: a note of numbers, which hold; cameras where none has enough images."""
     slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
     is_filmed = any(line.stream.heads and line not in slow for line in regular)
     for line in slow:
         rate = NS / line.period_ns
-        if not line.stream.heads or not is_filmed:
-            advice = f": use fps = {max(1, round(rate))}" if line.stream.heads else ""
-            yield of_stream(line.stream, "slow", f"comes {rate:.1f} times a second, rows {fps} times{advice}")
+        text = f"comes {rate:.1f} times a second, rows {fps} times"
+        if not line.stream.heads:
+            yield of_stream(line.stream, NOTE, text)
+        elif not is_filmed:
+            yield of_stream(line.stream, "slow", f"{text}: use fps = {max(1, round(rate))}")
 
 
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:

@@ -29,7 +29,7 @@ class PlaybackSource:
 
 
 def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[PlaybackSource]:
-    """Every episode below the paths, in their order; a run's failures only when asked for.
+    """Every episode below the paths, in their order; a run's failures only when asked for, an evaluation's always.
 
     Raises:
         ConfigError: A path is not there, or holds nothing that can be shown.
@@ -47,7 +47,8 @@ def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
             PlaybackSource(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
             for index in dataset_episodes(path)
         ]
-    files = [*found.recordings, *(found.failed if include_failures else ())]
+    shows_failures = include_failures or found.kind == "evaluation"  # whose failed rollouts are results like others
+    files = [*found.recordings, *(found.failed if shows_failures else ())]
     if not files and found.failed:
         raise ConfigError(f"The folder holds failed attempts only, which --include-failures shows: {path}")
     expect_recordings(found, files)
