@@ -50,20 +50,22 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     total = len(subjects) + len(sample)
     workers = useful_workers(subjects, images=False, cores=available_cores())
     options = CheckOptions(images=False, workers=workers)
-    warnings = 0
+    warned: Counter[str] = Counter()
     failures: list[str] = []
     for done, report in enumerate(check_subjects(subjects, options)):
         progress(done + 1, total)
-        warnings += report.count("warn")
+        warned.update(r.check for r in report.results if r.level == "warn")
         failures += [f"{report.path.name}: {r.check}: {r.detail}" for r in report.results if r.level == "fail"]
     paths = [result.folder / file for file in sample]
     for done, again in enumerate(deep_checks(paths, allowed=result.run.config.modules), start=len(subjects) + 1):
         progress(done, total)
-        warnings += again.level == "warn"
+        warned.update(["made again"] if again.level == "warn" else [])
         if again.level == "fail":
             first = again.error or str(again.differences[0])
             failures.append(f"{again.path.name}: made again, it is not the same: {first}")
-    found = [f"{len(failures)} failed" if failures else "none failed", f", {counted(warnings, 'warning')}"]
+    found = [f"{len(failures)} failed" if failures else "none failed", f", {counted(warned.total(), 'warning')}"]
+    if warned:
+        found.append(f" ({', '.join(sorted(warned))})")
     if sample:
         found.append(f"; {counted(len(sample), 'episode')} made again and compared")
     return "".join(found), failures
