@@ -411,6 +411,11 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     (failure,) = (failure for failure in failures if "made again" in failure)
     assert failure.startswith(path.name)
     assert "info.instruction" in failure
+    info["versions"]["pybullet"] = "0.0.1"  # made by another version, so that nothing is proved
+    path.write_bytes(rewritten(path, change={EPISODE: {"info": json.dumps(info)}}))
+    found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
+    assert ", 1 warning (made again)" in found
+    assert not [failure for failure in failures if "made again" in failure]
     assert "1 episode made again" in check_run(result, deep_every=5, progress=lambda done, total: None)[0]
     assert "made again" not in check_run(result, deep_every=0, progress=lambda done, total: None)[0]
 
