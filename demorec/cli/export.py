@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
@@ -15,6 +14,7 @@ from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_insi
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
 from demorec.core.tables import EXPORTERS
+from demorec.core.targets import Target
 from demorec.datasets.options import CommonOptions, ExportReport
 
 
@@ -35,7 +35,7 @@ class Export:
 
     format: Annotated[Positional[str], arg(metavar="FORMAT", help=f"One of: {', '.join(EXPORTERS.names())}.")]
     sources: Readable
-    out: Path
+    out: Target
     """Folder or file to create."""
     mapping: MappingFile = None
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)

@@ -18,6 +18,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.registry import modules_of
+from demorec.core.targets import Target
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Render:
 
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, or folders of recordings."""
-    out: Path
+    out: Target
     """Folder for the new recordings, or the name of one (.mcap)."""
     cameras: tuple[str, ...] = ()
     """Names from the recording or `demorec list cameras`, or my_package.my_module:MY_CAMERA (auto: as recorded)."""
