@@ -15,7 +15,7 @@ from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError, check_option, check_seed
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.registry import modules_of
 from demorec.core.targets import Target
@@ -113,7 +113,7 @@ class Render:
 
         if self.renderer is not None:
             RENDERERS.check_name(self.renderer)
-        check_option("looks", self.looks, 0, 2**63 - 1)
+        check_seed("looks", self.looks)
         changes = {
             name: getattr(self, name)
             for name in ("codec", "gop", "crf", "preset", "jpeg_quality")
