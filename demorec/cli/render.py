@@ -114,6 +114,8 @@ class Render:
         if self.renderer is not None:
             RENDERERS.check_name(self.renderer)
         check_seed("looks", self.looks)
+        check_option("width", self.width, 16, 8192, "pixels")
+        check_option("height", self.height, 16, 8192, "pixels")
         changes = {
             name: getattr(self, name)
             for name in ("codec", "gop", "crf", "preset", "jpeg_quality")

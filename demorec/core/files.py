@@ -15,7 +15,7 @@ import platform
 import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, Self
@@ -206,8 +206,9 @@ def run_lock(folder: Path) -> Iterator[None]:
             ) from error
         raise resource_error(error) or write_error("The output folder", error, folder, DemorecError) from error
     try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
+        with suppress(OSError):  # on a full disk, whose it is cannot be said
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
         yield
     finally:
         os.close(descriptor)

@@ -23,8 +23,8 @@ def check_targets(command: Any) -> None:
         command: A dataclass whose fields, and those of dataclasses in it, are options.
 
     Raises:
-        OptionError: A target can never be made: its name is too long or not UTF-8, it is below a file, it is a link to
-            something that does not exist.
+        OptionError: A target can never be made: its name is too long or not UTF-8, it is below a file, it is, or is
+            below, a link to something that does not exist.
     """
     for option, target in _targets(command):
         try:
@@ -33,11 +33,13 @@ def check_targets(command: Any) -> None:
             raise OptionError(option, f"has bytes that are not UTF-8, choose another name: {target}") from None
         try:
             target.lstat()
-            if not target.exists():
-                raise OptionError(option, f"is a link to something that does not exist, remove it: {target}")
         except OSError as error:
             if error.errno != errno.ENOENT:
                 raise OptionError(option, f"cannot be written ({error.strerror}), choose another: {target}") from error
+        for place in (target, *target.parents):
+            if place.is_symlink() and not place.exists():
+                what = "is" if place == target else f"is below {place.name},"
+                raise OptionError(option, f"{what} a link to something that does not exist, remove it: {target}")
 
 
 def _targets(command: Any) -> Iterator[tuple[str, Path]]:

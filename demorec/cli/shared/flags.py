@@ -228,7 +228,7 @@ def _optional_words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | 
     return PrimitiveConstructorSpec(
         nargs="*",
         metavar="[STR ...]",
-        instance_from_str=tuple,
+        instance_from_str=lambda words: tuple(map(_line_of_text, words)),
         is_instance=lambda value: value is None or isinstance(value, tuple),
         str_from_instance=lambda value: [] if value is None else list(value),
     )

@@ -103,7 +103,7 @@ class ExportOptions(CommonOptions):
         for name in ("data_files_mb", "video_files_mb"):
             check_option(name, getattr(self, name), MIN_FILE_MIB, MAX_FILE_MIB, "MiB")
         check_option("files_per_chunk", self.files_per_chunk, 1, 1_000_000)
-        self.transcode.validate()
+        check_option("transcode_crf", self.transcode_crf, 0, 51 if self.transcode_codec == "h264" else 63)
 
 
 def check_repo_id(repo_id: str) -> None:
