@@ -14,7 +14,6 @@ from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 from demorec.robots.motors import MotorUnits
 
-
 MIN_FILE_MIB = 1e-6
 MAX_FILE_MIB = 1e6
 """Sizes of files: from one byte to a terabyte."""
