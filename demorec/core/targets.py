@@ -27,10 +27,8 @@ def check_targets(command: Any) -> None:
             below, a link to something that does not exist.
     """
     for option, target in _targets(command):
-        try:
-            str(target).encode()
-        except UnicodeEncodeError:
-            raise OptionError(option, f"has bytes that are not UTF-8, choose another name: {target}") from None
+        if not is_utf8(target):
+            raise OptionError(option, f"has bytes that are not UTF-8, choose another name: {target}")
         try:
             target.lstat()
         except OSError as error:
@@ -40,6 +38,15 @@ def check_targets(command: Any) -> None:
             if place.is_symlink() and not place.exists():
                 what = "is" if place == target else f"is below {place.name},"
                 raise OptionError(option, f"{what} a link to something that does not exist, remove it: {target}")
+
+
+def is_utf8(path: Path) -> bool:
+    """Whether a path is text; PyArrow and Rerun, for example, open no other ones."""
+    try:
+        str(path).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _targets(command: Any) -> Iterator[tuple[str, Path]]:
