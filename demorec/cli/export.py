@@ -10,7 +10,7 @@ from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
 from demorec.cli.shared.output import counted, say
-from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside
+from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside, tell_incomplete
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
 from demorec.core.tables import EXPORTERS
@@ -59,6 +59,7 @@ class Export:
                 f"No recordings are given: name a run, e.g. demorec export {self.format} recordings/cubes."
             )
         refuse_inside([self.out])
+        tell_incomplete(self.sources)
         with (
             reading(self.sources, self.mapping, imports_datasets=True) as sources,
             ProgressBar("exporting") as bar,

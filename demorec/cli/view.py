@@ -12,7 +12,15 @@ from tyro.conf import Positional, arg
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
-from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside, tell_unfinished
+from demorec.cli.shared.paths import (
+    WHAT_IS_READ,
+    MappingFile,
+    places_read,
+    reading,
+    refuse_inside,
+    tell_incomplete,
+    tell_unfinished,
+)
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
 from demorec.core.targets import OptionalTarget
@@ -86,6 +94,7 @@ class View:
 
         sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
         tell_unfinished(self.paths)
+        tell_incomplete(self.paths)
         if self.rank is not None:
             sources = self._ranked(sources)
         if self.save is None and self.screenshot is None and not self.web:

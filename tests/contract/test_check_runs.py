@@ -65,7 +65,7 @@ LINES: dict[str, Callable[[Any], None]] = {
 
 def test_the_good_one_passes(good: Path) -> None:
     assert {(result.check, result.level) for result in checked(good, "run").results} == {
-        (check, "pass") for check in ("run_files", "run_agrees", "run_dataset", "duplicates")
+        (check, "pass") for check in ("run_files", "run_complete", "run_agrees", "run_dataset", "duplicates")
     }
 
 
