@@ -192,7 +192,8 @@ class ImportBatch:
                 if planned is not None:
                     writing.append((planned.bag.path, write(planned)))
             else:
-                first: list[Future[Any]] = [future for _, future in (*list(writing)[:1], *list(reading)[:1])]
+                first: list[Future[Any]] = [future for _, future in list(writing)[:1]]
+                first += [future for _, future in list(reading)[:1]]
                 wait(first, return_when=FIRST_COMPLETED)
         folder.planned = self._planned()
         if failure is not None:
