@@ -24,7 +24,7 @@ def check_targets(command: Any) -> None:
 
     Raises:
         OptionError: A target can never be made: its name is too long or not UTF-8, it is below a file, it is, or is
-            below, a link to something that does not exist.
+            below, a link to something that is not there.
     """
     for option, target in _targets(command):
         if not is_utf8(target):
@@ -37,7 +37,7 @@ def check_targets(command: Any) -> None:
         for place in (target, *target.parents):
             if place.is_symlink() and not place.exists():
                 what = "is" if place == target else f"is below {place.name},"
-                raise OptionError(option, f"{what} a link to something that does not exist, remove it: {target}")
+                raise OptionError(option, f"{what} a link to something that is not there, remove it: {target}")
 
 
 def is_utf8(path: Path) -> bool:

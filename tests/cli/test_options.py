@@ -157,7 +157,7 @@ def test_targets_that_cannot_be_made(
     Path("link").symlink_to("nothing")
     reasons = {
         "": "One of the paths is empty",
-        "link": "is a link to something that does not exist",
+        "link": "is a link to something that is not there",
         "x" * 300: "File name too long",
         "file/below": "Not a directory",
         "bytes\udcff": "has bytes that are not UTF-8",
