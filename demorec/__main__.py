@@ -21,6 +21,9 @@ def generate_dataset() -> None:
 
 def _start(program: str, *, is_limited: bool) -> None:
     try:
+        from demorec.core.streams import open_closed_streams
+
+        open_closed_streams()
         if is_limited:
             from demorec.core.limited import continue_in_child
 

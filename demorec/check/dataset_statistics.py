@@ -12,12 +12,12 @@ from demorec.check.base import Found, Measurement, dataset_check
 from demorec.check.dataset import Dataset
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import read_json, rows_in
+from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 
 _NUMBERING = ("index", "episode_index", "task_index")
-"""Columns that LeRobot's delete, split and merge renumber without new statistics; nobody normalises by them."""
+"""Columns that LeRobot's delete, split and merge renumber without new statistics, except for the count."""
 MIN_DEVIATION = 1e-4
 """Deviation by which an element that hardly moves is measured."""
 MERGED_ERROR = 0.02
@@ -43,6 +43,7 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     stats = read_statistics(dataset)
     features = dataset.info.features
     names = [name for name, feature in features.items() if feature.is_numeric and name not in _NUMBERING]
+    num_rows = sum(place.length for place in dataset.places)
     for name in names:
         episodes = [_vectors(dataset, name, rows[name]) for rows in dataset.rows]
         ranges = [_quantile_ranges(values) for values in episodes]
@@ -51,7 +52,11 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
         between = {} if dataset.sidecar else _hull(ranges)
         count = sum(len(rows[name]) for rows in dataset.rows)
         yield from _errors(stats.get(name), np.concatenate(episodes), count, name, averaged, between)
+    for name in [name for name in features if name in stats and name not in names]:
+        yield from _form_errors(stats[name], name, num_rows if name in _NUMBERING else None)
     columns = [f"stats/{name}/{quantity}" for name in names for quantity in NAMES]
+    counts = _numbering_counts(dataset)
+    columns += counts.values()
     for number, (row, rows) in enumerate(
         zip(rows_in(dataset.path, "meta/episodes", columns), dataset.rows, strict=False)
     ):
@@ -59,8 +64,18 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
             stored = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
             values = _vectors(dataset, name, rows[name])
             yield from _errors(stored, values, len(rows[name]), f"{name}, episode {number}", {}, {})
+        for name, column in counts.items():
+            yield from _form_errors({"count": row[column]}, f"{name}, episode {number}", len(rows[name]))
     if unknown := [name for name in stats if name not in features]:
         yield Measurement(value=MERGED_ERROR, detail=f"{', '.join(unknown[:3])}: not a feature")
+
+
+def _numbering_counts(dataset: Dataset) -> dict[str, str]:
+    """Name -> column of the episodes' counts of each numbering, where the dataset has it."""
+    tables = tables_in(dataset.path, "meta/episodes")
+    known = set(open_table(tables[0]).schema_arrow.names) if tables else set()
+    columns = {name: f"stats/{name}/count" for name in _NUMBERING}
+    return {name: column for name, column in columns.items() if column in known}
 
 
 def read_statistics(dataset: Dataset) -> dict[str, Any]:
@@ -122,12 +137,32 @@ def _errors(
         yield Measurement(value=float(error.max()), detail=f"{quantity} of {name}")
 
 
+def _form_errors(stored: Mapping[str, Any], name: str, count: int | None) -> Iterator[Measurement]:
+    """What is not a finite number among the statistics of images or numberings, and an error of their count.
+
+    Args:
+        stored: Quantity -> its numbers.
+        name: Of the feature.
+        count: Rows; None for images, of which some are sampled.
+    """
+    for quantity in NAMES:
+        if quantity in stored:
+            found = numbers_of(stored[quantity])
+            is_finite = bool(len(found) and np.isfinite(found).all())
+            yield Measurement(value=0.0 if is_finite else math.inf, detail=f"{quantity} of {name}")
+    if count is not None and "count" in stored:
+        yield Measurement(
+            value=float(np.abs(numbers_of(stored["count"]) - count).max(initial=0)), detail=f"count of {name}"
+        )
+
+
 def numbers_of(value: Any) -> Array:
-    """(N,) numbers of an entry in the statistics, however nested; (0,) for anything else."""
+    """(N,) numbers of an entry in the statistics, however nested; (0,) for anything else, text of numbers included."""
     try:
-        return np.asarray(value, dtype=np.float64).reshape(-1)
-    except (ValueError, TypeError, OverflowError):
+        found = np.asarray(value)
+    except (ValueError, OverflowError):
         return np.zeros(0)
+    return found.reshape(-1).astype(np.float64) if found.dtype.kind in "biuf" else np.zeros(0)
 
 
 @dataset_check(

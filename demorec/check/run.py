@@ -21,15 +21,8 @@ from demorec.core.plain import to_plain
 from demorec.episode.features import STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
-from demorec.runs.run_file import (
-    EPISODES,
-    FAILED,
-    Attempt,
-    RunFile,
-    is_external_run,
-    load_any_run_file,
-    recorded_line,
-)
+from demorec.runs.recorded import recorded_line
+from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
 
 if TYPE_CHECKING:
     from demorec.sources.import_file import ImportFile
@@ -104,8 +97,7 @@ def run_files(run: CheckedRun) -> Measurement:
     """Compare the recordings with those that run.json lists, and their SHA-256."""
     listed = {attempt.file: attempt.sha256 for attempt in run.attempts}
     there = {str(path.relative_to(run.path)) for path in run.recordings}
-    is_complete = run.form == "external run" or run.run.is_complete
-    hint = "" if is_complete else " yet; the command that began the run takes it in and goes on"
+    hint = "" if run.run.is_complete else " yet; the command that began the run takes it in and goes on"
     wrong = [f"{file} is missing" for file in sorted(listed.keys() - there)]
     wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - listed.keys())]
     for file in sorted(there & listed.keys()):
@@ -117,6 +109,17 @@ def run_files(run: CheckedRun) -> Measurement:
                 raise lack from error
             wrong.append(f"{file} cannot be read ({error.strerror})")
     return counted(wrong, f"{len(there)} recordings")
+
+
+@run_check(
+    measures="episodes or files that were asked for and are not in the run yet",
+    on=_ANY_RUN,
+    needs="a run",
+    fail=math.inf,
+)
+def run_complete(run: CheckedRun) -> Measurement:
+    """Count what a generation or an import that was interrupted has still to do."""
+    return Measurement(value=run.run.num_missing, detail=run.run.unfinished)
 
 
 @run_check(measures="recordings that differ from their line in run.json, or from the run", on=_ANY_RUN, needs="a run")

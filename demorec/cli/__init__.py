@@ -12,7 +12,7 @@ import sys
 import tempfile
 import textwrap
 import traceback
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from typing import Protocol
 
@@ -61,8 +61,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Entry point of `demorec`."""
     args = list(sys.argv[1:] if argv is None else argv)
     if args[:1] == ["--version"]:
-        say(f"demorec {version('demorec')}")
-        sys.exit(0)
+        sys.exit(_reported("demorec", lambda: _print([f"demorec {version('demorec')}"])))
     sys.exit(_run_named(COMMANDS, args, prog="demorec", about="robot demonstrations you can trust"))
 
 
@@ -76,12 +75,8 @@ def _run_named(commands: Registry[type[Command]], args: Sequence[str], *, prog: 
     """Run the command that the first word names; without one, say what the program is about and list all of them."""
     name = args[0] if args else ""
     if not name or name.startswith("-"):
-        try:
-            say(*_overview(commands, prog, about))
-        except DemorecError as error:
-            tell(f"{prog}: {error}")
-            return error.exit_code
-        return 0 if name in ("-h", "--help") else 2
+        code = _reported(prog, lambda: _print(_overview(commands, prog, about)))
+        return code if name in ("-h", "--help") else code or 2
     if name not in commands.rows:
         tell(f"{prog}: Unknown command {name!r}.{nearest_match(name, commands.rows)} See {prog} --help.")
         return 2
@@ -106,22 +101,30 @@ def subcommands_of(command: type[Command]) -> Registry[type[Command]] | None:
 
 
 def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> int:
-    """Parse the flags, run the command, turn its errors into one sentence and an exit code."""
+    """Parse the flags, run the command, and return the exit code."""
     handler = logging.StreamHandler()
     handler.setFormatter(PrintableFormatter())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
     logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
+    return _reported(prog, lambda: parse(command, args, prog=prog).run())
+
+
+def _print(lines: Sequence[str]) -> int:
+    say(*lines)
+    return 0
+
+
+def _reported(prog: str, run: Callable[[], int]) -> int:
+    """Run a part of a program, turn its errors into one sentence, and return the exit code."""
     try:
-        code: int = parse(command, args, prog=prog).run()
-        return code
+        return run()
     except DemorecError as error:
         tell(f"{prog}: {_shortened(error.of_flag() if isinstance(error, OptionError) else str(error))}")
         return error.exit_code
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")
         return 130
-    except BrokenPipeError:
-        sys.stderr.close()
+    except BrokenPipeError:  # the reader of the answer has left and wants no more words
         return 1
     except Exception as error:
         lack = resource_error(error)  # memory and files may run out in any line

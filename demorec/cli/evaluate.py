@@ -14,6 +14,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.core.errors import ConfigError, check_option
+from demorec.core.targets import OptionalTarget
 from demorec.learn.evaluate import TakeOver
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ class RolloutFlags:
     """Number of scenes."""
     seed: int = 0
     """Root seed of the scenes; unless --split is eval, choose another one than the dataset's."""
-    out: Path | None = None
+    out: OptionalTarget = None
     """Folder for the results (auto: one per task)."""
     action: str | None = None
     """joint, joint_increment, ee or ee_delta (auto: as in the dataset that the policy was trained on)."""

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
 from demorec.cli.shared.output import counted, say
-from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside
+from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside, tell_incomplete
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
 from demorec.core.tables import EXPORTERS
+from demorec.core.targets import Target
 from demorec.datasets.options import CommonOptions, ExportReport
 
 
@@ -35,7 +35,7 @@ class Export:
 
     format: Annotated[Positional[str], arg(metavar="FORMAT", help=f"One of: {', '.join(EXPORTERS.names())}.")]
     sources: Readable
-    out: Path
+    out: Target
     """Folder or file to create."""
     mapping: MappingFile = None
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
@@ -59,6 +59,7 @@ class Export:
                 f"No recordings are given: name a run, e.g. demorec export {self.format} recordings/cubes."
             )
         refuse_inside([self.out])
+        tell_incomplete(self.sources)
         with (
             reading(self.sources, self.mapping, imports_datasets=True) as sources,
             ProgressBar("exporting") as bar,

@@ -16,6 +16,7 @@ from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
+from demorec.core.targets import OptionalTarget
 from demorec.robots.motors import Motors, MotorUnits
 from demorec.runs.find import find, name_of
 from demorec.sources.formats import FORMATS, SourceFormat
@@ -52,7 +53,7 @@ class Import:
     bags: Annotated[Positional[tuple[Path, ...]], arg(help=f"{_BAGS} Or a word in front of what is no bag: {_WORDS}.")]
     mapping: Path | None = None
     """Mapping file (TOML): which topics or datasets become which features; required where --suggest writes one."""
-    out: Path | None = None
+    out: OptionalTarget = None
     """Folder of the run, new or to be continued; required unless --suggest is given."""
     skip_bad: bool = False
     """Leave out bags that cannot be read, or do not fit the mapping or the other bags, list them at the end and exit

@@ -198,7 +198,13 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
     run = load_any_run_file(path)
     if run.generation is None:
         left_out = _left_out(path)
-        plain = {"kind": "external run", "path": str(path), "digest": run.digest, **run.plain()}
+        plain = {
+            "kind": "external run",
+            "path": str(path),
+            "complete": run.is_complete,
+            "digest": run.digest,
+            **run.plain(),
+        }
         return plain | {"left_out": left_out}, [*_external_run_lines(path, run), *_left_out_lines(left_out)]
     plain = {
         "kind": "run",
@@ -250,13 +256,15 @@ def _external_run_lines(path: Path, run: RunFile) -> list[str]:
     counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
     parts = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
     facts = [
-        ("run", f"{path} (external)"),
+        ("run", f"{path} (external, {'complete' if run.is_complete else 'unfinished'})"),
         ("robot", run.robot),
-        ("episodes", f"{len(run.attempts)} ({parts})"),
+        ("episodes", f"{len(run.attempts)}{f' ({parts})' if parts else ''}"),
         ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
         ("size", size_in_words(sum(line.num_bytes for line in run.attempts))),
         ("digest", run.digest),
     ]
+    if run.unfinished:
+        facts.append(("missing", f"{counted(run.num_missing, 'item')}: {run.unfinished}."))
     rows = [("episode", "outcome", "frames", "size", "file", "task")]
     rows += [
         (

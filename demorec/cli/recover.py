@@ -8,6 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import say
+from demorec.core.targets import OptionalTarget
 from demorec.runs.find import EVALUATION_NAME, expect
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 
@@ -26,7 +27,7 @@ class Recover:
 
     file: Positional[Path]
     """An unfinished recording (NAME.mcap.part), or a finished one that was damaged."""
-    out: Path | None = None
+    out: OptionalTarget = None
     """The recording to write (auto: NAME.mcap beside NAME.mcap.part; NAME.recovered.mcap beside NAME.mcap, or in
     RUN/recovered where that is an episode of a run or an evaluation)."""
     overwrite: bool = False

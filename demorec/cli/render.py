@@ -15,9 +15,10 @@ from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError, check_option, check_seed
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.registry import modules_of
+from demorec.core.targets import Target
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ class Render:
 
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, or folders of recordings."""
-    out: Path
+    out: Target
     """Folder for the new recordings, or the name of one (.mcap)."""
     cameras: tuple[str, ...] = ()
     """Names from the recording or `demorec list cameras`, or my_package.my_module:MY_CAMERA (auto: as recorded)."""
@@ -112,7 +113,9 @@ class Render:
 
         if self.renderer is not None:
             RENDERERS.check_name(self.renderer)
-        check_option("looks", self.looks, 0, 2**63 - 1)
+        check_seed("looks", self.looks)
+        check_option("width", self.width, 16, 8192, "pixels")
+        check_option("height", self.height, 16, 8192, "pixels")
         changes = {
             name: getattr(self, name)
             for name in ("codec", "gop", "crf", "preset", "jpeg_quality")

@@ -20,6 +20,7 @@ from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.registry import modules_of
 from demorec.core.tables import load_robot
+from demorec.core.targets import OptionalTarget
 from demorec.robots.motors import MotorUnits
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
@@ -73,7 +74,7 @@ class Replay:
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""
-    out: Path | None = None
+    out: OptionalTarget = None
     """Folder for recordings of the replays, images included."""
     view: bool = False
     """Show recording and replay overlaid in Rerun."""

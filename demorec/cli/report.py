@@ -13,6 +13,7 @@ from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, rea
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT, check_replaceable
+from demorec.core.targets import Target
 from demorec.runs.find import EPISODE_FOLDERS, expect
 from demorec.sources.formats import IMPORTED
 
@@ -33,7 +34,7 @@ class ReportCommand:
 
     path: Annotated[Positional[Path], arg(help=f"One of: {WHAT_IS_READ}, evaluations.")]
     mapping: MappingFile = None
-    out: Path
+    out: Target
     """The page (.html)."""
     camera: str = ""
     """Camera for the filmstrips; default: the first one."""

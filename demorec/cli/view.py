@@ -12,9 +12,18 @@ from tyro.conf import Positional, arg
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, size_in_words, tell
-from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside, tell_unfinished
+from demorec.cli.shared.paths import (
+    WHAT_IS_READ,
+    MappingFile,
+    places_read,
+    reading,
+    refuse_inside,
+    tell_incomplete,
+    tell_unfinished,
+)
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
+from demorec.core.targets import OptionalTarget
 from demorec.robots.assets import allow_models
 from demorec.runs.find import expect
 
@@ -52,9 +61,9 @@ class View:
     """Show the episodes of LeRobot datasets in this order, by demorec dataset score, the worst first."""
     include_failures: bool = False
     """Also show the failed attempts of a run."""
-    save: Path | None = None
+    save: OptionalTarget = None
     """Write an .rrd file (layout included) instead of opening a window; several episodes: NAME-0000.rrd and so on."""
-    screenshot: Path | None = None
+    screenshot: OptionalTarget = None
     """Write a screenshot (.png) of the viewer instead of opening a window."""
     at: float | None = None
     """Second of the episode that the screenshot shows (auto: the middle of the first episode)."""
@@ -85,6 +94,7 @@ class View:
 
         sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
         tell_unfinished(self.paths)
+        tell_incomplete(self.paths)
         if self.rank is not None:
             sources = self._ranked(sources)
         if self.save is None and self.screenshot is None and not self.web:

@@ -16,7 +16,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, Literal
 
-from demorec.core.errors import ConfigError, OptionError, check_option
+from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
 from demorec.core.plain import from_plain
 from demorec.core.registry import modules_of
 from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
@@ -162,7 +162,7 @@ class GenerateConfig:
         self.check_names(self.modules)
         if len({camera_name(name) for name in self.cameras}) != len(self.cameras):
             raise ConfigError(f"A camera is named twice: {' '.join(self.cameras)}.")
-        check_option("seed", self.seed, 0, 2**63 - 1)
+        check_seed("seed", self.seed)
         check_option("physics_hz", self.physics_hz, 60, MAX_PHYSICS_HZ)
         check_option("fps", self.fps, 1, MAX_PHYSICS_HZ)
         if self.physics_hz % self.fps:

@@ -54,6 +54,11 @@ def check_option(option: str, value: float | None, low: float, high: float, unit
         raise OptionError(option, f"is {value}, allowed are {least} to {most}{unit and ' '}{unit}.")
 
 
+def check_seed(option: str, value: int | None) -> None:
+    """Raise OptionError unless a seed fits in 63 bits; None, which leaves the choice to demorec, is always allowed."""
+    check_option(option, value, 0, 2**63 - 1)
+
+
 class NotAllowedError(ConfigError):
     """A file names a module from outside of demorec, and the user has not said that it may be run."""
 

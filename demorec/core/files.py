@@ -15,12 +15,12 @@ import platform
 import stat
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
 from typing import Any, Self
 
-from demorec.core.errors import ConfigError, resource_error
+from demorec.core.errors import ConfigError, DemorecError, resource_error, write_error
 from demorec.core.plain import parse_json
 
 MCAP_MAGIC = b"\x89MCAP0\r\n"
@@ -108,14 +108,12 @@ def make_folder(path: Path) -> None:
     """Make a folder for results, and those above it; one that is there is fine.
 
     Raises:
-        ConfigError: It cannot be made.
+        DemorecError: It cannot be made.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ConfigError(
-            f"The output folder cannot be made ({error.strerror}): choose another --out: {path}"
-        ) from error
+        raise resource_error(error) or write_error("The output folder", error, path, DemorecError) from error
 
 
 def replace_text(path: Path, text: str) -> None:
@@ -206,13 +204,11 @@ def run_lock(folder: Path) -> Iterator[None]:
             raise ConfigError(
                 f"The lock of the output folder is no file: remove it, or choose another --out: {path}"
             ) from error
-        unusable = ConfigError(
-            f"The output folder cannot be written to ({error.strerror}): choose another --out: {folder}"
-        )
-        raise resource_error(error) or unusable from error
+        raise resource_error(error) or write_error("The output folder", error, folder, DemorecError) from error
     try:
-        os.ftruncate(descriptor, 0)
-        os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
+        with suppress(OSError):  # on a full disk, whose it is cannot be said
+            os.ftruncate(descriptor, 0)
+            os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
         yield
     finally:
         os.close(descriptor)

@@ -220,7 +220,8 @@ def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_lar
         os._exit(128 + number)
     names = ", ".join(limits.paths[:_MAX_NAMES]) + ", ..." * (len(limits.paths) > _MAX_NAMES)
     begin = "\n" if os.isatty(2) else ""  # a progress bar may have left its line open
-    os.write(2, f"{begin}demorec {command}: {printable(f'{reason}: {names}')}\n".encode(errors="backslashreplace"))
+    with suppress(OSError):  # when nobody is left to be told
+        os.write(2, f"{begin}demorec {command}: {printable(f'{reason}: {names}')}\n".encode(errors="backslashreplace"))
     os._exit(1)
 
 

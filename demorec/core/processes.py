@@ -16,9 +16,10 @@ from multiprocessing import connection, resource_tracker
 from multiprocessing.context import SpawnContext, SpawnProcess
 from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import Any, NoReturn
 
 from demorec.core.limited import remove_limits
+from demorec.core.streams import drop_output
 
 _PATIENCE_S = 3.0
 """How long a program may take to end when it is asked to."""
@@ -231,6 +232,15 @@ def _main_hidden() -> Iterator[None]:
 def terminate_as_interrupt() -> AbstractContextManager[None]:
     """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
     return handled(signal.default_int_handler, signal.SIGTERM)
+
+
+def exit_silently(number: int, frame: FrameType | None) -> NoReturn:
+    """End this process in order, as the handler of a signal.
+
+    Python would print the traceback of an exit within a destructor or a callback of `atexit`.
+    """
+    drop_output(sys.stderr.fileno())
+    sys.exit(1)
 
 
 @contextmanager

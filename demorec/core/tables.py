@@ -102,7 +102,7 @@ CHECKS: Registry[Check] = Registry(
         ("kinematics", "forward_kinematics"),
         ("motion", "frozen_sensors", "action_lag"),
         ("images", "frozen_images"),
-        ("run", "run_files", "run_agrees"),
+        ("run", "run_files", "run_complete", "run_agrees"),
         ("run_dataset", "run_dataset"),
         ("run", "import_findings", "import_dropped"),
         ("duplicates", "duplicates"),

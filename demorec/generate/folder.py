@@ -12,7 +12,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from demorec.core.config import GenerateConfig, cpu_type, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, GenerationError, NotGeneratedError, resource_error
+from demorec.core.errors import (
+    ConfigError,
+    DemorecError,
+    GenerationError,
+    NotGeneratedError,
+    resource_error,
+    write_error,
+)
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
@@ -279,8 +286,7 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
     try:
         yield
     except OSError as error:
-        unusable = ConfigError(f"The output folder cannot be used ({error.strerror}): choose another --out: {path}")
-        raise resource_error(error) or unusable from error
+        raise resource_error(error) or write_error("The output folder", error, path, GenerationError) from error
 
 
 def _processor() -> str:

@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.core.errors import ConfigError, check_option
+from demorec.core.targets import OptionalTarget
 from demorec.datasets.lerobot.options import check_repo_id
 from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile
 
@@ -18,7 +19,7 @@ from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile
 class RunOptions:
     """Everything about a run that leaves the data alone."""
 
-    out: Path | None = None
+    out: OptionalTarget = None
     """Folder of the run (auto: recordings/TASK). Run the same command again to continue where it stopped."""
     num_episodes: int = 50
     """How many successful episodes to make; a larger number extends the run, a smaller one leaves the rest out."""

@@ -26,7 +26,8 @@ from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.robots.assets import allow_models
 from demorec.robots.inertials import check_masses
-from demorec.runs.run_file import UNFINISHED, Attempt, RunFile, inspect_recording
+from demorec.runs.recorded import inspect_recording
+from demorec.runs.run_file import UNFINISHED, Attempt, RunFile
 
 MAX_LOSSES = 5
 """How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""

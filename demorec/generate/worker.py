@@ -23,7 +23,8 @@ from demorec.core.files import sync_path
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
-from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, inspect_recording, recording_name
+from demorec.runs.recorded import inspect_recording
+from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)

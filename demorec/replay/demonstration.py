@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from demorec.core.config import deciding_versions
-from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option
+from demorec.core.config import MAX_PHYSICS_HZ, deciding_versions
+from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option, check_seed
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
@@ -65,6 +65,8 @@ class ReplayOptions:
         """Raise ConfigError for impossible values and combinations."""
         check_option("noise", self.noise, 0, 1, "rad")
         check_option("delay", self.delay, 0, 1000, "steps")
+        check_seed("seed", self.seed)
+        check_option("export_hz", self.export_hz, 1, MAX_PHYSICS_HZ, "Hz")
         if self.states and (self.noise or self.delay or self.export_hz):
             raise ConfigError("--states sends no commands: leave out --noise, --delay and --export-hz.")
         if self.robot is not None and (self.states or self.export_hz):

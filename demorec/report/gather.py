@@ -40,7 +40,6 @@ from demorec.runs.run_file import (
     RunFile,
     is_external_run,
     load_any_run_file,
-    load_run_file,
 )
 
 _KINDS: Mapping[PathKind, str] = {
@@ -211,10 +210,12 @@ def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:
 
 def _run_file(found: Found) -> tuple[RunFile | None, list[str]]:
     """run.json if it can be read, and sentences about what is missing."""
-    if found.kind != "run" or is_external_run(found.path):
+    if found.kind != "run":
         return None, []
     try:
-        return load_run_file(found.path), []
+        run = load_any_run_file(found.path)
+        missing = [f"{run.unfinished}."] if run.unfinished else []
+        return (None if run.generation is None else run), missing
     except DamagedRunFileError as error:
         return None, [f"{without_path(error, found.path / RUN_NAME)}, so what was asked for is not known."]
 

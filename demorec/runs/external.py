@@ -7,7 +7,7 @@ off is made whole when the folder is opened again, and nothing that is there is 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from hashlib import sha256
@@ -18,6 +18,7 @@ from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
 from demorec.core.replacing import json_object
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
+from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import (
     DATASET,
     EPISODES,
@@ -29,7 +30,6 @@ from demorec.runs.run_file import (
     RunSession,
     is_external_run,
     load_any_run_file,
-    recorded_line,
     recording_name,
     refuse_strangers,
     save_run_file,
@@ -44,6 +44,7 @@ class ExternalFolder:
         path: Of the folder.
         episodes: What is there, in order.
         recovered: Recordings that were made whole when it was opened.
+        planned: As in `RunFile`; written into run.json with the next change.
 
     Args:
         path: Of the folder.
@@ -54,6 +55,7 @@ class ExternalFolder:
         self.path = path
         self.recovered: list[Path] = []
         self._session = RunSession(started=utc_now())
+        self._begun_with: EpisodeInfo | None = None
         known, is_damaged = RunFile(), False
         if os.path.lexists(path / RUN_NAME):
             try:
@@ -63,6 +65,7 @@ class ExternalFolder:
         if recovers:
             self._recover_parts()
         self._sessions = known.sessions
+        self.planned: Sequence[str] = known.planned
         lines = {line.file: line for line in known.attempts}
         self.episodes = [self._line(file, lines) for file in sorted((path / EPISODES).glob("episode_*.mcap"))]
         if is_damaged:
@@ -127,9 +130,21 @@ class ExternalFolder:
             f"{path}"
         )
 
+    def begin(self, info: EpisodeInfo) -> None:
+        """Write run.json before a planned episode is recorded: a crash leaves a run that says what is missing."""
+        if self._begun_with is None:
+            self._begun_with = info
+            self.save()
+
+    @property
+    def began_in_vain(self) -> bool:
+        """Whether run.json was written for planned episodes, and none is there."""
+        return self._begun_with is not None and not self.episodes
+
     def add(self, recording: Path) -> Attempt:
         """Take a finished recording into run.json."""
         line = external_line(recording)
+        self.planned = [what for what in self.planned if what != planned_episode(line.episode_index)]
         self.extend([line])
         return line
 
@@ -140,11 +155,17 @@ class ExternalFolder:
 
     def save(self, *, ended: bool = False) -> None:
         """Write run.json, if there is anything to tell."""
-        if (info := self.kind()) is None:
+        if (info := self.kind() or self._begun_with) is None:
             return
         session = replace(self._session, ended=utc_now() if ended else "")
         sessions = (*self._sessions, session)
-        run = RunFile(robot=info.robot_name, fps=info.fps, attempts=tuple(self.episodes), sessions=sessions)
+        run = RunFile(
+            robot=info.robot_name,
+            fps=info.fps,
+            planned=tuple(self.planned),
+            attempts=tuple(self.episodes),
+            sessions=sessions,
+        )
         try:
             save_run_file(run, self.path)
         except OSError as error:
@@ -186,11 +207,18 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
             yield folder
         finally:
             folder.save(ended=True)
+            if folder.began_in_vain:
+                (path / RUN_NAME).unlink(missing_ok=True)
             if not was_there and not (path / RUN_NAME).exists():
                 with suppress(OSError):  # of what is in it: a recording, or what is left of one
                     (path / EPISODES).rmdir()
                     (path / LOCK_NAME).unlink()
                     path.rmdir()
+
+
+def planned_episode(episode_index: int) -> str:
+    """What an episode is called among those that an import plans."""
+    return f"episode {episode_index}"
 
 
 def episode_path(run: Path, episode_index: int) -> Path:

@@ -18,6 +18,7 @@ from typing import BinaryIO, Literal
 from demorec.core.errors import ConfigError, resource_error
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 from demorec.core.replacing import shown
+from demorec.core.targets import is_utf8
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
 
@@ -81,6 +82,9 @@ _MARKS: tuple[tuple[str, PathKind], ...] = (
 """The file by whose presence a folder is known."""
 
 
+NOT_UTF8 = "This name has bytes that are not UTF-8, which not every library can open: rename it"
+
+
 @dataclass(frozen=True, kw_only=True)
 class Found:
     """What a path is.
@@ -121,10 +125,15 @@ def find(path: Path) -> Found:
     Raises:
         ResourceError: This machine lacks what it takes to look.
     """
+    if not is_utf8(path):
+        return Found(path=path, kind="unreadable", reason=NOT_UTF8)
     try:
         mode = path.stat().st_mode
         if stat.S_ISDIR(mode):
-            return _folder(path)
+            found = _folder(path)
+            if odd := [file for file in (*found.recordings, *found.failed) if not is_utf8(file)]:
+                return Found(path=odd[0], kind="unreadable", reason=NOT_UTF8)
+            return found
         if not stat.S_ISREG(mode):
             return Found(path=path, kind="unreadable", reason=f"This is {irregular_kind(mode)}, no file and no folder")
         return _file(path)
@@ -156,7 +165,7 @@ def expect(path: Path, *kinds: PathKind) -> Found:
     """
     found = find(path)
     if found.reason:
-        raise ConfigError(f"{found.reason}: {path}")
+        raise ConfigError(f"{found.reason}: {found.path}")
     if found.kind not in kinds:
         taken, (name, advice) = [_WORDS[kind][0] for kind in kinds], _WORDS[found.kind]
         if kinds == ("dataset",) and found.kind == "run":

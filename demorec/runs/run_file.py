@@ -19,15 +19,12 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import (
     ConfigError,
     DemorecError,
-    NotGeneratedError,
-    RecordingError,
     describe_error,
     resource_error,
 )
-from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sha256_of, sync_path
+from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sync_path
 from demorec.core.plain import digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
-from demorec.episode.info import NOT_SIMULATED, EpisodeInfo
 
 RUN_NAME = "run.json"
 RUN_FORMAT = 1
@@ -142,6 +139,8 @@ class RunFile:
         generation: None of a run whose episodes are external; its values, read as those of the run, raise ConfigError
             then.
         robot, fps: Of external episodes: name of the robot, nominal frames per second.
+        planned: Of external episodes: bags, or episodes of a dataset, that the last import was given and has not taken
+            in yet, in words.
         attempts: Every finished attempt at the episodes that are asked for, ordered by episode and attempt.
         sessions: Every start of the command, or of a program that added episodes.
     """
@@ -149,6 +148,7 @@ class RunFile:
     generation: Generation | None = None
     robot: str = ""
     fps: int = 0
+    planned: tuple[str, ...] = ()
     attempts: tuple[Attempt, ...] = ()
     sessions: tuple[RunSession, ...] = ()
 
@@ -211,9 +211,27 @@ class RunFile:
         return tuple(a.episode_index for a in self.failures if a.attempt == last and a.episode_index not in succeeded)
 
     @property
+    def num_missing(self) -> int:
+        """Episodes that are neither there nor given up; of external episodes, what is planned."""
+        if self.generation is None:
+            return len(self.planned)
+        return max(0, self.num_episodes - len(self.successes) - len(self.given_up))
+
+    @property
     def is_complete(self) -> bool:
-        """Whether every episode has succeeded or been given up."""
-        return len(self.successes) + len(self.given_up) >= self.num_episodes
+        """Whether nothing is missing."""
+        return not self.num_missing
+
+    @property
+    def unfinished(self) -> str:
+        """What is missing, as a sentence without its end; "" for a complete run."""
+        if self.is_complete:
+            return ""
+        if self.generation is None:
+            missing = f"{shown(self.planned)} {'is' if self.num_missing == 1 else 'are'} not imported yet"
+        else:
+            missing = f"{self.num_missing} of {self.num_episodes} episodes are missing"
+        return f"The run is unfinished, {missing}; the command that began it continues it"
 
     @property
     def digest(self) -> str:
@@ -242,7 +260,14 @@ class RunFile:
         plain: dict[str, Any] = to_plain(self)
         if self.generation is None:
             sessions = [{key: session[key] for key in ("started", "ended")} for session in plain["sessions"]]
-            return {"robot": self.robot, "fps": self.fps, "sessions": sessions, "episodes": self._lines(_EXTERNAL_LINE)}
+            lines = self._lines(_EXTERNAL_LINE)
+            return {
+                "robot": self.robot,
+                "fps": self.fps,
+                "planned": list(self.planned),
+                "sessions": sessions,
+                "episodes": lines,
+            }
         generation = {key: value for key, value in plain["generation"].items() if key != "beyond"}
         export = generation.pop("export")
         lines = self._lines(_LINE)
@@ -265,7 +290,7 @@ def save_run_file(run: RunFile, folder: Path) -> None:
     plain, head = run.plain(), dict[str, Any](format=RUN_FORMAT)
     if run.generation is None:
         lines = plain.pop("episodes")
-        head |= {"kind": _EXTERNAL, "digest": run.digest, **plain}
+        head |= {"kind": _EXTERNAL, "digest": run.digest, "complete": run.is_complete, **plain}
     else:
         lines = _episode_lines(run, plain.pop("attempts") + plain.pop("beyond"))
         head |= {"config_digest": run.config_digest, "digest": run.digest, "complete": run.is_complete, **plain}
@@ -306,14 +331,14 @@ def load_any_run_file(folder: Path) -> RunFile:
         if (version := plain.pop("format")) > RUN_FORMAT:
             raise ConfigError(f"run.json has format {str(version)[:40]}, this demorec knows up to {RUN_FORMAT}: {path}")
         lines, sessions = plain.pop("episodes"), plain.pop("sessions", [])
-        del plain["digest"]
+        del plain["digest"], plain["complete"]
         if plain.pop("kind", "") == _EXTERNAL:
             external = from_plain({**plain, "attempts": lines, "sessions": sessions}, RunFile)
             if not external.robot or external.fps < 1:
                 raise ValueError("robot or fps is missing")
             return external
         attempts = [line for line in lines if line.pop("state") != "planned"]
-        del plain["config_digest"], plain["complete"]
+        del plain["config_digest"]
         run = from_plain({"generation": plain, "attempts": attempts, "sessions": sessions}, RunFile)
         _refuse_impossible(run)
         return run.with_attempts(run.attempts)
@@ -372,53 +397,3 @@ def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dic
     for index in range(run.num_episodes):
         if index not in tried:
             yield {"state": "planned", "episode_index": index, "seed": run.config.seed}
-
-
-def recorded_line(path: Path) -> tuple[Attempt, EpisodeInfo]:
-    """Read all of a recording: its line of run.json, with the bare name as its `file`, and what is known of it.
-
-    Raises:
-        RecordingError: It is damaged.
-    """
-    from demorec.mcap import open_recording  # which reading run.json alone does not need
-
-    with open_recording(path) as recording:
-        info, outcome = recording.info, recording.outcome
-        is_simulated = info.simulation is not None
-        line = Attempt(
-            episode_index=info.episode_index,
-            attempt=info.attempt,
-            seed=info.simulated.root_seed if is_simulated else 0,
-            success=None if outcome is None else outcome.success,
-            file=path.name,
-            sha256=sha256_of(path),
-            digest=recording.digest(),
-            num_frames=recording.num_frames,
-            num_bytes=path.stat().st_size,
-            phase="" if outcome is None else outcome.failure_phase,
-            reason="cut off by a crash" if outcome is None else outcome.failure_reason,
-            instruction="" if is_simulated else info.instruction,
-            drops={} if outcome is None else outcome.drops,
-        )
-        return line, info
-
-
-def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[str, str]]:
-    """Read all of a finished recording: nothing that run.json says of it is taken on trust.
-
-    Returns:
-        The line of run.json that it speaks for, with the bare name as its `file`; the config that it was made with, as
-        plain data; and package -> version of what decided the bits.
-
-    Raises:
-        RecordingError: It is no complete recording of an episode that demorec simulated.
-        NotGeneratedError: It was rendered or replayed, or a policy made it.
-    """
-    attempt, info = recorded_line(path)
-    if info.simulation is None:
-        raise RecordingError(f"{NOT_SIMULATED}: {path}")
-    if info.origin:
-        raise NotGeneratedError(f"The recording is a {info.origin}, which generate-dataset did not make: {path}")
-    if attempt.success is None:
-        raise RecordingError(f"The recording was cut off by a crash: {path}")
-    return attempt, info.simulated.config, info.versions

@@ -18,8 +18,9 @@ import zstandard
 
 from demorec.core.errors import ConfigError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
+from demorec.core.targets import is_utf8
 from demorec.mcap.scan import ScannedMessage
-from demorec.runs.find import BAG_SUFFIXES, IMPORT_WORDS, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, name_of
+from demorec.runs.find import BAG_SUFFIXES, IMPORT_WORDS, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, name_of
 from demorec.sources.bag_files import MAX_TIME_NS, BagError, Report, Topics, read_mcap, read_ros1, read_sqlite
 from demorec.sources.words import in_natural_order
 
@@ -137,6 +138,8 @@ def open_bag(path: Path) -> Bag:
         raise resource_error(error, path) or ConfigError(
             f"There is no bag that could be read ({error.strerror}): {path}"
         ) from error
+    if not is_utf8(path):
+        raise ConfigError(f"{NOT_UTF8}: {path}")
     if stat.S_ISDIR(mode):
         return _folder(path)
     _magic_of(path)

@@ -23,6 +23,7 @@ from demorec.sources.rows import RATE, EpisodeRows, Timelines
 
 _EPOCH_S = 1e8
 """Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
+_YEAR_S = 365.25 * 86_400
 _RESTS = 0.02
 """Of the range of all elements, within which they stay while a robot stands still."""
 MAX_ENCODER_NOISE = 1e-3
@@ -50,6 +51,7 @@ def _findings(bag: Timelines) -> Iterator[Finding]:
     yield from _joint_findings(regular)
     yield from _extent_findings(regular)
     yield from _offset_findings(lines)
+    yield from _epoch_findings(lines)
     yield from _mixed_findings(bag, lines)
     yield from _frozen_findings(lines)
     yield from _still_findings(lines)
@@ -63,8 +65,8 @@ def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
     nothing of a single stream: then it is the one to the difference of the stream that has most messages.
     """
     skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
-    known = [line for line in lines if len(line.skews_ns)]
-    if not known or any(abs(np.median(line.skews_ns)) < _EPOCH_S * NS for line in known):
+    known = _of_another_epoch(lines)
+    if not known:
         return skews
     usual = max(known, key=lambda line: len(line.skews_ns))
     stamps = usual.stream.header_ns[usual.stream.header_ns > 0]
@@ -73,6 +75,24 @@ def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
         own = line.stream.header_ns[line.stream.header_ns > 0]
         skews[line] = line.skews_ns - np.interp(own, stamps[order], usual.skews_ns[order])
     return skews
+
+
+def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
+    """Return the streams whose headers have times, if all these count from another beginning than the recorder."""
+    known = [line for line in lines if len(line.skews_ns)]
+    return known if all(abs(np.median(line.skews_ns)) >= _EPOCH_S * NS for line in known) else []
+
+
+def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+    """Headers of simulated time, or of a clock that was never set, by which the rows go."""
+    known = [line for line in _of_another_epoch(lines) if line.is_header]
+    if known:
+        years = float(np.median([np.median(line.skews_ns) for line in known])) / NS / _YEAR_S
+        text = (
+            f"all headers are {abs(years):.1f} years {'behind' if years > 0 else 'ahead of'} the times of recording, "
+            "and rows go by them: simulated time, or a clock that was never set"
+        )
+        yield Finding(kind=NOTE, stream="", text=text)
 
 
 def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:

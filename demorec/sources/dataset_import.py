@@ -20,7 +20,7 @@ from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.lerobot.videos import why_transcoded
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.robots.motors import Motors
-from demorec.runs.external import open_external_run
+from demorec.runs.external import episode_path, open_external_run, planned_episode
 from demorec.runs.find import expect
 from demorec.sources.frames_writer import FramesImport, Image, importing_versions, write_frames
 
@@ -63,7 +63,9 @@ def import_lerobot(
     digest, num_new = functools.cache(sha256_of), 0
     video = video or VideoConfig()
     with open_external_run(out, recovers=False) as folder:
-        for number in range(len(dataset.places)):
+        numbers = range(len(dataset.places))
+        folder.planned = [planned_episode(n) for n in numbers if not episode_path(folder.path, n).exists()]
+        for number in numbers:
             recording = DatasetRecording(dataset, number)
             info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
             if folder.has(info):

@@ -156,6 +156,7 @@ def write_frames(
         RecordingError: A number is not finite, or the disk is full.
     """
     folder.check_fits(info)
+    folder.begin(info)
     path = episode_path(folder.path, info.episode_index)
     leads = leads or {}
     begin = max(leads.values(), default=0)

@@ -27,7 +27,7 @@ from demorec.episode.episode import Outcome, Vector
 from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.robots.motors import Motors
-from demorec.runs.external import differences, open_external_run
+from demorec.runs.external import differences, open_external_run, planned_episode
 from demorec.runs.find import expect
 from demorec.sources.fields import FieldError
 from demorec.sources.frames_writer import FramesImport, imported_info, urdf_text, write_frames
@@ -87,6 +87,7 @@ def import_hdf5(
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
     with open_external_run(out, recovers=False) as folder:
         missing = [plan for plan in plans if not folder.has(plan[2])]
+        folder.planned = [planned_episode(info.episode_index) for _, _, info, _ in missing]
         for path, place, info, outcome in missing:
             with ForeignFile(path) as file, _named(path):
                 episode = _Stored(file, place, mapping)

@@ -19,9 +19,10 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.plain import to_plain
 from demorec.core.processes import process_pool
+from demorec.core.replacing import json_object
 from demorec.episode.info import EpisodeInfo
 from demorec.runs.external import ExternalFolder, differences, open_external_run
-from demorec.runs.run_file import Attempt
+from demorec.runs.run_file import RUN_NAME, Attempt
 from demorec.sources.bag import Bag, Files, bags_in, open_bag
 from demorec.sources.episode_writer import write_bag
 from demorec.sources.frames_writer import urdf_text
@@ -76,7 +77,8 @@ def import_bags(
         submit: Callable[..., Future[Any]]
         submit = _at_once if workers == 1 else stack.enter_context(process_pool(workers)).submit
         new = batch.look(lambda bag: submit(Bag.sha256s, bag))
-        if new or (known.bags and batch.skipped_bags() != known.skipped):
+        was_unfinished = bool(json_object(out / RUN_NAME).get("planned"))
+        if new or was_unfinished or (known.bags and batch.skipped_bags() != known.skipped):
             with open_external_run(out, recovers=False) as folder:
 
                 def read(bag: Bag) -> Future[PlannedBag]:
@@ -118,6 +120,7 @@ class ImportBatch:
         self, paths: Sequence[Path], known: ImportFile, *, skips: bool, progress: Callable[[int, int], None]
     ) -> None:
         self._paths, self._known, self._skips, self._progress = paths, known, skips, progress
+        self._left = list(paths)  # to be taken into the run, or left out
         self._files: dict[Path, Files] = {}  # of bags that are in the run, or will be
         self._skipped: dict[Path, str] = {}
         self.num_new = self._num_done = 0
@@ -141,7 +144,7 @@ class ImportBatch:
         for bag, found in [(bag, digest(bag)) for bag in likely]:
             if (files := found.result()) in known:
                 self._files[bag.path] = files
-                self._advance()
+                self._advance(bag.path)
         return [bag for bag in bags if bag.path not in self._files]
 
     def run(
@@ -165,16 +168,18 @@ class ImportBatch:
             tell: Called with the report of each bag that is in the run now.
         """
         self._kind = folder.kind()
+        folder.planned = self._planned()
         waiting, failure = deque(bags), None
         reading: deque[tuple[Bag, Future[PlannedBag]]] = deque()
-        writing: deque[Future[_Written]] = deque()
+        writing: deque[tuple[Path, Future[_Written]]] = deque()
         while waiting or reading or writing:
             while waiting and len(reading) + len(writing) < ahead:
                 bag = waiting.popleft()
                 reading.append((bag, read(bag)))
-            if writing and writing[0].done():
-                report, lines = writing.popleft().result()
-                self._take(folder, report, lines)
+            if writing and writing[0][1].done():
+                path, written = writing.popleft()
+                report, lines = written.result()
+                self._take(folder, path, report, lines)
                 tell(report)
             elif reading and reading[0][1].done():
                 try:
@@ -185,22 +190,28 @@ class ImportBatch:
                     reading.clear()
                     continue
                 if planned is not None:
-                    writing.append(write(planned))
+                    writing.append((planned.bag.path, write(planned)))
             else:
-                first: list[Future[Any]] = [*list(writing)[:1], *(future for _, future in list(reading)[:1])]
+                first: list[Future[Any]] = [future for _, future in list(writing)[:1]]
+                first += [future for _, future in list(reading)[:1]]
                 wait(first, return_when=FIRST_COMPLETED)
+        folder.planned = self._planned()
         if failure is not None:
             raise failure
         if self._known.bags:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
 
-    def _take(self, folder: ExternalFolder, report: BagReport, lines: Sequence[Attempt]) -> None:
-        """A bag whose episodes are written into the run."""
-        folder.extend(lines)
+    def _planned(self) -> list[str]:
+        return [path.name for path in self._left]
+
+    def _take(self, folder: ExternalFolder, path: Path, report: BagReport, lines: Sequence[Attempt]) -> None:
+        """Take a bag whose episodes are written into the run; run.json, which says that it is done, comes last."""
         self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
         save_import_file(self._known, folder.path)
         self.num_new += 1
-        self._advance()
+        self._advance(path)
+        folder.planned = self._planned()
+        folder.extend(lines)
 
     def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> PlannedBag | None:
         """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
@@ -220,8 +231,10 @@ class ImportBatch:
         is_there = planned.report.files in self._files.values()
         self._files[bag.path] = planned.report.files
         if is_there:  # another one with the same bytes
-            self._advance()
+            self._advance(bag.path)
             return None
+        if planned.episodes:
+            folder.begin(planned.episodes[0].info)
         planned = planned.numbered(self._next_index)
         self._next_index += len(planned.episodes)
         return replace(planned, episodes=tuple(one for one in planned.episodes if not folder.has(one.info)))
@@ -236,9 +249,10 @@ class ImportBatch:
         self._skipped[path] = (
             without_path(error, path)[:_MAX_REASON] if known else f"unexpected {type(error).__name__}, please report it"
         )
-        self._advance()
+        self._advance(path)
 
-    def _advance(self) -> None:
+    def _advance(self, path: Path) -> None:
+        self._left.remove(path)
         self._num_done += 1
         self._progress(self._num_done, len(self._paths))
 

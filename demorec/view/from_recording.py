@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -36,7 +37,7 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
     known = {
         "name": path.name.removesuffix(".mcap"),
         "group": folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
-        "identity": hashlib.sha256(str(path.resolve()).encode()).hexdigest()[:16],
+        "identity": hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16],
         "source": path.name,
     }
     with open_recording(path) as recording:

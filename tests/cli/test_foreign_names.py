@@ -19,7 +19,8 @@ from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.plain import to_plain
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.episode.simulated import with_simulation
-from demorec.runs.run_file import RUN_NAME, Generation, RunFile, inspect_recording, save_run_file
+from demorec.runs.recorded import inspect_recording
+from demorec.runs.run_file import RUN_NAME, Generation, RunFile, save_run_file
 
 SAMPLE = next((Path(__file__).parents[2] / "recordings" / "sample").glob("*.mcap"))
 MODULE = "names_of_a_stranger"

@@ -20,7 +20,8 @@ from support.recording import write_episode
 
 from demorec.cli import COMMANDS, main, run_command
 from demorec.mcap import Recording
-from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
+from demorec.runs.recorded import inspect_recording
+from demorec.runs.run_file import Generation, RunFile, save_run_file
 
 HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
 NAME = "\x1b[31mred\u202e.mcap"

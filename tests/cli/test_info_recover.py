@@ -157,7 +157,7 @@ def test_an_empty_path_is_not_the_current_folder(capsys: pytest.CaptureFixture[s
     with pytest.raises(SystemExit) as ended:
         main(["info", ""])
     assert ended.value.code == 2
-    assert "one of the paths is empty" in capsys.readouterr().err
+    assert "One of the paths is empty" in capsys.readouterr().err
 
 
 def test_a_path_that_looks_like_a_flag_is_told_how_to_be_written(

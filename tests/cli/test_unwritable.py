@@ -1,7 +1,11 @@
-"""A target that no file or folder can take is a wrong request: exit code 2 and one sentence, whatever the command."""
+"""Targets that cannot be written: one sentence and the exit code of the table in docs/README.md from every command."""
 
 from __future__ import annotations
 
+import os
+import resource
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -12,10 +16,12 @@ from support.export import export
 CALLS = {
     "generate": "generate --num-episodes 1 --cameras none --out NEW",
     "generate again": "generate --config RECORDING --out NEW",
-    "export lerobot": "export lerobot RECORDING --out NEW --no-verify",
-    "export hdf5": "export hdf5 RECORDING --out NEW.hdf5",
+    "export lerobot": "export lerobot RECORDING --out NEW --no-verify --include-failures",
+    "export hdf5": "export hdf5 RECORDING --out NEW.hdf5 --include-failures",
     "import": "import lerobot DATASET --out NEW",
     "dataset": "dataset select DATASET --episodes 0 --out NEW",
+    "dataset split": "dataset split DATASET --shares a=0.5 b=0.5 --out NEW",
+    "dataset score": "dataset score DATASET --out NEW.json",
     "report": "report RECORDING --no-checks --out NEW.html",
     "view": "view RECORDING --save NEW.rrd",
     "replay": "replay RECORDING --out NEW",
@@ -30,22 +36,80 @@ CALLS = {
 def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     folder = tmp_path_factory.mktemp("sources")
     recording = simulate(folder / "e.mcap", fps=10, max_episode_seconds=1.0)
-    export([recording], folder / "dataset", include_failures=True)
+    export([recording], folder / "one", include_failures=True)
+    both = [folder / "one", folder / "one"]
+    assert exit_code("dataset", "merge", *both, "--out", folder / "dataset") == 0
     return {"RECORDING": recording, "DATASET": folder / "dataset"}
 
 
-@pytest.mark.parametrize("place", ["below a file", "in /proc"])
+def call(name: str, sources: dict[str, Path], new: Path) -> list[str]:
+    """The words of a call that writes `new`, or what begins with it."""
+    words = CALLS[name]
+    for word, path in sources.items():
+        words = words.replace(word, str(path))
+    return words_of(words, "", new)
+
+
+def said(capsys: pytest.CaptureFixture[str]) -> str:
+    """The one sentence about the error."""
+    lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("demorec ")]
+    assert len(lines) == 1, lines
+    return lines[0]
+
+
+PLACES = {
+    "below a file": Path("file/x"),
+    "in /proc": Path("/proc/x"),
+    "a long name": Path("x" * 300),
+    "bytes": Path(os.fsdecode(b"\xff")),
+    "below a link to nothing": Path("link/x"),
+}
+
+
+@pytest.mark.parametrize("place", PLACES)
 @pytest.mark.parametrize("name", CALLS)
 def test_an_unwritable_target_is_exit_code_2(
     name: str, place: str, sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (tmp_path / "file").write_text("mine")
-    new = tmp_path / "file" / "x" if place == "below a file" else Path("/proc/x")
-    call = CALLS[name]
-    for word, path in sources.items():
-        call = call.replace(word, str(path))
-    assert exit_code(*words_of(call, "", new)) == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if line.startswith("demorec ")]
-    assert len(said) == 1, said
-    assert str(new.parent) in said[0]
+    (tmp_path / "link").symlink_to("nothing")
+    new = tmp_path / PLACES[place]
+    assert exit_code(*call(name, sources, new)) == 2
+    assert "/".join(new.parts[-2:])[:-1].encode("ascii", "backslashreplace").decode()[1:] in said(capsys)
     assert (tmp_path / "file").read_text() == "mine"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_the_file_of_a_user_is_exit_code_2(
+    name: str, sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = call(name, sources, tmp_path / "thesis")
+    target = Path(words[words.index("--save" if name == "view" else "--out") + 1])
+    target.write_text("years of work")
+    assert exit_code(*words) == 2
+    assert str(tmp_path) in said(capsys)
+    assert target.read_text() == "years of work"
+    assert list(tmp_path.iterdir()) == [target]
+
+
+@contextmanager
+def full_disk() -> Iterator[None]:
+    """Let no file take a byte: like a full disk, files and folders can still be made."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+
+@pytest.mark.parametrize("name", [name for name in CALLS if not name.startswith("generate")])
+def test_a_full_disk_is_exit_code_1(
+    name: str, sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = call(name, sources, tmp_path / "new")
+    with full_disk():
+        assert exit_code(*words) == 1
+    assert "unexpected" not in said(capsys)
+    assert not (tmp_path / words[words.index("--save" if name == "view" else "--out") + 1]).is_file()

@@ -100,6 +100,23 @@ def test_every_command_tells_the_same_about_a_path(
     assert sorted(tmp_path.iterdir()) == before
 
 
+@pytest.mark.parametrize("command", ON_A_PATH)
+@pytest.mark.parametrize("place", ["the path itself", "in a folder"])
+def test_names_that_are_not_utf8(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str) -> None:
+    """PyArrow and Rerun open none of them."""
+    path = tmp_path / os.fsdecode(b"\xff.mcap")
+    write_episode(path, num_frames=2, cameras=())
+    before = sorted(tmp_path.iterdir())
+    given = path if place == "the path itself" else tmp_path
+    assert exit_code(*words_of(ON_A_PATH[command], given, tmp_path / "out")) == 2
+    shown = str(path).replace("\udcff", "\\udcff")
+    told = capsys.readouterr().err
+    assert told.startswith(f"demorec {command}: This name has bytes that are not UTF-8")
+    assert told.endswith(f": {shown}\n")
+    assert told.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
+
+
 def test_what_cannot_be_seen_is_not_called_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "run" / "meta").mkdir(parents=True)
 

@@ -304,6 +304,8 @@ def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone
         program.kill()
     _, alive = psutil.wait_procs(children, timeout=30)
     assert not alive
+    assert load_any_run_file(run).planned, "a kill at any moment leaves a run that says what is missing"
     import_bags([batch[0]], batch[1], run, skip_bad=True)
+    assert not load_any_run_file(run).planned
     assert _content(run) == _content(alone)
     assert load_any_run_file(run).digest == load_any_run_file(alone).digest

@@ -131,6 +131,13 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "a wrong deviation": (of_stats("action", "std", lambda v: [*v[:2], 1.0, *v[3:]]), "dataset_statistics"),
     "a wrong quantile": (of_stats("action", "q10", lambda v: [0.5 * number for number in v]), "dataset_statistics"),
     "a wrong count": (of_stats("action", "count", lambda v: [v[0] - 1]), "dataset_statistics"),
+    "numbers that are text": (of_stats("action", "mean", lambda v: [str(n) for n in v]), "dataset_statistics"),
+    "colours that are text": (of_stats(CAMERA, "mean", lambda v: "grey"), "dataset_statistics"),
+    "colours that are not numbers": (of_stats(CAMERA, "std", lambda v: [[[float("nan")]]] * 3), "dataset_statistics"),
+    "a count beyond all rows": (of_stats("index", "count", lambda v: [2**63 - 1]), "dataset_statistics"),
+    "an episode's count beyond all rows": (
+        value_of("stats/index/count", 1, [2**63 - 1], "meta/episodes"), "dataset_statistics"
+    ),
     "an episode's mean": (value_of("stats/action/mean", 1, 0.7, "meta/episodes"), "dataset_statistics"),
     "statistics that are gone": (lambda dataset: (dataset / "meta/stats.json").unlink(), "dataset_statistics"),
     "colours of 0 to 255": (of_stats(CAMERA, "mean", lambda v: [[[140.0]]] * 3), "dataset_image_statistics"),

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable, Iterator
+from copy import deepcopy as copy_of
 from pathlib import Path
 from typing import Any
 
@@ -65,8 +66,37 @@ LINES: dict[str, Callable[[Any], None]] = {
 
 def test_the_good_one_passes(good: Path) -> None:
     assert {(result.check, result.level) for result in checked(good, "run").results} == {
-        (check, "pass") for check in ("run_files", "run_agrees", "run_dataset", "duplicates")
+        (check, "pass") for check in ("run_files", "run_complete", "run_agrees", "run_dataset", "duplicates")
     }
+
+
+def places_in(plain: Any, above: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
+    """Where every value of a JSON document is."""
+    items = plain.items() if isinstance(plain, dict) else enumerate(plain) if isinstance(plain, list) else ()
+    for key, value in items:
+        yield (*above, key)
+        yield from places_in(value, (*above, key))
+
+
+def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
+    """One value after the other becomes null."""
+    path = run / "run.json"
+    plain = json.loads(path.read_text())
+    plain["export"] = {"run_digest": "a", "repo_id": "local/a", "dataset_digest": "b", "seconds": 1.0}
+    damaged = set()
+    for *above, last in places_in(plain):
+        spoilt = copy_of(plain)
+        owner: Any = spoilt
+        for key in above:
+            owner = owner[key]
+        if owner[last] is None or {"config", "seconds", "versions", 1} & set(above):
+            continue  # one of the config's values and one episode stand for all
+        owner[last] = None
+        path.write_text(json.dumps(spoilt))
+        is_damaged = exit_code("info", run) == 1
+        assert (level_of(run, "run_files", "run") == "fail") == is_damaged, (*above, last)
+        damaged |= {last} if is_damaged else set()
+    assert {"repo_id", "num_episodes", "sha256", "config"} <= damaged
 
 
 @pytest.mark.parametrize("name", LINES)

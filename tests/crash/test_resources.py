@@ -11,7 +11,7 @@ from support.recording import write_episode
 
 from demorec.core.errors import RecordingError, ResourceError
 from demorec.mcap import container
-from demorec.runs.run_file import inspect_recording
+from demorec.runs.recorded import inspect_recording
 
 
 @pytest.mark.parametrize(

@@ -269,7 +269,7 @@ def test_a_vanished_folder_is_told(tmp_path: Path) -> None:
 @pytest.mark.parametrize("place", ["a-file/run", "/proc/demorec-run"])
 def test_an_impossible_folder_is_told(tmp_path: Path, place: str) -> None:
     (tmp_path / "a-file").touch()
-    with pytest.raises(ConfigError, match="cannot be made"):
+    with pytest.raises(ConfigError, match="cannot be written"):
         run_fake(tmp_path / place)
 
 

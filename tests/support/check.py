@@ -29,7 +29,8 @@ from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.frames import frames_of
 from demorec.mcap.part_file import PartFile
 from demorec.robots.motors import Motors
-from demorec.runs.run_file import Generation, RunFile, inspect_recording, save_run_file
+from demorec.runs.recorded import inspect_recording
+from demorec.runs.run_file import Generation, RunFile, save_run_file
 from support.mcap import metadata_of
 
 Images = list[dict[str, CameraImages]]

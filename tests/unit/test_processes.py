@@ -159,3 +159,17 @@ def test_a_program_ends_when_it_is_asked_to_and_tells_how_it_ended() -> None:
     assert not alive
     with start_program([sys.executable, "-c", "raise SystemExit(7)"]) as failing:
         assert failing.wait(20) == 7
+
+
+def test_a_process_that_is_asked_to_end_while_it_ends_prints_no_traceback() -> None:
+    """SIGTERM while Python runs the callbacks of atexit, as the verifier of an export may get it."""
+    code = (
+        "import atexit, os, signal, sys; from demorec.core.processes import exit_silently;"
+        "atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM));"
+        "signal.signal(signal.SIGTERM, {});"
+    )
+    for handler, is_printed in (("lambda number, frame: sys.exit(1)", True), ("exit_silently", False)):
+        ended = subprocess.run(
+            [sys.executable, "-c", code.format(handler)], capture_output=True, text=True, check=False
+        )
+        assert ("Traceback" in ended.stderr) == is_printed

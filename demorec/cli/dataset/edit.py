@@ -13,6 +13,7 @@ from demorec.cli.shared.output import counted, say
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
+from demorec.core.targets import OptionalTarget
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ CONDITION_HELP = (
 class Edit:
     """Flags of every command that writes a dataset."""
 
-    out: Path | None = None
+    out: OptionalTarget = None
     """Folder of the new dataset."""
     decode: bool = False
     """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""

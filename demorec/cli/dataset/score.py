@@ -11,6 +11,7 @@ from demorec.cli.dataset.edit import DatasetPath, dataset_at
 from demorec.cli.shared.output import counted, say, say_json, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.core.errors import ExportError, write_error
+from demorec.core.targets import OptionalTarget
 
 if TYPE_CHECKING:
     from demorec.datasets.editing.plan import Source
@@ -26,7 +27,7 @@ class Score:
     """
 
     dataset: DatasetPath
-    out: Path | None = None
+    out: OptionalTarget = None
     """JSON file for the scores."""
     overwrite: bool = False
     """Replace an existing file of scores."""

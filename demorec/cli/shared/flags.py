@@ -10,13 +10,14 @@ import codecs
 import dataclasses
 import inspect
 import io
+import math
 import re
 import shutil
 import sys
 import textwrap
-from collections.abc import Sequence
+import unicodedata
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import redirect_stderr, redirect_stdout
-from itertools import pairwise
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -35,12 +36,16 @@ from tyro.constructors import (
 from demorec.cli.shared.output import say, tell
 from demorec.core.errors import ConfigError
 from demorec.core.registry import is_module_name, split_name
+from demorec.core.targets import check_targets
+from demorec.core.text import printable
 
 FLAG_TYPES = ConstructorRegistry()
 
 _HOME = re.compile(r"^(--[\w-]+=|)~(?=/|$)")
 _NARROWEST = 40
 """Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
+_UNWRITABLE = ("Cc", "Cs", "Zl", "Zp")
+"""Unicode's categories of control characters, of bytes that are not UTF-8, and of ends of lines and paragraphs."""
 _HINTED = object()
 """Marks a type for which tyro's own rule is asked."""
 
@@ -64,17 +69,13 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
     # ~ within quotes and in --out=~/new, which bash leaves as it is
     args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
-    # Python would take an empty path for the current folder.
-    if any(not word and not before.startswith("--") for before, word in pairwise(["", *args])):
-        tell(f"{prog}: one of the paths is empty (an unset variable of the shell?); the current folder is written as .")
-        raise SystemExit(2)
     asks_for_help = "-h" in args or "--help" in args
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
     encoding = codecs.lookup(sys.stdout.encoding or "utf-8").name
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
         with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err):
-            return tyro.cli(
+            parsed = tyro.cli(
                 command,
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
                 prog=prog,
@@ -83,13 +84,15 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
                 config=(tyro.conf.OmitArgPrefixes,),
             )
     except SystemExit as end:
-        for page, write in ((out, say), (err, tell)):  # tyro repeats what it does not understand as it is
-            page.seek(0)
-            write(*_laid_out(page.read(), terminal_width()))
+        page, write = (err, tell) if end.code else (out, say)
+        page.seek(0)
+        write(*_laid_out(page.read(), terminal_width()))  # tyro repeats what it does not understand as it is
         for word in args if end.code else ():
             if word.startswith("-") and Path(word).exists():
                 tell(f"{prog}: a path that begins with a dash is written ./{word}")
         raise
+    check_targets(parsed)
+    return parsed
 
 
 def _laid_out(page: str, width: int) -> list[str]:
@@ -118,14 +121,70 @@ def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
     return dataclasses.replace(spec, fields=tuple(fields))
 
 
+def _finite_number(word: str) -> float:
+    number = float(word)
+    if not math.isfinite(number):
+        raise ValueError(f"{word} is not a finite number")
+    return number
+
+
+def _whole_number(word: str) -> int:
+    number = int(word)
+    if not -(2**63) <= number < 2**63:
+        raise ValueError(f"{word} is not a whole number of 64 bits")
+    return number
+
+
+def _line_of_text(word: str) -> str:
+    """A word that may be written into a file of lines (YAML, JSON, TOML), encoded as UTF-8."""
+    if any(unicodedata.category(character) in _UNWRITABLE for character in word):
+        raise ValueError(f"{printable(word)!r} is not one line of text: it has a line end or another control character")
+    return word
+
+
+def _path(word: str) -> Path:
+    """Read a path. Its errors pass through tyro, which would not repeat the reason where several paths may be given."""
+    if not word:  # Python would take it for the current folder
+        raise ConfigError(
+            "One of the paths is empty (an unset variable of the shell?): the current folder is written as ."
+        )
+    if "\0" in word:
+        raise ConfigError(f"A path has no zero byte: {word}")
+    return Path(word)
+
+
+_VALUE_OF: Mapping[Any, Callable[[str], Any]] = {
+    int: _whole_number,
+    float: _finite_number,
+    str: _line_of_text,
+    Path: _path,
+}
+"""Type of an option, or of one of its values -> what reads a word of the command line, ValueError for a wrong one."""
+
+
+@FLAG_TYPES.primitive_rule
+def _value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+    """`--noise FLOAT` and the like."""
+    value_of = _VALUE_OF.get(info.type)
+    if value_of is None:
+        return None
+    return PrimitiveConstructorSpec(
+        nargs=1,
+        metavar=info.type.__name__.upper(),
+        instance_from_str=lambda words: value_of(words[0]),
+        is_instance=lambda value: isinstance(value, info.type),
+        str_from_instance=lambda value: [str(value)],
+    )
+
+
 @FLAG_TYPES.primitive_rule
 def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
     """`--workers INT` and `--codec {auto,h264,av1}` with auto for None, where tyro would show `{None}|INT`."""
     kind = _kind_beside_none(info.type)
     choices = ("auto", *get_args(kind)) if get_origin(kind) is Literal else None
-    if choices is None and kind not in (int, float, str, Path):
+    if choices is None and kind not in _VALUE_OF:
         return None
-    value_of = kind if choices is None else str
+    value_of = _VALUE_OF[str if choices else kind]
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=f"{{{','.join(choices)}}}" if choices else kind.__name__.upper(),
@@ -150,7 +209,7 @@ def _optional_pair(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | N
             return None
         if len(words) != 2:
             raise ValueError(f"two {needed} are needed, {metavar}, or auto")
-        return tuple(kind(word) for word in words)
+        return tuple(_VALUE_OF[kind](word) for word in words)
 
     return PrimitiveConstructorSpec(
         nargs=(1, 2),
@@ -169,7 +228,7 @@ def _optional_words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | 
     return PrimitiveConstructorSpec(
         nargs="*",
         metavar="[STR ...]",
-        instance_from_str=tuple,
+        instance_from_str=lambda words: tuple(map(_line_of_text, words)),
         is_instance=lambda value: value is None or isinstance(value, tuple),
         str_from_instance=lambda value: [] if value is None else list(value),
     )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import contextlib
 import json
 import logging
-import os
 import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -18,6 +17,7 @@ from typing import Any, TextIO
 from tqdm import tqdm
 
 from demorec.core.errors import DemorecError
+from demorec.core.streams import drop_output
 from demorec.core.text import display_width, printable
 
 
@@ -94,11 +94,10 @@ def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
         with tqdm.external_write_mode(file=stream):  # progress bars step aside
             stream.write(text)
             stream.flush()
-    except BrokenPipeError:
-        raise
     except OSError as error:
-        # What is left in the buffer would fail again, with a traceback, at the end of the program.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        drop_output(stream.fileno())
+        if isinstance(error, BrokenPipeError):
+            raise
         raise OutputError(f"The answer cannot be written ({error.strerror}): {stream.name}") from error
 
 

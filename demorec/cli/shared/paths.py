@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Annotated
 
@@ -12,10 +12,10 @@ from tyro.conf import Positional, arg
 from demorec.cli.shared.output import renamed, tell
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.processes import terminate_as_interrupt
-from demorec.core.replacing import use_as_source
+from demorec.core.replacing import json_object, use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
-from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
+from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED, load_any_run_file
 from demorec.sources.formats import FORMATS, import_kind, opened
 
 WHAT_IS_READ = (
@@ -43,6 +43,14 @@ def need_paths(paths: Sequence[Path], command: str) -> None:
 def tell_unfinished(paths: Iterable[Path]) -> None:
     """Name what is unfinished in what the user has named, which the command leaves out."""
     tell(*(f"Left out: {left}." for path in paths if (left := find(path).left)))
+
+
+def tell_incomplete(paths: Iterable[Path]) -> None:
+    """Name what unfinished runs lack, of which the command takes what is there."""
+    for path in paths:
+        if json_object(path / RUN_NAME).get("complete") is False:
+            with suppress(DemorecError):  # reported where the run is read
+                tell(f"Note: {load_any_run_file(path).unfinished}: {path}")
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
 from demorec.core.registry import check_choice, nearest_match
 from demorec.datasets.editing.plan import FeatureMapping, Plan, Source
 from demorec.datasets.lerobot.files import column_numbers
@@ -87,6 +87,7 @@ def reorder(source: Source, by: str = "", order: Sequence[int] = (), *, descendi
 
 def shuffle(source: Source, seed: int) -> Plan:
     """All episodes in an order that the seed decides."""
+    check_seed("seed", seed)
     plan = Plan.whole(source)
     order = np.random.default_rng(seed).permutation(len(plan.cuts)).tolist()
     return plan.with_cuts([plan.cuts[number] for number in order])
@@ -114,8 +115,9 @@ def trim_idle(source: Source, feature: str, threshold: float, margin: int) -> Pl
     """
     numeric = [name for name in _own(source) if source.info.features[name].is_numeric]
     check_choice("feature of numbers", feature, numeric)
-    if not threshold > 0 or margin < 0:
-        raise ConfigError("The threshold is a share above 0, the margin a number of frames of at least 0.")
+    if not 0 < threshold <= 1:
+        raise OptionError("idle_threshold", f"is {threshold}, allowed are shares above 0 and up to 1.")
+    check_option("idle_margin", margin, 0, 2**63 - 1, "frames")
     plan = Plan.whole(source)
     rows = RowStream(source.info, [feature])
 
@@ -147,6 +149,7 @@ def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "
 
     Episodes stay in the dataset's order. Raises ConfigError for impossible shares.
     """
+    check_seed("seed", seed)
     total = sum(shares.values())
     if len(shares) < 2 or not all(share > 0 for share in shares.values()) or abs(total - 1) > _SHARE_TOLERANCE:
         raise ConfigError(

@@ -9,10 +9,14 @@ from typing import Literal
 
 from demorec.annotate import KINDS, LanguageKind
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, OptionError
+from demorec.core.errors import ConfigError, OptionError, check_option
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 from demorec.robots.motors import MotorUnits
+
+MIN_FILE_MIB = 1e-6
+MAX_FILE_MIB = 1e6
+"""Sizes of files: from one byte to a terabyte."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -95,9 +99,10 @@ class ExportOptions(CommonOptions):
         if unknown := [kind for kind in self.language or () if kind not in KINDS]:
             raise OptionError("language", f"names {unknown[0]!r}, its kinds are {', '.join(KINDS)}.")
         check_repo_id(self.repo_id)
-        if self.data_files_mb <= 0 or self.video_files_mb <= 0 or self.files_per_chunk < 1:
-            raise ConfigError("--data-files-mb, --video-files-mb and --files-per-chunk must be above 0.")
-        self.transcode.validate()
+        for name in ("data_files_mb", "video_files_mb"):
+            check_option(name, getattr(self, name), MIN_FILE_MIB, MAX_FILE_MIB, "MiB")
+        check_option("files_per_chunk", self.files_per_chunk, 1, 1_000_000)
+        check_option("transcode_crf", self.transcode_crf, 0, 51 if self.transcode_codec == "h264" else 63)
 
 
 def check_repo_id(repo_id: str) -> None:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import importlib.util
 import os
 import signal
-import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
@@ -23,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, ExportError, describe_error, resource_error
-from demorec.core.processes import SPAWN
+from demorec.core.processes import SPAWN, exit_silently
 from demorec.datasets.episode import ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
@@ -100,7 +99,7 @@ class Verifier:
 
 def _serve(pipe: Connection[Any, Any], cache: str) -> None:
     """Life of the process: load LeRobot, verify what comes through the pipe, answer with a count or an error."""
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(1))  # an orderly end: libraries left semaphores
+    signal.signal(signal.SIGTERM, exit_silently)  # an orderly end: libraries left semaphores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; who exports ends us
     os.environ.update(HF_HUB_OFFLINE="1", HF_DATASETS_OFFLINE="1", HF_DATASETS_CACHE=cache)
     answer: int | DemorecError

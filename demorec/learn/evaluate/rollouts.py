@@ -21,8 +21,16 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, describe_error
-from demorec.core.files import read_json_object, replace_text
+from demorec.core.errors import (
+    ConfigError,
+    DemorecError,
+    GenerationError,
+    MissingDependencyError,
+    describe_error,
+    resource_error,
+    write_error,
+)
+from demorec.core.files import make_folder, read_json_object, replace_text
 from demorec.core.own_versions import differences
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.replacing import (
@@ -332,7 +340,7 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
         evaluation = _with(replace(evaluation, settings=settings), kept)
     for place in (EPISODES, FAILED):
-        (out / place).mkdir(parents=True, exist_ok=True)
+        make_folder(out / place)
     _save(evaluation, out)
     return evaluation
 
@@ -383,4 +391,7 @@ def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[s
 
 
 def _save(evaluation: Evaluation, folder: Path) -> None:
-    replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))
+    try:
+        replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))
+    except OSError as error:
+        raise resource_error(error) or write_error("The evaluation", error, folder, GenerationError) from error

@@ -1,0 +1,61 @@
+"""What a recording says of itself: its line of run.json, and what it was made with."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import NotGeneratedError, RecordingError
+from demorec.core.files import sha256_of
+from demorec.episode.info import NOT_SIMULATED, EpisodeInfo
+from demorec.mcap import open_recording
+from demorec.runs.run_file import Attempt
+
+
+def recorded_line(path: Path) -> tuple[Attempt, EpisodeInfo]:
+    """Read all of a recording: its line of run.json, with the bare name as its `file`, and what is known of it.
+
+    Raises:
+        RecordingError: It is damaged.
+    """
+    with open_recording(path) as recording:
+        info, outcome = recording.info, recording.outcome
+        is_simulated = info.simulation is not None
+        line = Attempt(
+            episode_index=info.episode_index,
+            attempt=info.attempt,
+            seed=info.simulated.root_seed if is_simulated else 0,
+            success=None if outcome is None else outcome.success,
+            file=path.name,
+            sha256=sha256_of(path),
+            digest=recording.digest(),
+            num_frames=recording.num_frames,
+            num_bytes=path.stat().st_size,
+            phase="" if outcome is None else outcome.failure_phase,
+            reason="cut off by a crash" if outcome is None else outcome.failure_reason,
+            instruction="" if is_simulated else info.instruction,
+            drops={} if outcome is None else outcome.drops,
+        )
+        return line, info
+
+
+def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[str, str]]:
+    """Read all of a finished recording: nothing that run.json says of it is taken on trust.
+
+    Returns:
+        The line of run.json that it speaks for, with the bare name as its `file`; the config that it was made with, as
+        plain data; and package -> version of what decided the bits.
+
+    Raises:
+        RecordingError: It is no complete recording of an episode that demorec simulated.
+        NotGeneratedError: It was rendered or replayed, or a policy made it.
+    """
+    attempt, info = recorded_line(path)
+    if info.simulation is None:
+        raise RecordingError(f"{NOT_SIMULATED}: {path}")
+    if info.origin:
+        raise NotGeneratedError(f"The recording is a {info.origin}, which generate-dataset did not make: {path}")
+    if attempt.success is None:
+        raise RecordingError(f"The recording was cut off by a crash: {path}")
+    return attempt, info.simulated.config, info.versions

@@ -1,0 +1,168 @@
+"""Every option of every command, given what it cannot take: exit code 2, before anything is read or written.
+
+The options are found by their types, so that those of a new command are tried as well.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+
+import pytest
+from support.commands import exit_code
+from tyro.conf import Positional
+
+from demorec.cli import COMMANDS, subcommands_of
+from demorec.core.tables import EXPORTERS
+from demorec.core.targets import OptionalTarget, Target
+
+READ_PATHS = {"a", "b", "bags", "calibration", "compare", "config", "dataset", "datasets", "file", "mapping", "path",
+              "paths", "policy", "scores", "sources", "urdf"}  # fmt: skip
+"""Paths that are read; every other one names something new."""
+WITHOUT_REASON = re.compile("Could not (find valid parse for|parse) arguments")
+"""What tyro says of several values."""
+_POSITIONAL = get_args(Positional[int])[1]
+
+
+class Option(NamedTuple):
+    """An option of a command: the words of the command, its name, and its type."""
+
+    command: tuple[str, ...]
+    name: str
+    type: Any
+    is_required: bool
+
+    @property
+    def is_positional(self) -> bool:
+        return _POSITIONAL in get_args(self.type)
+
+    def takes(self, *kinds: object) -> bool:
+        """Whether its values, or those of a pair or list, are of one of these types."""
+        return any(kind in kinds for kind in _parts(self.type))
+
+    @property
+    def is_pair(self) -> bool:
+        """Whether it takes two values."""
+        return any(get_origin(kind) is tuple and Ellipsis not in get_args(kind) for kind in _parts(self.type))
+
+
+def _parts(kind: Any) -> Iterator[Any]:
+    yield kind
+    if get_origin(kind) is not Literal:
+        for part in get_args(kind):
+            yield from _parts(part)
+
+
+def _fields(owner: type) -> Iterator[tuple[str, Any, bool]]:
+    hints = get_type_hints(owner, include_extras=True)
+    for field in dataclasses.fields(owner):
+        kinds = [
+            kind for kind in _parts(hints[field.name]) if isinstance(kind, type) and dataclasses.is_dataclass(kind)
+        ]
+        if kinds:
+            yield from _fields(kinds[0])
+        else:
+            is_required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
+            yield field.name, hints[field.name], is_required
+
+
+def _options() -> Iterator[Option]:
+    for name in COMMANDS.names():
+        command = COMMANDS.load(name)
+        below = subcommands_of(command)
+        found = [((name,), command)] if below is None else [((name, sub), below.load(sub)) for sub in below.names()]
+        for words, owner in found:
+            yield from (Option(words, *field) for field in _fields(owner))
+    for name in EXPORTERS.names():
+        yield from (Option(("export", name), *field) for field in _fields(EXPORTERS.load(name).options))
+
+
+OPTIONS = tuple(_options())
+
+
+def words_with(option: Option, value: list[str]) -> list[str]:
+    """A command line that has a value for this option, and for what its command requires."""
+    words = list(option.command)
+    for other in OPTIONS:
+        if other == option:
+            words += value if option.is_positional else []
+        elif other.is_required and other.command in (option.command, option.command[:1]):
+            words += _example(other, is_named=other.name == "format" and len(option.command) > 1)
+    return words if option.is_positional else [*words, f"--{option.name.replace('_', '-')}", *value]
+
+
+def _example(option: Option, *, is_named: bool) -> list[str]:
+    """A value that the option takes; none if the words of the command are one already."""
+    if option.name == "format":
+        return [] if is_named else ["lerobot"]
+    literals = [get_args(kind)[0] for kind in _parts(option.type) if get_origin(kind) is Literal]
+    return [*([] if option.is_positional else [f"--{option.name}"]), literals[0] if literals else "new.html"]
+
+
+def once(options: list[Option]) -> list[Any]:
+    """One of the options of each name and type, of the command that has the fewest."""
+    counts = {option.command: sum(other.command == option.command for other in OPTIONS) for option in OPTIONS}
+    chosen: dict[tuple[str, str], Option] = {}
+    for option in sorted(options, key=lambda option: counts[option.command]):
+        chosen.setdefault((option.name, str(option.type)), option)
+    return [pytest.param(option, id=f"{' '.join(option.command)} {option.name}") for option in chosen.values()]
+
+
+def refusal(option: Option, value: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """What a command says of the value that it refuses."""
+    assert exit_code(*words_with(option, value)) == 2
+    told = capsys.readouterr()
+    assert told.out == ""
+    return " ".join(word for word in told.err.split() if word.strip("│╭╮╰╯─"))
+
+
+@pytest.mark.parametrize("option", once([option for option in OPTIONS if option.takes(float)]))
+def test_numbers_are_finite(option: Option, capsys: pytest.CaptureFixture[str]) -> None:
+    value = ["0", "nan"] if option.is_pair else ["nan"]
+    assert "nan is not a finite number" in refusal(option, value, capsys)
+
+
+@pytest.mark.parametrize("option", once([option for option in OPTIONS if option.takes(int)]))
+def test_whole_numbers_have_64_bits(option: Option, capsys: pytest.CaptureFixture[str]) -> None:
+    value = ["0", str(10**30)] if option.is_pair else [str(10**30)]
+    told = refusal(option, value, capsys)
+    assert "is not a whole number of 64 bits" in told or WITHOUT_REASON.search(told)
+
+
+@pytest.mark.parametrize("option", once([option for option in OPTIONS if option.takes(str)]))
+@pytest.mark.parametrize("text", ["a\nb", "a\0b", "a\udcff"], ids=["line end", "zero byte", "not UTF-8"])
+def test_texts_are_lines(option: Option, text: str, capsys: pytest.CaptureFixture[str]) -> None:
+    told = refusal(option, [text], capsys)
+    assert "is not one line of text" in told or WITHOUT_REASON.search(told)
+    assert repr(text)[1:-1].replace("\\n", "") in told.replace("\\\\", "\\").replace("\\n", "")
+
+
+TARGETS = [option for option in OPTIONS if {Target, OptionalTarget} & {option.type}]
+
+
+def test_every_path_is_read_or_a_target() -> None:
+    paths = {option.name for option in OPTIONS if option.takes(Path)}
+    assert paths - READ_PATHS == {option.name for option in TARGETS} == {"out", "save", "screenshot"}
+
+
+@pytest.mark.parametrize("option", [pytest.param(o, id=f"{' '.join(o.command)} {o.name}") for o in TARGETS])
+def test_targets_that_cannot_be_made(
+    option: Option, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("years of work")
+    Path("link").symlink_to("nothing")
+    reasons = {
+        "": "One of the paths is empty",
+        "link": "is a link to something that is not there",
+        "x" * 300: "File name too long",
+        "file/below": "Not a directory",
+        "bytes\udcff": "has bytes that are not UTF-8",
+    }
+    for target, reason in reasons.items():
+        assert reason in refusal(option, [target], capsys)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
+    assert Path("file").read_text() == "years of work"
