@@ -129,7 +129,7 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
     if any(not low < high for low, high in source.limits):
         yield f"{place} has limits that are not [lowest, highest]"
     if source.next:
-        yield from _next_problems(mapping, name, source.next)
+        yield from _next_problems(mapping, name, source.next, is_bag=is_bag)
     if bool(source.topic or source.dataset) == bool(source.next):
         what, parts = ("topic", "sources") if is_bag else ("dataset", "parts")
         yield f"{place} needs either a {what} or next in each of its {parts}"
@@ -140,10 +140,10 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
     yield from _age_problems(place, source.max_age_s)
 
 
-def _next_problems(mapping: SourceMapping, name: str, following: str) -> Iterator[str]:
+def _next_problems(mapping: SourceMapping, name: str, following: str, *, is_bag: bool) -> Iterator[str]:
     place, known = f"the feature {name!r}", [other for other in mapping.features if other != name]
-    if len(mapping.features[name]) > 1:
-        yield f"{place} has other sources beside next"
+    if len(mapping.features[name]) > 1 and not is_bag:
+        yield f"{place} has other parts beside next"
     if following not in known and (following in mapping.features or following != STATE):  # whose lack is said already
         yield f"{place} follows {following!r}, which is no feature.{nearest_match(following, known)}".rstrip(".")
     elif any(other.next for other in mapping.features.get(following, ())):

@@ -125,11 +125,11 @@ class Timelines:
             raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
 
     def sources(self, feature: str) -> list[Timeline]:
-        """The timelines of a feature's sources; of one that is another's next row, that one's."""
-        sources = self.mapping.features[feature]
-        if sources[0].next:
-            return self.sources(sources[0].next)
-        return [self.lines[feature, index] for index in range(len(sources))]
+        """The timelines of a feature's sources; for a source that is another feature's next row, those of that one."""
+        found: list[Timeline] = []
+        for index, source in enumerate(self.mapping.features[feature]):
+            found += self.sources(source.next) if source.next else [self.lines[feature, index]]
+        return found
 
     def rows(self, window: Window) -> EpisodeRows:
         """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
@@ -142,15 +142,9 @@ class Timelines:
             if problems := [text for key, rows in chosen.items() if (text := judge(self.lines[key], rows, times))]:
                 raise NoRowsError("; ".join(problems))
         mapped = self.mapping.features
-        taken = {name: self._feature(name, chosen) for name, sources in mapped.items() if not sources[0].next}
-        count = len(times) - any(sources[0].next for sources in mapped.values())
-        features = {}
-        for name, sources in mapped.items():
-            feature, later = taken[sources[0].next or name], 1 if sources[0].next else 0
-            part = slice(later, later + count)
-            # The age of what a feature is next counts from the row that has it, and so is below 0.
-            ages = feature.ages_ns[part] - (times[part] - times[:count])
-            features[name] = FeatureRows(values=feature.values[part], ages_ns=ages)
+        has_next = any(source.next for sources in mapped.values() for source in sources)
+        count = len(times) - has_next
+        features = {name: self._feature(name, chosen, times, count) for name in mapped}
         return EpisodeRows(
             window=window,
             times_ns=times[:count],
@@ -160,12 +154,21 @@ class Timelines:
             follows=follows,
         )
 
-    def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples]) -> FeatureRows:
-        rows = [(line, chosen[name, index]) for index, line in enumerate(self.sources(name))]
-        return FeatureRows(
-            values=np.concatenate([line.sampled(of_line) for line, of_line in rows], axis=1),
-            ages_ns=np.max(np.stack([of_line.age_ns for _, of_line in rows]), axis=0),
-        )
+    def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> FeatureRows:
+        """The first `count` rows of a feature; a source that is a feature's next row is taken one row later."""
+        values, ages = [], []
+        for index, source in enumerate(self.mapping.features[name]):
+            later = 1 if source.next else 0
+            part = slice(later, later + count)
+            keys = self._keys(source.next) if source.next else [(name, index)]
+            for key in keys:
+                values.append(self.lines[key].sampled(chosen[key])[part])
+                # The age of a next row counts from the row that has it, and so is below 0.
+                ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
+        return FeatureRows(values=np.concatenate(values, axis=1), ages_ns=np.max(np.stack(ages), axis=0))
+
+    def _keys(self, feature: str) -> list[Key]:
+        return [(feature, index) for index in range(len(self.mapping.features[feature]))]
 
     def _extent(self, window: Window) -> tuple[int, int]:
         """From where on and until when all streams have something, within a window."""

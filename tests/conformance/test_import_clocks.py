@@ -269,3 +269,23 @@ def test_numbers_slower_than_rows_are_a_note(imports: Imports) -> None:
     _, told, _ = imports(notes, _with_gripper(stamp="log", max_age_s="XX").replace('"XX"', "0.3"))
     (line,) = [line for line in told.splitlines() if "comes 10.0 times a second, rows 30 times" in line]
     assert line.startswith("  note: ")
+
+
+def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp_path: Path) -> None:
+    """Joints take the next state, the gripper the last command of its own topic, row by row."""
+    notes = real(3.0)
+    mapping = MAPPING.replace('[[features.action]]\ntopic = "/joint_command"\nfield = "position"\n', "")
+    mapping += '[[features.action]]\nnext = "observation.state"\n'
+    mapping += f'[[features.action]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\nstamp = "log"\n'
+    code, told, error = imports(notes, mapping)
+    assert code == 0, told + error
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        table, info = recording.table(), recording.info
+    (action,) = [feature for feature in info.features if feature.name == "action"]
+    assert len(action.names) == 3
+    state = table.features["observation.state"]
+    grippers = [note for note in notes if note.topic == GRIPPER]
+    for row, values in enumerate(table.features["action"][:-1]):
+        time_ns = int(table.time_ns[row])
+        gripper = max((note for note in grippers if note.log_ns <= time_ns), key=lambda note: note.log_ns)
+        assert values.tolist() == [*state[row + 1].tolist(), *gripper.body["data"].tolist()]
