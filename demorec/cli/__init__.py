@@ -18,7 +18,7 @@ from typing import Protocol
 
 from demorec.cli.shared.flags import parse, terminal_width
 from demorec.cli.shared.output import PrintableFormatter, say, tell
-from demorec.core.errors import DemorecError, OptionError, resource_error
+from demorec.core.errors import DemorecError, MissingDependencyError, OptionError, resource_error
 from demorec.core.registry import Registry, nearest_match
 
 
@@ -127,12 +127,30 @@ def _reported(prog: str, run: Callable[[], int]) -> int:
     except BrokenPipeError:  # the reader of the answer has left and wants no more words
         return 1
     except Exception as error:
-        lack = resource_error(error)  # memory and files may run out in any line
+        lack = resource_error(error) or _missing_package(error)  # memory and files may run out in any line
         if lack is None:
             tell(f"{prog}: unexpected {type(error).__name__}, please report it with this file: {_keep_traceback()}")
             return 1
         tell(f"{prog}: {lack}")
         return lack.exit_code
+
+
+_DISTRIBUTIONS = {
+    "rerun": "rerun-sdk",
+    "PIL": "pillow",
+    "ruamel": "ruamel-yaml",
+    "fast_simplification": "fast-simplification",
+}
+"""Imported name -> name to install, where the two differ."""
+
+
+def _missing_package(error: Exception) -> DemorecError | None:
+    """Return the sentence for an import of a package that is not installed; None for any other error."""
+    if not isinstance(error, ModuleNotFoundError) or not error.name or error.name.startswith("demorec"):
+        return None
+    name = error.name.partition(".")[0]
+    package = _DISTRIBUTIONS.get(name, name)
+    return MissingDependencyError("This command", package, f"pip install {package}")
 
 
 def _shortened(text: str) -> str:

@@ -89,3 +89,21 @@ for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == 0, done.stderr[-2000:]
     assert "evaluate" in COMMANDS.names()
+
+
+@pytest.mark.parametrize(
+    ("module", "package", "command"),
+    [
+        ("rerun", "rerun-sdk", "view RUN --save NEW.rrd"),
+        ("h5py", "h5py", "export hdf5 RUN --out NEW.hdf5"),
+    ],
+)
+def test_a_package_that_is_missing_is_named_with_what_installs_it(
+    module: str, package: str, command: str, run: Path, tmp_path: Path
+) -> None:
+    blocked = f"import sys; sys.modules[{module!r}] = None; from demorec.cli import main; main(sys.argv[1:])"
+    words = [word.replace("RUN", str(run)).replace("NEW", str(tmp_path / "new")) for word in command.split()]
+    ended = subprocess.run([sys.executable, "-c", blocked, *words], capture_output=True, text=True, check=False)
+    assert ended.returncode == MissingDependencyError("", "", "").exit_code
+    sentence = f"This command needs the package {package!r}, which is not installed: pip install {package}."
+    assert ended.stderr == f"demorec {words[0]}: {sentence}\n"
