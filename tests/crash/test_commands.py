@@ -28,6 +28,8 @@ from demorec.core.limited import VARIABLE
 
 KILLS = 8
 MINE = "years of work"
+SLOW = (pytest.mark.slow,)
+LONG = (pytest.mark.slow, pytest.mark.long)
 
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 
@@ -43,7 +45,8 @@ class Row:
         resumes: Whether an interrupted command leaves finished targets, among which it goes on.
         surprise: A target that somebody else makes while the command runs.
         keeps: Whether the result is kept under another name then.
-        marks: Of the tests: "slow" or "long" for what is more of the same.
+        flag: Lets the command replace what is there.
+        runs: When the tests run.
     """
 
     call: str
@@ -52,7 +55,8 @@ class Row:
     resumes: bool = False
     surprise: str = ""
     keeps: bool = True
-    marks: tuple[str, ...] = ()
+    flag: str = "--overwrite"
+    runs: tuple[pytest.MarkDecorator, ...] = ()
 
     @property
     def surprising(self) -> str:
@@ -60,35 +64,10 @@ class Row:
 
 
 ROWS = {
-    "report": Row(
-        call="report SOURCES/dataset --no-checks --out new.html",
-        targets=("new.html",),
-        old="report SOURCES/run --no-checks --out new.html",
-        marks=("slow",),
-    ),
     "score": Row(
         call="dataset score SOURCES/dataset --out new.json",
         targets=("new.json",),
         old="dataset score SOURCES/other --out new.json",
-    ),
-    "view": Row(
-        call="view SOURCES/run --episodes 0 --save new.rrd",
-        targets=("new.rrd",),
-        old="view SOURCES/run --episodes 1 --save new.rrd",
-        marks=("slow", "long"),
-    ),
-    "view several": Row(
-        call="view SOURCES/run --save new.rrd",
-        targets=("new-0000.rrd", "new-0001.rrd", "new-0002.rrd"),
-        old="view SOURCES/reversed --save new.rrd",
-        surprise="new-0001.rrd",
-        marks=("slow",),
-    ),
-    "edit": Row(
-        call="dataset select SOURCES/dataset --episodes 0:2 --out new",
-        targets=("new",),
-        old="dataset select SOURCES/dataset --episodes 2 --out new",
-        marks=("slow",),
     ),
     "split": Row(
         call="dataset split SOURCES/dataset --shares train=0.7 val=0.3 --seed 1 --out new",
@@ -96,22 +75,12 @@ ROWS = {
         old="dataset split SOURCES/dataset --shares train=0.3 val=0.7 --seed 0 --out new",
         surprise="new/val",
     ),
-    "merge": Row(
-        call="dataset merge SOURCES/dataset SOURCES/other --out new",
-        targets=("new",),
-        old="dataset select SOURCES/dataset --episodes 2 --out new",
-        marks=("slow", "long"),
-    ),
-    "export lerobot": Row(
-        call="export lerobot SOURCES/run --no-verify --out new",
-        targets=("new",),
-        old="export lerobot SOURCES/run --episodes 1 --no-verify --out new",
-        marks=("slow",),
-    ),
-    "export hdf5": Row(
-        call="export hdf5 SOURCES/run --out new.hdf5",
-        targets=("new.hdf5",),
-        old="export hdf5 SOURCES/run --episodes 1 --out new.hdf5",
+    "view several": Row(
+        call="view SOURCES/run --save new.rrd",
+        targets=("new-0000.rrd", "new-0001.rrd", "new-0002.rrd"),
+        old="view SOURCES/reversed --save new.rrd",
+        surprise="new-0001.rrd",
+        runs=SLOW,
     ),
     "import": Row(
         call="import lerobot SOURCES/dataset --out new",
@@ -119,41 +88,89 @@ ROWS = {
         surprise="new/episodes/episode_000001.mcap",
         resumes=True,
         keeps=False,
+        runs=SLOW,
+    ),
+    "export lerobot": Row(
+        call="export lerobot SOURCES/run --no-verify --out new",
+        targets=("new",),
+        old="export lerobot SOURCES/run --episodes 1 --no-verify --out new",
+        runs=SLOW,
+    ),
+    "export hdf5": Row(
+        call="export hdf5 SOURCES/run --out new.hdf5",
+        targets=("new.hdf5",),
+        old="export hdf5 SOURCES/run --episodes 1 --out new.hdf5",
+        runs=SLOW,
     ),
     "recover": Row(
         call="recover SOURCES/cut.mcap --out new.mcap",
         targets=("new.mcap",),
         old="recover SOURCES/other_cut.mcap --out new.mcap",
-        marks=("slow",),
+        runs=SLOW,
+    ),
+    "append": Row(
+        call="export lerobot SOURCES/run --episodes 1: --no-verify --out new",
+        targets=("new",),
+        old="export lerobot SOURCES/run --episodes 0 --no-verify --out new",
+        flag="--append",
+        runs=LONG,
+    ),
+    "export lerobot with processes": Row(
+        call="export lerobot SOURCES/run --no-verify --workers 2 --out new",
+        targets=("new",),
+        old="export lerobot SOURCES/run --episodes 1 --no-verify --out new",
+        runs=LONG,
+    ),
+    "edit": Row(
+        call="dataset select SOURCES/dataset --episodes 0:2 --out new",
+        targets=("new",),
+        old="dataset select SOURCES/dataset --episodes 2 --out new",
+        runs=LONG,
+    ),
+    "merge": Row(
+        call="dataset merge SOURCES/dataset SOURCES/other --out new",
+        targets=("new",),
+        old="dataset select SOURCES/dataset --episodes 2 --out new",
+        runs=LONG,
+    ),
+    "report": Row(
+        call="report SOURCES/dataset --no-checks --out new.html",
+        targets=("new.html",),
+        old="report SOURCES/run --no-checks --out new.html",
+        runs=LONG,
+    ),
+    "view": Row(
+        call="view SOURCES/run --episodes 0 --save new.rrd",
+        targets=("new.rrd",),
+        old="view SOURCES/run --episodes 1 --save new.rrd",
+        runs=LONG,
     ),
     "replay": Row(
         call="replay SOURCES/e.mcap --out new",
         targets=("new/*.mcap",),
         surprise="new/e.mcap",
         resumes=True,
-        marks=("slow",),
+        runs=LONG,
     ),
     "render": Row(
         call="render SOURCES/e.mcap --cameras front --workers 1 --out new.mcap",
         targets=("new.mcap",),
         old="recover SOURCES/other_cut.mcap --out new.mcap",
         resumes=True,
-        marks=("slow",),
+        runs=LONG,
     ),
     "generate": Row(
         call="generate --num-episodes 2 --cameras none --workers 1 --no-export --no-check --out new",
         targets=("new/episodes/*.mcap",),
+        surprise="new/notes.txt",
         resumes=True,
         keeps=False,
-        marks=("slow", "long"),
+        runs=LONG,
     ),
 }
-NAMES = [pytest.param(name, marks=[getattr(pytest.mark, mark) for mark in row.marks]) for name, row in ROWS.items()]
-REPLACING = [
-    pytest.param(name, marks=[getattr(pytest.mark, mark) for mark in row.marks])
-    for name, row in ROWS.items()
-    if row.old
-]
+"""All commands that write, but for evaluate and correct, which need a policy, and screenshots, which need a viewer."""
+NAMES = [pytest.param(name, marks=row.runs) for name, row in ROWS.items()]
+REPLACING = [pytest.param(name, marks=row.runs or SLOW) for name, row in ROWS.items() if row.old]
 
 
 @pytest.fixture(scope="module")
@@ -184,7 +201,7 @@ class Case:
 
     def __init__(self, name: str, sources: Path, folder: Path, *, replaces: bool) -> None:
         self.row, self.folder, self._sources = ROWS[name], folder / "work", sources
-        self.words = self._words(self.row.call) + ["--overwrite"] * replaces
+        self.words = self._words(self.row.call) + [self.row.flag] * replaces
         self._replaces = replaces
         self.start_anew()
         self.before, self.all_before = self.state(), self.everything()
@@ -352,10 +369,7 @@ def test_a_second_interrupt_during_the_clean_up(name: str, sources: Path, tmp_pa
         case.check_again(moment)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "name", [name if name == "split" else pytest.param(name, marks=pytest.mark.long) for name in ROWS]
-)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW if name == "split" else LONG) for name in ROWS])
 def test_closed_streams(name: str, sources: Path, tmp_path: Path) -> None:
     """Nobody hears the answer, and nothing is half made."""
     case = Case(name, sources, tmp_path, replaces=False)
