@@ -57,13 +57,16 @@ def test_what_appears_meanwhile_stays_and_the_result_is_kept(
         with atomic_write(target, kind) as part:
             fill(part, kind, "old")
     kept = tmp_path / ("x.txt.1" if kind.is_folder else "x.1.txt")
-    with (
-        pytest.raises(ConfigError, match=rf"stays as it is \(.*x\.txt.*kept as {kept}"),
-        atomic_write(target, kind, overwrite=replaces) as part,
-    ):
-        fill(part, kind, "result")
-        target.mkdir(exist_ok=True) if kind.is_folder else None
-        fill(target, kind, "mine, and longer")
+
+    def write_and_disturb() -> None:
+        with atomic_write(target, kind, overwrite=replaces) as part:
+            fill(part, kind, "result")
+            if kind.is_folder:
+                target.mkdir(exist_ok=True)
+            fill(target, kind, "mine, and longer")
+
+    with pytest.raises(ConfigError, match=rf"stays as it is \(.*x\.txt.*kept as {kept}"):
+        write_and_disturb()
     assert text_of(target) == "mine, and longer"
     assert text_of(kept) == "result"
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["x.txt", kept.name])
@@ -77,20 +80,26 @@ def test_several_appear_together_or_none(tmp_path: Path, kind: ReplaceableKind) 
             fill(part, kind, "old")
         assert not any(target.exists() for target in targets)
     before = content_of(tmp_path)
-    with (
-        pytest.raises(ConfigError, match=r"stays as it is \(.*b"),
-        atomic_write_all(targets, kind, overwrite=True) as parts,
-    ):
-        for part in parts:
-            fill(part, kind, "new")
-        fill(targets[1], kind, "mine, and longer")
+
+    def write_and_disturb() -> None:
+        with atomic_write_all(targets, kind, overwrite=True) as parts:
+            for part in parts:
+                fill(part, kind, "new")
+            fill(targets[1], kind, "mine, and longer")
+
+    with pytest.raises(ConfigError, match=r"stays as it is \(.*b"):
+        write_and_disturb()
     mine = {name: b"mine, and longer" for name in before if name.startswith("b")}
     kept = {f"{name[0]}.1{name[1:]}": b"new" for name in before}
     assert content_of(tmp_path) == before | mine | kept
 
 
 def test_an_error_leaves_nothing_not_even_new_parents(tmp_path: Path) -> None:
-    with pytest.raises(ZeroDivisionError), atomic_write(tmp_path / "deep" / "er" / "x.txt", FILE) as part:
-        part.write_text("half")
-        raise ZeroDivisionError
+    def fail() -> None:
+        with atomic_write(tmp_path / "deep" / "er" / "x.txt", FILE) as part:
+            part.write_text("half")
+            raise ZeroDivisionError
+
+    with pytest.raises(ZeroDivisionError):
+        fail()
     assert list(tmp_path.iterdir()) == []
