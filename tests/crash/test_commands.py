@@ -76,9 +76,9 @@ ROWS = {
         surprise="new/val",
     ),
     "view several": Row(
-        call="view SOURCES/run --save new.rrd",
-        targets=("new-0000.rrd", "new-0001.rrd", "new-0002.rrd"),
-        old="view SOURCES/reversed --save new.rrd",
+        call="view SOURCES/run --episodes 0:2 --save new.rrd",
+        targets=("new-0000.rrd", "new-0001.rrd"),
+        old="view SOURCES/reversed --episodes 0:2 --save new.rrd",
         surprise="new-0001.rrd",
         runs=SLOW,
     ),
@@ -170,6 +170,8 @@ ROWS = {
 }
 """All commands that write, but for evaluate and correct, which need a policy, and screenshots, which need a viewer."""
 NAMES = [pytest.param(name, marks=row.runs) for name, row in ROWS.items()]
+KILLED = [pytest.param(name, marks=LONG if row.runs and row.old else row.runs) for name, row in ROWS.items()]
+"""Replacing is killed, too, which is more."""
 REPLACING = [pytest.param(name, marks=row.runs or SLOW) for name, row in ROWS.items() if row.old]
 
 
@@ -203,8 +205,8 @@ class Case:
         self.row, self.folder, self._sources = ROWS[name], folder / "work", sources
         self.words = self._words(self.row.call) + [self.row.flag] * replaces
         self._replaces = replaces
-        self._start = folder / "start"
-        self._start.mkdir(exist_ok=True)
+        self._start = folder / f"start_{replaces}"
+        self._start.mkdir()
         if replaces:
             assert run_command(self._words(self.row.old), self._start).code == 0
         self.start_anew()
@@ -280,7 +282,7 @@ def killed(case: Case) -> None:
     assert left_something
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", KILLED)
 def test_killed_at_eight_moments(name: str, sources: Path, tmp_path: Path) -> None:
     killed(Case(name, sources, tmp_path, replaces=False))
 
