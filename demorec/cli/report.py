@@ -11,8 +11,9 @@ from tyro.conf import Positional, arg
 from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
+from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.replacing import REPORT, check_replaceable
+from demorec.core.replacing import REPORT
 from demorec.core.targets import Target
 from demorec.runs.find import EPISODE_FOLDERS, expect
 from demorec.sources.formats import IMPORTED
@@ -57,18 +58,15 @@ class ReportCommand:
         expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
-        check_replaceable(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path]))
         refuse_inside([self.out])
         from demorec.check.report import CheckOptions
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
         checks = CheckOptions(images=self.images) if self.checks else None
-        with (
-            reading([self.path], self.mapping) as (path,),
-            ProgressBar("reading", unit="item") as bar,
-        ):
-            report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
-        size = write_page(report, self.out)
+        with atomic_write(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path])) as part:
+            with reading([self.path], self.mapping) as (path,), ProgressBar("reading", unit="item") as bar:
+                report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
+            size = write_page(report, part)
         say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
         return 0

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -21,6 +22,7 @@ from demorec.cli.shared.paths import (
     tell_incomplete,
     tell_unfinished,
 )
+from demorec.core.atomic import atomic_write, atomic_write_all
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
 from demorec.core.targets import OptionalTarget
@@ -88,7 +90,7 @@ class View:
             return replace(self, paths=paths)._view()
 
     def _view(self) -> int:
-        from demorec.view.save import numbered, save, save_comparison, save_each
+        from demorec.view.save import numbered, save_comparison, save_each
         from demorec.view.sources import find_episodes, select
         from demorec.view.viewer import need_screen
 
@@ -107,25 +109,43 @@ class View:
             sources = sources[:_MOST]
         targets = [] if self.save is None else numbered(self.save, 1 if self.compare else len(sources))
         self._check_targets(targets)
-
-        if self.save is not None:
-            if self.compare:
-                save_comparison(sources[0], sources[1], self.save)
-                say(f"{size_in_words(self.save.stat().st_size)}: {self.save}")
-            else:
-                for source, target in zip(sources, targets, strict=True):
-                    save(source, target)
-                    of = f" ({source.name})" if len(targets) > 1 else ""
-                    say(f"{size_in_words(target.stat().st_size)}: {target}{of}")
+        if targets:
+            self._save(sources, targets)
             if self.screenshot is None:
                 return 0
-        with tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
+        with self._image() as image, tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
             if self.compare:
                 files = [Path(folder) / "comparison.rrd"]
                 save_comparison(sources[0], sources[1], files[0])
             else:
                 files = save_each(sources, Path(folder))
-            return self._show(files, sources)
+            return self._show(files, sources, image)
+
+    def _save(self, sources: Sequence[PlaybackSource], targets: Sequence[Path]) -> None:
+        """Write all .rrd files, none of which appears before all are complete."""
+        from demorec.view.save import save, save_comparison
+
+        read = places_read(self.paths)
+        with atomic_write_all(targets, RERUN_FILE, overwrite=self.overwrite, sources=read) as parts:
+            if self.compare:
+                save_comparison(sources[0], sources[1], parts[0])
+            else:
+                for source, part in zip(sources, parts, strict=True):
+                    save(source, part)
+        for source, target in zip(sources, targets, strict=False):
+            of = f" ({source.name})" if len(targets) > 1 else ""
+            say(f"{size_in_words(target.stat().st_size)}: {target}{of}")
+
+    @contextmanager
+    def _image(self) -> Iterator[Path | None]:
+        """Give the path for the screenshot, which appears at the end; None if none is asked for."""
+        if self.screenshot is None:
+            yield None
+            return
+        read = places_read(self.paths)
+        with atomic_write(self.screenshot, IMAGE, overwrite=self.overwrite, sources=read) as part:
+            yield part
+        say(f"{self.size[0]}x{self.size[1]}: {self.screenshot}")
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
@@ -162,12 +182,11 @@ class View:
                 raise ConfigError(f"{flag}: there is no folder {target.parent}.")
 
     def _check_targets(self, saved: Sequence[Path]) -> None:
-        """Refuse to replace anything but an .rrd file by --save and an image by --screenshot, before any work."""
-        kinds = [(target, RERUN_FILE) for target in saved]
-        kinds += [] if self.screenshot is None else [(self.screenshot, IMAGE)]
-        for target, kind in kinds:
-            check_replaceable(target, kind, overwrite=self.overwrite, sources=places_read(self.paths))
-        refuse_inside(target for target, _ in kinds)
+        """Refuse impossible targets before any work; those of --save are looked at when they are opened."""
+        if self.screenshot is not None:
+            read = places_read(self.paths)
+            check_replaceable(self.screenshot, IMAGE, overwrite=self.overwrite, sources=read)
+        refuse_inside([*saved, *([] if self.screenshot is None else [self.screenshot])])
 
     def _show_rrd(self) -> int:
         others = [path for path in self.paths if path.suffix != ".rrd"]
@@ -178,15 +197,15 @@ class View:
         for path in self.paths:
             expect(path, "rrd")
         self._check_targets(())
-        return self._show(self.paths, ())
+        with self._image() as image:
+            return self._show(self.paths, (), image)
 
-    def _show(self, files: Sequence[Path], sources: Sequence[PlaybackSource]) -> int:
-        if self.screenshot is not None:
+    def _show(self, files: Sequence[Path], sources: Sequence[PlaybackSource], image: Path | None) -> int:
+        if image is not None:
             from demorec.view.viewer import screenshot
 
             width, height = self.size
-            screenshot(files, self.screenshot, seconds=self._second(sources), width=width, height=height)
-            say(f"{width}x{height}: {self.screenshot}")
+            screenshot(files, image, seconds=self._second(sources), width=width, height=height)
             return 0
         if self.web:
             from demorec.view.viewer import serve_web

@@ -10,6 +10,8 @@ from pathlib import Path
 
 import platformdirs
 
+from demorec.core.files import open_locked
+
 
 def cache_folder(*parts: str) -> Path:
     """A folder below the user's cache folder, created when missing; `DEMOREC_CACHE` moves it elsewhere."""
@@ -42,16 +44,12 @@ def folder_lock(folder: Path) -> Iterator[None]:
 
     A folder that cannot be written to is not locked: nothing will be kept in it.
     """
-    import fcntl
-
     try:
-        file = (folder / "lock").open("a")
+        descriptor = open_locked(folder / "lock", waits=True)
     except OSError:
         yield
         return
-    with file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        try:
-            yield
-        finally:
-            fcntl.flock(file, fcntl.LOCK_UN)
+    try:
+        yield
+    finally:
+        os.close(descriptor)

@@ -160,10 +160,14 @@ class Closing(ABC):
 LOCK_NAME = ".lock"
 
 
-def open_locked(path: Path) -> int:
+def open_locked(path: Path, *, waits: bool = False) -> int:
     """Open a file for writing, made if it is not there, locked until the descriptor is closed or the process dies.
 
     Neither a FIFO is waited for nor a link followed, since what is opened is written to.
+
+    Args:
+        path: The file.
+        waits: Whether to wait for another process that holds the lock.
 
     Raises:
         BlockingIOError: Another process holds the lock.
@@ -174,7 +178,7 @@ def open_locked(path: Path) -> int:
     flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOFOLLOW
     descriptor = os.open(path, flags, 0o666)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        fcntl.flock(descriptor, fcntl.LOCK_EX if waits else fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BaseException:
         os.close(descriptor)
         raise

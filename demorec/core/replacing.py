@@ -2,8 +2,8 @@
 
 Only what a command recognises, by its content, as the kind of thing that it makes is replaced, and only when the user
 asks for it. Never a source of the same command, never a folder that a person lives or works in, never a folder with
-anything foreign in it. What is replaced stays whole until what takes its place is whole: a file is renamed over, a
-folder is moved aside first and deleted last.
+anything foreign in it. What is replaced stays whole until what takes its place is whole (`demorec.core.atomic`); the
+parts of a run are moved aside first and deleted last.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError
-from demorec.core.files import MAX_JSON_BYTES, MCAP_MAGIC, RERUN_MAGICS, open_locked, read_json_limited
+from demorec.core.files import MAX_JSON_BYTES, MCAP_MAGIC, RERUN_MAGICS, read_json_limited
 
 _SHOWN = 5
 """How many foreign files a refusal names."""
@@ -244,56 +244,3 @@ def _put_back(folder: Path, names: Sequence[str]) -> None:
             (aside / name).rename(folder / name)
     (aside / _MARK).unlink(missing_ok=True)
     aside.rmdir()
-
-
-def lock_part(part: Path, kind: ReplaceableKind) -> int:
-    """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
-
-    What a dead process left there stays as it is; the caller decides about it.
-
-    Raises:
-        ConfigError: Another process is writing it, or it is none of ours.
-        OSError: It cannot be written.
-    """
-    while True:
-        if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
-            raise ConfigError(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
-        try:
-            handle = open_locked(part)
-        except BlockingIOError as error:
-            raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
-        try:
-            # The owner before us may have given the file its final name between the two calls.
-            if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
-                os.close(handle)
-                continue
-            if os.fstat(handle).st_size and not kind.recognises(part):
-                raise ConfigError(f"This is not the unfinished beginning of {kind.name}, move it elsewhere: {part}")
-            return handle
-        except BaseException:
-            os.close(handle)
-            raise
-
-
-@contextmanager
-def written_whole(target: Path, kind: ReplaceableKind) -> Iterator[Path]:
-    """Give the name of a file beside `target`, which takes its place in one step when the block ends without an error.
-
-    A leftover of a killed process is written over; an error removes the unfinished file.
-
-    Raises:
-        ConfigError: Another process is writing it.
-        OSError: The file cannot be written.
-    """
-    part = target.with_name(f".{target.name}.demorec-part")
-    handle = lock_part(part, kind)
-    try:
-        os.ftruncate(handle, 0)
-        yield part
-        os.fsync(handle)
-        part.replace(target)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
-    finally:
-        os.close(handle)

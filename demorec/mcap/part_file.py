@@ -12,9 +12,10 @@ import foxglove
 from foxglove.mcap import MCAPCompression, MCAPWriteOptions
 from foxglove.messages import CompressedVideo
 
+from demorec.core.atomic import snapshot, take_name
 from demorec.core.errors import ConfigError, RecordingError, describe_error, write_error
-from demorec.core.files import sync_path
-from demorec.core.replacing import RECORDING, check_replaceable, lock_part
+from demorec.core.files import open_locked, sync_path
+from demorec.core.replacing import RECORDING, check_replaceable
 from demorec.mcap import messages
 from demorec.mcap.ros2 import DEFINITIONS
 
@@ -92,11 +93,12 @@ class PartFile:
         overwrite: bool = False,
         is_worthless: Callable[[Path], bool] = lambda part: False,
     ) -> None:
-        self.path, self.part, self._overwrite = path, part or path.with_name(f"{path.name}.part"), overwrite
+        self.path, self.part = path, part or path.with_name(f"{path.name}.part")
         check_replaceable(path, RECORDING, overwrite=overwrite)
+        self._before = snapshot(path)
         try:
             # Held until the file has its name or is left: no other process takes it for what a dead one left.
-            self._lock: int | None = lock_part(self.part, RECORDING)
+            self._lock: int | None = _lock_part(self.part)
             try:
                 if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
                     raise ConfigError(
@@ -205,15 +207,57 @@ class PartFile:
         """End the file and give it its name.
 
         Raises:
-            ConfigError: A file of that name has appeared meanwhile.
+            ConfigError: A file of that name has appeared meanwhile, or another one than is to be replaced.
             RecordingError: The disk is full.
         """
         try:
             self.end()
-            check_replaceable(self.path, RECORDING, overwrite=self._overwrite)
-            self.part.replace(self.path)
+            if self._before and snapshot(self.path) == self._before:
+                self.part.replace(self.path)
+            else:
+                take_name(self.part, self.path)
             sync_path(self.path.parent)
+        except FileExistsError as error:
+            raise ConfigError(
+                f"Another file has appeared while this recording was made, and stays as it is ({self.path}); the "
+                f"recording is kept as {self.part}"
+            ) from error
         except OSError as error:
             raise self._unwritable(error) from error
         finally:
             self.close()
+
+
+def _lock_part(part: Path) -> int:
+    """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
+
+    What a dead process left there stays as it is; the caller decides about it.
+
+    Raises:
+        ConfigError: Another process is writing it, or it is none of ours.
+        OSError: It cannot be written.
+    """
+    while True:
+        if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
+            raise ConfigError(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
+        try:
+            handle = open_locked(part)
+        except BlockingIOError as error:
+            raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
+        try:
+            # The owner before us may have given the file its final name between the two calls.
+            if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
+                os.close(handle)
+                continue
+            if os.fstat(handle).st_nlink > 1:  # a kill came while it got its final name
+                part.unlink()
+                os.close(handle)
+                continue
+            if os.fstat(handle).st_size and not RECORDING.recognises(part):
+                raise ConfigError(
+                    f"This is not the unfinished beginning of {RECORDING.name}, move it elsewhere: {part}"
+                )
+            return handle
+        except BaseException:
+            os.close(handle)
+            raise

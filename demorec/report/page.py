@@ -21,8 +21,7 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from demorec.check.base import Result
-from demorec.core.errors import DemorecError, write_error
-from demorec.core.replacing import REPORT, REPORT_MARK, written_whole
+from demorec.core.replacing import REPORT_MARK
 from demorec.core.text import printable
 from demorec.episode.features import ACTION, STATE
 from demorec.report import charts
@@ -43,16 +42,8 @@ _GOOD = ("success at the first try", "success after a retry")
 
 
 def write_page(report: Report, path: Path) -> int:
-    """Write the page beside its place, then put it there; return its size in bytes.
-
-    Raises:
-        DemorecError: The file cannot be written; what was there before is still there.
-    """
-    try:
-        with written_whole(path, REPORT) as part:
-            _stream(report).dump(str(part), encoding="utf-8")
-    except OSError as error:
-        raise write_error("The report", error, path, DemorecError) from error
+    """Write the page to a new file; return its size in bytes. Raises OSError if it cannot be written."""
+    _stream(report).dump(str(path), encoding="utf-8")
     return path.stat().st_size
 
 

@@ -9,20 +9,19 @@ from pathlib import Path
 import rerun as rr
 
 from demorec.core.errors import RecordingError, write_error
-from demorec.core.replacing import RERUN_FILE, written_whole
 from demorec.view.layout import comparison_layout, episode_layout
 from demorec.view.scene import log_comparison, log_episode, new_comparison, new_recording
 from demorec.view.sources import PlaybackSource
 
 
 def save(source: PlaybackSource, target: Path) -> None:
-    """An episode into an .rrd file, which appears when it is complete.
+    """Write an episode to an .rrd file.
 
     Raises:
-        DemorecError: The episode cannot be read, or the file cannot be written.
+        DemorecError: The episode cannot be read.
+        OSError: The file cannot be written.
     """
-    with _refusals_reported(target), written_whole(target, RERUN_FILE) as part:
-        _save_episode(source, part, is_alone=True)
+    _save_episode(source, target, is_alone=True)
 
 
 def numbered(target: Path, count: int) -> list[Path]:
@@ -36,32 +35,25 @@ def numbered(target: Path, count: int) -> list[Path]:
 
 
 def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
-    """Each episode into an .rrd file of its own.
+    """Write each episode to an .rrd file of its own.
 
     Raises:
         DemorecError: An episode cannot be read, or a file cannot be written.
     """
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
-        with _refusals_reported(file):
+        try:
             _save_episode(source, file, is_alone=len(sources) == 1)
+        except OSError as error:
+            raise write_error("The file", error, file, RecordingError) from error
     return files
 
 
 def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
-    """Two episodes over each other into one .rrd file.
-
-    Raises:
-        DemorecError: As `save`; ConfigError when they cannot be compared.
-    """
-    with (
-        _refusals_reported(target),
-        written_whole(target, RERUN_FILE) as part,
-        a.open() as first,
-        b.open() as second,
-    ):
+    """Write two episodes over each other to one .rrd file; raises as `save`, ConfigError if they cannot be compared."""
+    with a.open() as first, b.open() as second:
         recording = new_comparison(first, second)
-        with _saving(recording, part, comparison_layout(first, second)):
+        with _saving(recording, target, comparison_layout(first, second)):
             log_comparison(recording, first, second)
 
 
@@ -88,11 +80,3 @@ def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Bl
         recording.disconnect()
     assert data is not None  # there is a layout, at least
     target.write_bytes(data)
-
-
-@contextmanager
-def _refusals_reported(target: Path) -> Iterator[None]:
-    try:
-        yield
-    except OSError as error:
-        raise write_error("The file", error, target, RecordingError) from error

@@ -16,9 +16,8 @@ from urllib.request import urlopen
 
 from rerun.experimental import ViewerClient
 
-from demorec.core.errors import ConfigError, DemorecError, RecordingError, write_error
+from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.processes import start_program
-from demorec.core.replacing import IMAGE, written_whole
 from demorec.view.paths import SECONDS
 from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
 
@@ -175,10 +174,8 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
                     ) from error
 
     def save_image(self, target: Path) -> None:
-        """The whole window as PNG, whole or not at all; OSError when it cannot be written."""
-        image = self._image()
-        with written_whole(target, IMAGE) as part:
-            part.write_bytes(image)
+        """Write the whole window as PNG. Raises OSError if it cannot be written."""
+        target.write_bytes(self._image())
 
     def view_image(self, name: str) -> bytes:
         """One view as PNG; KeyError when no view has that name."""
@@ -228,16 +225,14 @@ def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | Non
     Raises:
         ConfigError: The time is outside of it.
         DemorecError: The viewer cannot work here, or a view reports an error.
+        OSError: The image cannot be written.
     """
     with HeadlessViewer(*recordings, width=width, height=height) as viewer:
         viewer.seek(moment(seconds, viewer.end))
         for view, report in viewer.reports():
             if report.severity == "error":
                 raise RecordingError(f"The view {view!r} cannot be drawn: {report.summary}.")
-        try:
-            viewer.save_image(target)
-        except OSError as error:
-            raise write_error("The image", error, target, RecordingError) from error
+        viewer.save_image(target)
 
 
 @contextmanager

@@ -164,4 +164,4 @@ def test_the_home_folder_within_quotes(
     assert f"Scores of 5 episodes: {cups.parent}/scores.json" in capsys.readouterr().err
     assert not Path("~").exists()
     assert exit_code("dataset", "score", "cups", "--out", "x" * 250) == 2
-    assert "The scores cannot be written (File name too long)" in capsys.readouterr().err
+    assert "A file of scores (JSON) cannot be written (File name too long)" in capsys.readouterr().err

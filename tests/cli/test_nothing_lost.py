@@ -21,6 +21,7 @@ from support.generate import run_fake
 from support.recording import make_episode, write_episode
 
 from demorec.cli.shared.paths import refuse_inside
+from demorec.core.atomic import atomic_write
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.replacing import (
@@ -30,7 +31,6 @@ from demorec.core.replacing import (
     RERUN_FILE,
     check_replaceable,
     settle_parts,
-    written_whole,
 )
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import ExportOptions
@@ -150,7 +150,7 @@ def test_a_dataset_is_replaced_and_its_neighbours_are_not(place: Path) -> None:
 
 
 def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    workshop = place / ".new.demorec-export"
+    workshop = place / ".new.demorec-part"
     (workshop / "new").mkdir(parents=True)
     (workshop / "new" / "chapter_2.tex").write_text("years of work")
     before = files_of(place)
@@ -168,7 +168,8 @@ def test_files_put_into_the_target_meanwhile_are_kept(place: Path) -> None:
     with pytest.raises(ConfigError, match=r"notes\.txt"):
         export_lerobot([place / "runs/run"], place / "dataset", ExportOptions(overwrite=True, verify=False), note)
     assert (place / "dataset" / "notes.txt").read_text() == "years of work"
-    assert not (place / ".dataset.demorec-export").exists()
+    assert (place / "dataset.1" / "meta" / "info.json").is_file()  # the result is kept, too
+    assert not (place / ".dataset.demorec-part").exists()
 
 
 # A run: --overwrite of generate-dataset.
@@ -552,7 +553,7 @@ def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixtu
     for source, target, word in (
         ("alone.mcap", place / "thesis.html", "it is not a report"),
         ("alone.mcap", place / "link.html", "this command reads it"),
-        ("dataset", inside, "it lies in what this command reads"),
+        ("dataset", inside, "Nothing else is written into a dataset"),
     ):
         assert exit_code("report", place / source, "--out", target, "--overwrite") == 2
         assert word in capsys.readouterr().err
@@ -626,16 +627,16 @@ def test_special_files_are_never_replaced(tmp_path: Path, kind: object) -> None:
 def test_an_unfinished_file_of_somebody_else_is_kept(tmp_path: Path) -> None:
     part = tmp_path / ".x.png.demorec-part"
     part.write_text("mine")
-    with pytest.raises(ConfigError, match="not the unfinished"), written_whole(tmp_path / "x.png", IMAGE):
+    with pytest.raises(ConfigError, match="not made by demorec"), atomic_write(tmp_path / "x.png", IMAGE):
         pass
     assert part.read_text() == "mine"
 
 
 def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
     target = tmp_path / "x.png"
-    with written_whole(target, IMAGE) as part:
+    with atomic_write(target, IMAGE) as part:
         part.write_bytes(b"\x89PNG\r\n\x1a\n1")
-        with pytest.raises(ConfigError, match="Another process"), written_whole(target, IMAGE):
+        with pytest.raises(ConfigError, match="Another command"), atomic_write(target, IMAGE):
             pass
     assert target.read_bytes().endswith(b"1")
 

@@ -3,12 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-import resource
-import signal
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +16,6 @@ from numpy.typing import NDArray
 
 from demorec.check import lerobot_opens
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ExportError
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import ExportReport
 from demorec.datasets.lerobot import export as lerobot_export
@@ -107,49 +101,6 @@ def files_of(folder: Path) -> dict[str, bytes]:
     return {
         path.relative_to(folder).as_posix(): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()
     }
-
-
-@contextmanager
-def calls_counted(kill_at: int = 0) -> Iterator[list[int]]:
-    """Count calls of any function, C functions included; at number `kill_at` the process kills itself with SIGKILL.
-
-    That is a moment that does not depend on how busy the machine is.
-    """
-    calls = [0]
-
-    def count(frame: object, event: str, argument: object) -> None:
-        calls[0] += event in ("call", "c_call")
-        if calls[0] == kill_at > 0:
-            os.kill(os.getpid(), signal.SIGKILL)
-
-    sys.setprofile(count)
-    try:
-        yield calls
-    finally:
-        sys.setprofile(None)
-
-
-def in_child(action: Callable[[], object], *, size_limit: int = 0, kill_at: int = 0) -> None:
-    """Target of a process that may die: exit code 3 for an ExportError; `size_limit` bounds the size of its files."""
-    if size_limit:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (size_limit, size_limit))
-    try:
-        with calls_counted(kill_at) if kill_at else nullcontext():
-            action()
-    except ExportError:
-        raise SystemExit(3) from None
-
-
-def export_in_child(run: Path, out: Path, options: dict[str, Any], **limits: int) -> None:
-    """An export as `in_child`."""
-    in_child(lambda: export(run, out, **options), **limits)
-
-
-def count_calls(run: Path, out: Path, options: dict[str, Any]) -> int:
-    """How many calls such an export makes."""
-    with calls_counted() as calls:
-        export(run, out, **options)
-    return calls[0]
 
 
 def recode(video: Path, change: Callable[[list[Any]], object] = lambda images: None) -> None:

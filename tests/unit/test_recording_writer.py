@@ -52,7 +52,7 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> Non
     with EpisodeWriter(path, info) as writer:
         write_all(writer, frames)
         path.write_bytes(b"mine")
-        with pytest.raises(ConfigError, match="there already"):
+        with pytest.raises(ConfigError, match="has appeared"):
             writer.finish(outcome)
     assert path.read_bytes() == b"mine"
     recover(tmp_path / "a.mcap.part", tmp_path / "b.mcap")

@@ -49,43 +49,52 @@ class Edit:
         """The new dataset."""
         raise NotImplementedError
 
+    def part_names(self) -> Sequence[str]:
+        """Names of the new datasets within --out; "" for --out itself."""
+        return [""]
+
     def plans(self, sources: Sequence[Source]) -> Mapping[str, Plan]:
         """Name within --out -> new dataset."""
-        self.check_out(sources, [""])
         return {"": self.plan(sources)}
 
     def run(self) -> int:
         """Plan, write, and print what came out."""
-        from demorec.datasets.editing.write import write_plan
+        from demorec.datasets.editing.write import check_target
         from demorec.datasets.lerobot.files import leave_pandas_out
 
         leave_pandas_out()
         if self.out is None and not self.dry_run:
             raise ConfigError("Name the folder of the new dataset (--out NEW), or ask what it would be (--dry-run).")
-        for name, plan in self.plans(self.sources()).items():
+        sources = self.sources()
+        outs = [self.out / name for name in self.part_names()] if self.out is not None else []
+        refuse_inside(outs)
+        if outs and not self.dry_run:
+            self._write(sources, outs)
+            return 0
+        for out in outs:
+            check_target(out, sources, overwrite=self.overwrite)
+        for name, plan in self.plans(sources).items():
             say(*_changes(plan))
-            if self.out is None or self.dry_run:
-                self._print_result("Would be ", name, plan, "Would not be taken over")
-                continue
-            with ProgressBar("writing") as bar:
-                decoded, around = write_plan(
-                    plan, self.out / name, overwrite=self.overwrite, decode=self.decode, progress=bar.set
-                )
+            self._print_result("Would be ", name, plan, "Would not be taken over")
+        return 0
+
+    def _write(self, sources: Sequence[Source], outs: Sequence[Path]) -> None:
+        """Write the new datasets, which appear together, and print what came out."""
+        from demorec.datasets.editing.write import new_datasets, write_plan
+
+        results: list[tuple[int, int]] = []
+        with new_datasets(outs, sources, overwrite=self.overwrite) as folders:
+            plans = self.plans(sources)
+            for plan, folder in zip(plans.values(), folders, strict=True):
+                with ProgressBar("writing") as bar:
+                    results.append(write_plan(plan, folder, decode=self.decode, progress=bar.set))
+        for (name, plan), (decoded, around) in zip(plans.items(), results, strict=True):
+            say(*_changes(plan))
             self._print_result("", name, plan, "Not taken over")
             if around:
                 say(f"{counted(around, 'image')} beside cuts stay in the videos, since others need them.")
             if decoded:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
-        return 0
-
-    def check_out(self, sources: Sequence[Source], names: Sequence[str]) -> None:
-        """Raise ConfigError if a new dataset cannot be written to one of these names within --out."""
-        from demorec.datasets.editing.write import check_target
-
-        outs = [self.out / name for name in names] if self.out is not None else []
-        refuse_inside(outs)
-        for out in outs:
-            check_target(out, [source.root for source in sources], overwrite=self.overwrite)
 
     def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
         from demorec.datasets.editing.beside import left_out

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,11 +10,13 @@ from typing import TYPE_CHECKING
 from demorec.cli.dataset.edit import DatasetPath, dataset_at
 from demorec.cli.shared.output import counted, say, say_json, tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.core.errors import ExportError, write_error
+from demorec.core.atomic import atomic_write
+from demorec.core.errors import ConfigError
 from demorec.core.targets import OptionalTarget
 
 if TYPE_CHECKING:
     from demorec.datasets.editing.plan import Source
+    from demorec.datasets.scoring.score import EpisodeScore
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -37,14 +39,11 @@ class Score:
     def run(self) -> int:
         """Score, print, and write."""
         from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.datasets.scoring.score import check_target, score_dataset, to_json, write_scores
+        from demorec.datasets.scoring.score import score_dataset, to_json
 
         leave_pandas_out()
         root = dataset_at(self.dataset)
-        if self.out is not None:
-            refuse_inside([self.out])
-            check_target(self.out, source=root, overwrite=self.overwrite)
-        found = score_dataset(root)
+        found = score_dataset(root) if self.out is None else self._written(root, self.out)
         if self.json:
             say_json(to_json(found))
         for episode in () if self.json else sorted(found, key=lambda episode: episode.score):
@@ -53,12 +52,20 @@ class Score:
                 f"{episode.score:.2f}  episode {episode.episode_index}" + (f": {'; '.join(reasons)}" if reasons else "")
             )
         if self.out is not None:
-            try:
-                write_scores(self.out, found)
-            except OSError as error:
-                raise write_error("The scores", error, self.out, ExportError) from error
             tell(f"Scores of {counted(len(found), 'episode')}: {self.out}")
         return 0
+
+    def _written(self, root: Path, out: Path) -> Sequence[EpisodeScore]:
+        """Score, and write the scores to a file."""
+        from demorec.datasets.scoring.score import SCORES, score_dataset, write_scores
+
+        refuse_inside([out])
+        if not out.absolute().parent.is_dir():
+            raise ConfigError(f"--out: there is no folder {out.parent}.")
+        with atomic_write(out, SCORES, overwrite=self.overwrite, sources=[root]) as part:
+            found = score_dataset(root)
+            write_scores(part, found)
+        return found
 
 
 def add_scores(source: Source, names: Collection[str], file: Path | None) -> None:

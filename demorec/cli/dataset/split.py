@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Split(EditOne):
-    """Split a dataset into parts, each a dataset in a folder of its name within --out.
+    """Split a dataset into parts, each a dataset in a folder of its name within --out; all appear together.
 
     Examples:
       demorec dataset split cups --shares train=0.8 val=0.2 --out parts
@@ -32,15 +32,17 @@ class Split(EditOne):
     scores: Path | None = None
     """With --by score: file of demorec dataset score --out (auto: the dataset is scored)."""
 
+    def part_names(self) -> Sequence[str]:
+        """Names of the parts."""
+        return list(self._shares())
+
     def plans(self, sources: Sequence[Source]) -> Mapping[str, Plan]:
         """Name of each part -> its episodes."""
         from demorec.cli.dataset.score import add_scores
         from demorec.datasets.editing.operations import split
 
-        shares = self._shares()
-        self.check_out(sources, list(shares))
         add_scores(sources[0], {self.by}, self.scores)
-        return split(sources[0], shares, self.seed, by=self.by)
+        return split(sources[0], self._shares(), self.seed, by=self.by)
 
     def _shares(self) -> Mapping[str, float]:
         example = "--shares train=0.8 val=0.2"

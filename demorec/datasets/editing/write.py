@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
@@ -14,6 +15,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from PIL import Image
 
+from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
 from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
@@ -30,7 +32,6 @@ from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, co
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
-from demorec.datasets.staging import staged_folder
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
@@ -41,20 +42,36 @@ _EPISODES_AT_ONCE = 64
 _OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
-def check_target(out: Path, roots: Sequence[Path], *, overwrite: bool) -> None:
-    """Raise ConfigError where `write_plan` would: something is in the way at `out`, or it is one of the sources."""
-    check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=roots)
+def new_datasets(
+    outs: Sequence[Path], sources: Sequence[Source], *, overwrite: bool
+) -> AbstractContextManager[Sequence[Path]]:
+    """Give a folder for each new dataset; all appear together when the block ends without an error.
+
+    Args:
+        outs: Where the datasets go.
+        sources: What they are made from, which is never replaced.
+        overwrite: Whether existing datasets are replaced.
+
+    Raises:
+        ConfigError: Something is in the way.
+        ExportError: They cannot be written; what was there before is still there.
+    """
+    return atomic_write_all(outs, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
+
+
+def check_target(out: Path, sources: Sequence[Source], *, overwrite: bool) -> None:
+    """Raise ConfigError if `new_datasets` would, since something is in the way at `out`."""
+    check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
 
 
 def write_plan(
-    plan: Plan, out: Path, *, overwrite: bool = False, decode: bool = False, progress: ProgressCallback | None = None
+    plan: Plan, folder: Path, *, decode: bool = False, progress: ProgressCallback | None = None
 ) -> tuple[int, int]:
-    """Write the dataset: whole, or not at all; its sources are not touched.
+    """Write a dataset into an empty folder; its sources are not touched.
 
     Args:
-        plan: What.
-        out: Its folder.
-        overwrite: Whether a dataset that is there is replaced.
+        plan: Episodes and features of the dataset.
+        folder: Its folder.
         decode: Decode all images for their statistics, also of episodes whose own are known.
         progress: Called after every episode.
 
@@ -63,30 +80,29 @@ def write_plan(
         since others are decoded from them.
 
     Raises:
-        ConfigError: Something is in the way at `out`.
-        ExportError: A source is damaged, or the disk is full; what was at `out` is still there then.
+        ExportError: A source is damaged.
+        OSError: The dataset cannot be written.
     """
     roots = [source.root for source in plan.sources]
-    with staged_folder(out, _RESULT, replace=overwrite, sources=roots) as folder:
-        open_video = video_files()
-        readers = [_Reader(plan, number, open_video, decode=decode) for number in range(len(plan.sources))]
-        with (
-            DatasetWriter(folder, plan.info, _fact_types(plan)) as writer,
-            Beside(plan, folder) as beside,
-        ):
-            around = 0
-            for done, cut in enumerate(plan.cuts, start=1):
-                data = readers[cut.source].episode(cut)
-                around += sum(video.lead + video.tail for video in data.videos.values())
-                beside.add(cut, done - 1, writer.add(data))
-                if progress is not None:
-                    progress(done, len(plan.cuts))
-            writer.finish()
-            beside.finish()
-        for name in ABOUT_THE_WHOLE:
-            if len(roots) == 1 and (roots[0] / name).is_file():
-                (folder / name).parent.mkdir(exist_ok=True)
-                shutil.copyfile(roots[0] / name, folder / name)
+    open_video = video_files()
+    readers = [_Reader(plan, number, open_video, decode=decode) for number in range(len(plan.sources))]
+    with (
+        DatasetWriter(folder, plan.info, _fact_types(plan)) as writer,
+        Beside(plan, folder) as beside,
+    ):
+        around = 0
+        for done, cut in enumerate(plan.cuts, start=1):
+            data = readers[cut.source].episode(cut)
+            around += sum(video.lead + video.tail for video in data.videos.values())
+            beside.add(cut, done - 1, writer.add(data))
+            if progress is not None:
+                progress(done, len(plan.cuts))
+        writer.finish()
+        beside.finish()
+    for name in ABOUT_THE_WHOLE:
+        if len(roots) == 1 and (roots[0] / name).is_file():
+            (folder / name).parent.mkdir(exist_ok=True)
+            shutil.copyfile(roots[0] / name, folder / name)
     return sum(reader.num_decoded for reader in readers), around
 
 

@@ -11,11 +11,11 @@ import h5py
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError, ExportError, write_error
-from demorec.core.replacing import check_replaceable, written_whole
+from demorec.core.atomic import atomic_write
+from demorec.core.errors import ConfigError
 from demorec.core.tables import environment_name
 from demorec.datasets.episode import DONE, ExportEpisode
-from demorec.datasets.hdf5.file import DATASET, ENVIRONMENT_PREFIX, UNFINISHED, NewFile
+from demorec.datasets.hdf5.file import DATASET, ENVIRONMENT_PREFIX, NewFile
 from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
@@ -43,21 +43,11 @@ def export_hdf5(
     """
     options.validate()
     found = find_recordings(sources)
-
-    def check() -> None:
-        check_replaceable(out, DATASET, overwrite=options.overwrite, sources=places_of(found))
-
-    check()
-    target = out.resolve()
-    try:
-        target.parent.mkdir(parents=True, exist_ok=True)
-        with written_whole(target, UNFINISHED) as part:
-            with NewFile(part) as file:
-                report = _write(file, found, out, options, progress)
-            check()  # something may have been put there meanwhile
-    except OSError as error:
-        raise write_error("The file", error, out, ExportError) from error
-    return report
+    with (
+        atomic_write(out, DATASET, overwrite=options.overwrite, sources=places_of(found)) as part,
+        NewFile(part) as file,
+    ):
+        return _write(file, found, out, options, progress)
 
 
 def _write(

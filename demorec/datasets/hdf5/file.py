@@ -80,8 +80,6 @@ def _strangers(path: Path) -> list[str]:
 DATASET = ReplaceableKind(
     name="a robomimic dataset (HDF5) by demorec", recognises=_is_our_dataset, strangers=_strangers
 )
-UNFINISHED = ReplaceableKind(name="an HDF5 file", recognises=_begins_as_hdf5)
-"""What a killed export leaves (`NewFile` sees to its first bytes)."""
 
 
 class _Storage(io.FileIO):
@@ -91,7 +89,7 @@ class _Storage(io.FileIO):
     """
 
     def __init__(self, path: Path) -> None:
-        super().__init__(path, "r+")
+        super().__init__(path, "x+")
         self.error: BaseException | None = None
 
     def write(self, data: memoryview) -> int:  # type: ignore[override]
@@ -113,7 +111,7 @@ class _Storage(io.FileIO):
 
 
 class NewFile:
-    """Context manager: an HDF5 file written over what is at a path, which must exist and be locked by the caller.
+    """Context manager: an HDF5 file at a path where nothing is yet.
 
     Attributes:
         root: Its root group.
@@ -125,9 +123,6 @@ class NewFile:
     def __init__(self, path: Path) -> None:
         self._storage = _Storage(path)
         self.root = h5py.File(self._storage, "w")
-        # HDF5 writes its first bytes late; without them nobody would know whose file a killed export has left.
-        self._storage.seek(0)
-        self._storage.write(memoryview(HDF5_MAGIC))
 
     def __enter__(self) -> Self:
         return self

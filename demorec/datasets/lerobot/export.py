@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
@@ -34,7 +35,6 @@ from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, ler
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
-from demorec.datasets.staging import CODED, staged_folder
 from demorec.episode.episode import Outcome
 
 _STATED_OPTIONS = (
@@ -68,7 +68,7 @@ def export_lerobot(
     verifies = options.verify and lerobot_is_installed()
     kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
     with (
-        staged_folder(out, kind, replace=replace_it, sources=places_of(found)) as folder,
+        atomic_write(out, kind, overwrite=replace_it, sources=places_of(found)) as folder,
         Verifier() if verifies else nullcontext() as verifier,
     ):
         if existing is not None:
@@ -84,6 +84,10 @@ def export_lerobot(
     if options.push_to_hub:
         report = replace(report, url=push_to_hub(out, options.repo_id, private=not options.public))
     return report
+
+
+_ENCODED = ".encoded"
+"""Folder next to the new one for images of the export's processes."""
 
 
 class _Export:
@@ -103,7 +107,7 @@ class _Export:
         self._intake = Intake(found, options)
 
     def run(self, progress: ProgressCallback | None) -> ExportReport:
-        aside = self._folder.with_name(CODED)  # is removed with everything beside the new folder
+        aside = self._folder.with_name(_ENCODED)  # removed with everything next to the new folder
         aside.mkdir(exist_ok=True)
         found = self._noted(readings(self._found, self._options, progress, aside=aside))
         begun: list[Reading] = []  # up to the first episode, which decides what features there are

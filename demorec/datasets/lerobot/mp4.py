@@ -7,6 +7,7 @@ appended, images that lie in other files are copied once, and the index is writt
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import io
 import os
@@ -26,7 +27,6 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError
 from demorec.core.files import sync_path
 from demorec.datasets.lerobot.mp4_index import mp4_head
-from demorec.datasets.staging import copy_bytes
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
@@ -199,7 +199,7 @@ class Mp4Writer:
             for path, spans in groupby(self._spans, key=itemgetter(0)):
                 with path.open("rb", buffering=0) as source:
                     for _, begin, count in spans:
-                        copy_bytes(source, begin, count, file)
+                        _copy_bytes(source, begin, count, file)
         sync_path(self._unfinished)
         self._unfinished.rename(self._path)
         self._waiting.unlink()
@@ -289,3 +289,23 @@ def _open_bitstream_units(access_unit: bytes) -> list[tuple[int, int, int]]:
         units.append(((header >> 3) & 15, start, end))
         start = end
     return units
+
+
+_COPIED_BYTES = 1 << 16
+"""Copied at a time: pages of the file cache are taken faster one by one than a quarter of a megabyte together."""
+
+
+def _copy_bytes(source: IO[bytes], begin: int, count: int, target: IO[bytes]) -> None:
+    """Append a part of a file to another, both without a buffer.
+
+    Raises:
+        OSError: The part is not there, or cannot be written.
+    """
+    place = target.tell()
+    while count:
+        # In whole pages of the target: of parts that lie at any byte the kernel's own copying takes half as much again.
+        data = os.pread(source.fileno(), min(count, _COPIED_BYTES - place % _COPIED_BYTES), begin)
+        if not data:
+            raise OSError(errno.EIO, "the file ends before it should", source.name)
+        done = target.write(data)
+        begin, count, place = begin + done, count - done, place + done

@@ -18,7 +18,7 @@ import numpy as np
 
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import MAX_JSON_BYTES, read_json_limited
-from demorec.core.replacing import ReplaceableKind, check_replaceable, written_whole
+from demorec.core.replacing import ReplaceableKind
 from demorec.datasets.scoring.measure import Reading, measure_dataset
 
 MIN_SOUND = 0.8
@@ -130,17 +130,9 @@ def to_json(scores: Sequence[EpisodeScore]) -> dict[str, Any]:
     return {"kind": _KIND, "episodes": episodes}
 
 
-def check_target(path: Path, *, source: Path, overwrite: bool) -> None:
-    """Raise ConfigError if scores cannot be kept there: something else exists, or a file and no `overwrite`."""
-    check_replaceable(path, SCORES, overwrite=overwrite, sources=[source])
-    if not path.absolute().parent.is_dir():
-        raise ConfigError(f"--out: there is no folder {path.parent}.")
-
-
 def write_scores(path: Path, scores: Sequence[EpisodeScore]) -> None:
-    """Keep scores in a file that `check_target` allows."""
-    with written_whole(path, SCORES) as part:
-        part.write_text(json.dumps(to_json(scores), indent=1) + "\n")
+    """Write a file of scores. Raises OSError if it cannot be written."""
+    path.write_text(json.dumps(to_json(scores), indent=1) + "\n")
 
 
 def read_scores(path: Path, num_frames: Mapping[int, int]) -> dict[int, float]:
