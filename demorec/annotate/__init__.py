@@ -5,8 +5,9 @@ Everything follows from what was recorded (phases, events, poses, the scene as d
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 LanguageKind = Literal["subtask", "plan", "memory", "motion", "task_aug"]
 """`task_aug` is another wording of the task."""
@@ -20,11 +21,18 @@ class Statement:
     Attributes:
         row: Row of the episode, from 0.
         kind: Subject of the sentence.
-        role: Speaker: the user asks, the assistant does.
         text: The sentence.
     """
 
     row: int
     kind: LanguageKind
-    role: Literal["user", "assistant"]
     text: str
+
+
+BoxEntry = tuple[int, str, Mapping[str, Any]]
+"""Row of a box in its episode, the kind of its object, and its other values by COCO's names.
+
+`bbox` is (x, y, width, height) of the pixels that show the object, `area` their number. `visible_fraction` is that
+number over the area, px, of the whole outline, hidden parts and those beyond the image's edge included; None for a
+shape whose outline is not known (meshes, URDFs), or behind the camera. `color` is a word, or "".
+"""

@@ -80,7 +80,7 @@ class EpisodeTimeline:
         return "release" in phases and "lower" not in phases and "carry" in phases
 
 
-def episode_timeline(recording: Recording, trajectory: Trajectory) -> EpisodeTimeline:
+def episode_timeline(recording: Recording) -> EpisodeTimeline:
     """Return attempts and segments of a recording.
 
     An attempt begins where the script announced a grasp; a recording without such events is one attempt at its only
@@ -89,6 +89,7 @@ def episode_timeline(recording: Recording, trajectory: Trajectory) -> EpisodeTim
     Raises:
         RecordingError: The recording is damaged.
     """
+    trajectory = recording.trajectory()
     attempts = _attempts(recording, trajectory, recording.info.simulated.scene)
     starts = [attempt.first for attempt in attempts]
     phases = trajectory.phase

@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.annotate import BoxEntry
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Trajectory
 from demorec.episode.scene import SceneCamera, Shape
 from demorec.episode.words import nouns_of
 from demorec.mcap import Recording
@@ -22,38 +21,13 @@ _RIM_POINTS = 48
 """Points on the rim of a cylinder."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SeenObject:
-    """One object in one image, in COCO's terms.
-
-    Attributes:
-        row: Row of the dataset's episode.
-        name: Name of the body.
-        noun: Its kind, the category.
-        color: The word for its colour, or "".
-        box: (x, y, width, height) of the pixels that show it.
-        area: Number of pixels that show it.
-        visible_fraction: That number over the area, px, of its whole outline, hidden parts and those beyond the
-            image's edge included; None for a shape whose outline is not known (meshes, URDFs), or behind the camera.
-    """
-
-    row: int
-    name: str
-    noun: str
-    color: str
-    box: tuple[int, int, int, int]
-    area: int
-    visible_fraction: float | None
-
-
-def seen_objects(
-    recording: Recording, trajectory: Trajectory, rows: NDArray[np.intp], camera: SceneCamera
-) -> Iterator[SeenObject]:
+def seen_objects(recording: Recording, rows: NDArray[np.intp], camera: SceneCamera) -> Iterator[BoxEntry]:
     """Yield everything that a camera with segmentation sees in the given frames, row by row.
 
     Raises:
         RecordingError: The recording is damaged.
     """
+    trajectory = recording.trajectory()
     row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
     bodies = {
         body.name: body
@@ -77,23 +51,23 @@ def seen_objects(
                 else body.world_from_body.vector()
             )
             outline = outline_area(camera, world_from_camera, body.shape, pose)
-            yield SeenObject(
-                row=row_of[frame],
-                name=name,
-                noun=nouns_of(body)[0],
-                color=body.color_name,
-                box=_box(shown),
-                area=area,
-                visible_fraction=None if outline is None else round(min(1.0, area / max(outline, 1e-9)), 4),
-            )
+            values = {
+                "bbox": _box(shown),
+                "area": area,
+                "iscrowd": 0,
+                "object": name,
+                "color": body.color_name,
+                "visible_fraction": None if outline is None else round(min(1.0, area / max(outline, 1e-9)), 4),
+            }
+            yield row_of[frame], nouns_of(body)[0], values
 
 
-def _box(shown: NDArray[np.bool_]) -> tuple[int, int, int, int]:
+def _box(shown: NDArray[np.bool_]) -> list[int]:
     """Return (x, y, width, height) of the true pixels of an image (H, W)."""
     rows = np.flatnonzero(shown.any(axis=1))
     columns = np.flatnonzero(shown.any(axis=0))
     x, y = int(columns[0]), int(rows[0])
-    return x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1
+    return [x, y, int(columns[-1]) - x + 1, int(rows[-1]) - y + 1]
 
 
 def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
+from demorec.episode.episode import consecutive_runs
 
 if TYPE_CHECKING:
     from demorec.annotate.attempts import EpisodeTimeline, PhaseSegment
@@ -47,7 +48,9 @@ class StageRun:
 
 
 def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
-    """All stages of an episode with so many goals, in order; a script that lets things fall has fewer."""
+    """Return all stages of an episode with this number of goals, in order; a script that drops objects has fewer."""
+    if runs[0].stage == WHOLE_TASK:
+        return (WHOLE_TASK,)
     done = {run.stage.partition(": ")[2] for run in runs}
     is_dropped = "release" in done and "lower" not in done
     left_out = ("lower", "retreat") if is_dropped else ()
@@ -67,12 +70,8 @@ def dense_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageR
         return [StageRun(stage=WHOLE_TASK, first=0, last=len(rows) - 1)]
     starts = [segment.first for segment in timeline.segments]
     numbers = np.searchsorted(starts, rows, side="right") - 1
-    of_rows = [names[number] for number in numbers.tolist()]
-    runs = []
-    for name, group in groupby(range(len(rows)), key=lambda row: of_rows[row]):
-        members = list(group)
-        runs.append(StageRun(stage=name, first=members[0], last=members[-1]))
-    return runs
+    stages = [names[number] for number in numbers.tolist()]
+    return [StageRun(stage=name, first=first, last=end - 1) for name, first, end in consecutive_runs(stages)]
 
 
 def _stage_of(segment: PhaseSegment) -> str:

@@ -8,32 +8,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.annotate import KINDS, LanguageKind, Statement
-from demorec.annotate.attempts import EpisodeTimeline, PhaseSegment, episode_timeline
+from demorec.annotate.attempts import PhaseSegment, episode_timeline
 from demorec.annotate.situation import Surroundings, situation
 from demorec.annotate.subtasks import goal_words, memories, motion, plan, subtask
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
-from demorec.episode.episode import Trajectory
-from demorec.episode.scene import Scene
 from demorec.mcap import Recording
 
 
 def episode_statements(
-    recording: Recording, trajectory: Trajectory, rows: NDArray[np.intp], kinds: Collection[LanguageKind]
+    recording: Recording, rows: NDArray[np.intp], kinds: Collection[LanguageKind]
 ) -> list[Statement]:
     """Return the statements of the wanted kinds, in the order of the rows; those of one row in the order of `KINDS`.
 
     Args:
         recording: With its events.
-        trajectory: All of its numbers.
         rows: (T,) frames of the recording that the dataset has.
         kinds: Wanted kinds, as far as the recording supports them.
 
     Raises:
         RecordingError: The recording is damaged.
     """
-    annotator = _Annotator(recording, trajectory, rows)
+    annotator = _Annotator(recording, rows)
     found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
         "subtask": annotator.subtasks,
         "plan": annotator.plans,
@@ -48,10 +45,10 @@ def episode_statements(
 class _Annotator:
     """The sentences of one episode, kind by kind."""
 
-    def __init__(self, recording: Recording, trajectory: Trajectory, rows: NDArray[np.intp]) -> None:
-        self._info, self._trajectory, self._rows = recording.info, trajectory, rows
-        self._timeline: EpisodeTimeline = episode_timeline(recording, trajectory)
-        self._scene: Scene = recording.info.simulated.scene
+    def __init__(self, recording: Recording, rows: NDArray[np.intp]) -> None:
+        self._info, self._trajectory, self._rows = recording.info, recording.trajectory(), rows
+        self._timeline = episode_timeline(recording)
+        self._scene = recording.info.simulated.scene
         self._words = {
             attempt.first: goal_words(self._scene, attempt.goal, self._situation(attempt.first))
             for attempt in self._timeline.attempts
@@ -78,7 +75,7 @@ class _Annotator:
         for segment, first, _ in self._segment_rows():
             words = self._words[segment.attempt.first]
             text = subtask(segment, words, self._info.instruction, is_dropped=is_dropped)
-            yield Statement(row=first, kind="subtask", role="assistant", text=text)
+            yield Statement(row=first, kind="subtask", text=text)
 
     def plans(self) -> Iterator[Statement]:
         for index, attempt in enumerate(self._timeline.attempts):
@@ -89,14 +86,14 @@ class _Annotator:
                 now = self._situation(attempt.first)
                 remaining = [goal_words(self._scene, goal, now) for goal in range(attempt.goal, len(self._scene.goals))]
                 text = plan(remaining, is_dropped=self._timeline.is_dropped, is_retry=attempt.number > 0)
-                yield Statement(row=row, kind="plan", role="assistant", text=text)
+                yield Statement(row=row, kind="plan", text=text)
 
     def memories(self) -> Iterator[Statement]:
         latest: dict[int, Statement] = {}
         for frame, text in memories(self._timeline, self._words, is_dropped=self._timeline.is_dropped):
             row = self._row_of(frame)
             if row < len(self._rows):  # of two that fall into one row, the later one holds
-                latest[row] = Statement(row=row, kind="memory", role="assistant", text=text)
+                latest[row] = Statement(row=row, kind="memory", text=text)
         yield from latest.values()
 
     def motions(self) -> Iterator[Statement]:
@@ -104,7 +101,7 @@ class _Annotator:
         for _, first, end in self._segment_rows():
             frames = [self._rows[first], self._rows[end] if end < len(self._rows) else last]
             text = motion(trajectory.base_from_tcp[frames, :3], trajectory.gripper_width[frames])
-            yield Statement(row=first, kind="motion", role="assistant", text=text)
+            yield Statement(row=first, kind="motion", text=text)
 
     def wordings(self) -> Iterator[Statement]:
         info = self._info
@@ -115,4 +112,4 @@ class _Annotator:
             purpose="language",
         )
         for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._timeline.is_dropped):
-            yield Statement(row=0, kind="task_aug", role="user", text=text)
+            yield Statement(row=0, kind="task_aug", text=text)

@@ -38,8 +38,9 @@ _RECOVERY = {
     "missed": "open the gripper and rise after missing {object}",
     "dropped": "open the gripper and rise after dropping {object}",
 }
-_SMALLEST_MOVE, _SMALLEST_OPENING = 0.005, 0.0025
-"""Metres below which a motion or a change of the opening is left out: half of the last digit that is printed."""
+# Half of the last digit that is printed.
+_MIN_MOVE_M = 0.005
+_MIN_OPENING_CHANGE_M = 0.0025
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,13 +164,13 @@ def motion(position: Array, opening: Array) -> str:
         (position[1] - position[0]).tolist(), ("forward", "left", "up"), ("backward", "right", "down"), strict=True
     ):
         centimetres = round(abs(change) * 100)
-        if abs(change) >= _SMALLEST_MOVE and centimetres:
+        if abs(change) >= _MIN_MOVE_M and centimetres:
             parts.append((centimetres, positive if change > 0 else negative))
     parts.sort(key=lambda part: -part[0])
     said = [f"{centimetres} cm {direction}" for centimetres, direction in parts]
     sentences = [f"move {joined(said)}"] if said else []
     change = float(opening[1]) - float(opening[0])
-    if abs(change) >= _SMALLEST_OPENING:
+    if abs(change) >= _MIN_OPENING_CHANGE_M:
         verb = "open" if change > 0 else "close"
         sentences.append(f"{verb} the gripper by {max(0.5, round(abs(change) * 200) / 2):g} cm")
     return ", ".join(sentences) or "hold still"

@@ -17,7 +17,7 @@ from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import is_dataset
-from demorec.datasets.lerobot.prepare import prepare_episode, reasons_to_transcode
+from demorec.datasets.lerobot.prepare import reasons_to_transcode, recorded_videos
 from demorec.datasets.lerobot.sidecar import EXPORT_PATH, EpisodeRecord
 from demorec.datasets.lerobot.videos import PacketReader
 from demorec.mcap import open_recording
@@ -104,11 +104,11 @@ def episode_differences(
     """
     try:
         with open_recording(recording_file, simulated=True) as recording:
-            exporting = ExportEpisode(recording, options)
-            expected = prepare_episode(exporting, options, encode_depth=False)
-            record = EpisodeRecord.of(exporting)
-            # Encoded anew, images have the bytes of the version and machine that encoded them.
-            transcoded = {camera.feature for camera, reason in reasons_to_transcode(exporting).items() if reason}
+            expected = ExportEpisode(recording, options)
+            columns, record = expected.columns, EpisodeRecord.of(expected)
+            # Encoded again, images have the bytes of the version and machine that encoded them.
+            reasons = reasons_to_transcode(expected)
+            recorded = recorded_videos(expected, [camera for camera, reason in reasons.items() if not reason])
     except RecordingError as error:
         yield str(error), ()
         return
@@ -117,16 +117,16 @@ def episode_differences(
             raise lack from error
         yield f"its recording gives no such episode ({describe_error(error)})", ()
         return
-    if episode.tasks != (expected.task,):
+    if episode.tasks != (expected.info.instruction,):
         yield "instruction", ()
-    for name, values in expected.columns.items():
+    for name, values in columns.items():
         found, true = episode.rows.get(name), values.reshape(len(values), -1)
         if found is None or found.shape != true.shape:
             yield name, ()
         elif len(frames := np.flatnonzero((found != true).any(axis=1))):
             yield name, tuple(frames.tolist())
-    for key, video in expected.videos.items():
-        if key not in transcoded and videos.get(key) != video.digest:
+    for key, video in recorded.items():
+        if videos.get(key) != video.digest:
             yield key, ()
     for name, value in record.row.items():
         if name not in _OF_THE_PLACE and episode.kept.get(name) != value:

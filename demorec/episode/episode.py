@@ -8,8 +8,9 @@ episode to the bit.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby
 from typing import Any, Literal
 
 import numpy as np
@@ -306,3 +307,12 @@ def interventions(phases: Sequence[str]) -> NDArray[np.bool_]:
     """
     acts = np.array([phase not in (POLICY_PHASE, HALT_PHASE) for phase in phases], dtype=np.bool_)
     return acts & (POLICY_PHASE in phases)
+
+
+def consecutive_runs(names: Sequence[str]) -> Iterator[tuple[str, int, int]]:
+    """Yield name, first index and index after the last, for each run of equal names."""
+    first = 0
+    for name, group in groupby(names):
+        end = first + sum(1 for _ in group)
+        yield name, first, end
+        first = end

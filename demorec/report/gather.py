@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +15,7 @@ from demorec.core.errors import ConfigError, ExportError, RecordingError, withou
 from demorec.core.processes import in_turn
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import CommonOptions
-from demorec.episode.episode import Outcome
+from demorec.episode.episode import Outcome, consecutive_runs
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.simulated import simulation_facts
 from demorec.mcap import Recording, open_recording
@@ -158,7 +157,6 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
 
 def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, _Vectors]:
     info, content = recording.info, ExportEpisode(recording, CommonOptions())
-    names = content.recording.phases
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
@@ -168,8 +166,6 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
         strip = filmstrip(
             shown, recording.num_frames, lambda frames: recording.images_at(shown, frames), max_bytes=strip_bytes
         )
-    changes = [frame for frame, (a, b) in enumerate(pairwise(names), 1) if a != b]
-    bounds = [0, *changes, len(names)] if names else []
     is_failed = recording.path.parent.name == FAILED
     attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
     episode = ReportedEpisode(
@@ -180,14 +176,14 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
         num_frames=recording.num_frames,
         fps=info.fps,
         seed=simulation_facts(info).get("root_seed"),
-        phases=tuple((names[first], first, end) for first, end in pairwise(bounds)),
+        phases=tuple(consecutive_runs(recording.phases)),
         filmstrip=strip,
         facts=tuple(_facts_of(recording)),
     )
     return episode, _vectors(content)
 
 
-def _vectors(content: ExportEpisode) -> _Vectors:
+def _vectors(content: ExportEpisode[CommonOptions]) -> _Vectors:
     """State and action as an export has them; nothing of an episode that could not be exported."""
     try:
         vectors = content.vectors

@@ -128,6 +128,7 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
     [
         ({"action": "ee"}, "exported as they came"),
         ({"privileged": True}, "privileged is asked for"),
+        ({"intervention": True}, "intervention is asked for"),
         ({"depth": True}, "depth is asked for"),
         ({"fps": 10}, "was recorded at 30"),
         ({"features": ("observation.forse",)}, "Unknown feature 'observation.forse'.*observation.force"),

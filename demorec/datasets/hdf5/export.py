@@ -1,4 +1,4 @@
-"""Recordings to an HDF5 file: `export_hdf5`, from the first recording to the finished file."""
+"""Export of recordings to an HDF5 file in robomimic's layout."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from numpy.typing import NDArray
 from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError
 from demorec.core.tables import environment_name
-from demorec.datasets.episode import DONE, ExportEpisode
+from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.hdf5.file import DATASET, ENVIRONMENT_PREFIX, NewFile
 from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
-from demorec.episode.episode import Trajectory
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
-from demorec.episode.info import EpisodeInfo
 from demorec.mcap import open_recording
+
+Hdf5Episode = ExportEpisode[Hdf5Options]
 
 
 def export_hdf5(
     sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None = None
 ) -> ExportReport:
-    """Write the recordings into the file `out`: whole, or not at all. One image is in memory at a time.
+    """Write the recordings into the file `out`, completely or not at all. One image is in memory at a time.
 
     Args:
         sources: Recordings, runs, or folders of recordings.
         out: The file.
-        options: How.
+        options: Options of the export.
         progress: Called after every recording.
 
     Raises:
         ConfigError: Impossible options, nothing to export, or a file in the way.
-        ExportError: Recordings that differ, a full disk. What was at `out` is still there then.
+        ExportError: Recordings that differ, a full disk. `out` is unchanged.
         RecordingError: A recording is damaged, or lacks images that were asked for.
     """
     options.validate()
@@ -53,7 +53,8 @@ def export_hdf5(
 def _write(
     file: NewFile, found: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None
 ) -> ExportReport:
-    intake, data = Intake(found, options), file.root.create_group("data")
+    intake = Intake(found, options, lambda recording: ExportEpisode(recording, options).traits())
+    data = file.root.create_group("data")
     num_frames = 0
     depth_left_out: tuple[str, ...] = ()
     for done, path in enumerate(found, start=1):
@@ -61,8 +62,8 @@ def _write(
             if is_wanted(recording, options):
                 if goes_in(recording, options):
                     episode = ExportEpisode(recording, options)
-                    intake.take(path, dict(episode.traits()))
-                    _add(data, intake.num_taken - 1, episode, options.compression)
+                    intake.take(path, episode.traits())
+                    _add(data, intake.num_taken - 1, episode)
                     depth_left_out = depth_left_out or episode.depth_left_out
                     num_frames += len(episode.rows)
                     file.flush()
@@ -70,7 +71,8 @@ def _write(
                     intake.leave_out(recording.outcome)
         if progress is not None:
             progress(done, len(found))
-    intake.check()
+    if not intake.num_taken:
+        raise intake.nothing_to_export()
     data.attrs["total"] = num_frames
     _add_masks(file.root, intake.num_taken, options.valid_share)
     return ExportReport(
@@ -85,8 +87,8 @@ def _write(
     )
 
 
-_EXTERNAL = f"{ENVIRONMENT_PREFIX}collected"
-"""Stands for an environment in files of external episodes, which have none."""
+_NO_ENVIRONMENT = f"{ENVIRONMENT_PREFIX}collected"
+"""Stands for the environment of episodes that have none."""
 _GYM = 2
 """`EnvType.GYM_TYPE` of robomimic."""
 _ROBOSUITE = {
@@ -95,51 +97,51 @@ _ROBOSUITE = {
     EE_POSE: {"robot0_eef_pos": slice(0, 3), "robot0_eef_quat": slice(3, 7)},
     ENVIRONMENT_STATE: {"object": slice(None)},
 }
-"""Of simulated arms: feature -> robosuite's observations, and which elements each of them has."""
+"""Feature of an arm in a scene -> robosuite's observations, and the elements of each."""
 
 
-def _add(data: h5py.Group, number: int, episode: ExportEpisode, compression: int) -> None:
-    """Append an episode: numbers at once, images one by one, compressed by that level of gzip.
+def _add(data: h5py.Group, number: int, episode: Hdf5Episode) -> None:
+    """Append an episode: numbers at once, images one by one.
 
     Raises:
-        ConfigError: It has no actions, two of its streams would get one name, or images are missing.
+        ConfigError: The episode has no actions, or two of its streams would get one name.
         ExportError: It has no frames, a number that is not finite, or frames without an image.
-        RecordingError: It is damaged.
+        RecordingError: The recording is damaged.
     """
     demo = data.create_group(f"demo_{number}")
-    # By itself, since its groups are closed when it returns: HDF5 places the bytes that follow accordingly.
-    _fill(demo, episode, compression)
+    # A function of its own, since returning closes its groups, and HDF5 places the bytes that follow accordingly.
+    _fill(demo, episode)
     if number == 0:
         data.attrs.update(_attributes(episode))
 
 
-def _fill(demo: h5py.Group, episode: ExportEpisode, compression: int) -> None:
+def _fill(demo: h5py.Group, episode: Hdf5Episode) -> None:
     """Write the numbers and images of an episode."""
     observations, images = _observation_names(episode), _image_names(episode)
-    info, count = episode.recording.info, len(episode.rows)
+    count = len(episode.rows)
     demo.attrs["num_samples"] = count
-    demo.attrs["instruction"] = info.instruction
+    demo.attrs["instruction"] = episode.info.instruction
     if urdf := episode.urdf:
         demo.attrs["model_file"] = urdf
-    dones = episode.scalar_columns[DONE].astype(np.int64)
+    dones = episode.is_last.astype(np.int64)
     if (success := episode.recording.success) is not None:
         demo.attrs["success"] = success
         demo["rewards"] = (dones * success).astype(np.float32)
     demo["dones"] = dones
     _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
-    if episode.info.simulation is not None:
-        _add_vectors(demo, "states", *_states(episode.trajectory, episode.rows, episode.info))
+    if episode.scene is not None:
+        _add_vectors(demo, "states", *_states(episode))
     group = demo.create_group("obs")
     for name, (feature, elements) in observations.items():
         _add_vectors(group, name, episode.vectors[feature][:, elements], episode.names[feature][elements])
     for name, camera in zip(images, episode.cameras, strict=True):
         settings = episode.recording.video_settings(camera.name)
         shape = (count, settings.height, settings.width, 1 if camera.is_depth else 3)
-        _add_images(group, name, shape, episode.images(camera), compression)
+        _add_images(group, name, shape, episode.images(camera), episode.options.compression)
 
 
 def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
-    """Say which episodes are for training, and which for validation."""
+    """Write the names of the episodes for training and for validation."""
     share = Fraction(valid_share).limit_denominator(1_000_000)
     numbers = range(num_episodes)
     valid = [number for number in numbers if int((number + 1) * share) > int(number * share)]
@@ -148,19 +150,18 @@ def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
         root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
 
 
-def _observation_names(episode: ExportEpisode) -> dict[str, tuple[str, slice]]:
-    """Observation -> which elements of which feature: robosuite's names, or "force" for "observation.force".
+def _observation_names(episode: Hdf5Episode) -> dict[str, tuple[str, slice]]:
+    """Return observation -> feature and its elements: robosuite's names, or "force" for "observation.force".
 
     Raises:
-        ConfigError: There are no actions, or two streams would get one name.
+        ConfigError: The episode has no actions, or two streams would get one name.
     """
-    wanted = [name for name in episode.names if episode.options.takes(name)]
-    if ACTION not in wanted:
+    if ACTION not in episode.names:
         raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {episode.recording.path}")
-    known = {} if episode.info.simulation is None else _ROBOSUITE
+    known = {} if episode.scene is None else _ROBOSUITE
     found = [
         (name, (feature, elements))
-        for feature in wanted
+        for feature in episode.names
         if feature != ACTION
         for name, elements in known.get(feature, {feature.removeprefix("observation."): slice(None)}).items()
     ]
@@ -173,28 +174,25 @@ def _observation_names(episode: ExportEpisode) -> dict[str, tuple[str, slice]]:
     return dict(found)
 
 
-def _image_names(episode: ExportEpisode) -> list[str]:
-    """Of each camera: "front_image", or of a depth camera what the dataset calls it."""
+def _image_names(episode: Hdf5Episode) -> list[str]:
+    """Return a name for each camera: "front_image", or for a depth camera the end of its feature's name."""
     return [
         camera.feature.removeprefix(IMAGE_PREFIX) + ("" if camera.is_depth else "_image") for camera in episode.cameras
     ]
 
 
-def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
-    """Attributes of `data`: what robomimic makes an environment from, rate and names of observations.
-
-    An external episode has no environment, only the name of one.
-    """
+def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
+    """Return the attributes of `data`: arguments of robomimic's environment, rate and names of observations."""
     info, options = episode.info, episode.options
     arguments: dict[str, object] = {
         "robot": info.robot_name,
         "fps": episode.fps,
         "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
     }
-    name = _EXTERNAL
-    if info.simulation is not None:
+    name = _NO_ENVIRONMENT
+    if episode.scene is not None:
         name = environment_name(info.simulated.task)
-        cameras = [camera for camera in info.simulated.scene.cameras if options.takes(IMAGE_PREFIX + camera.name)]
+        cameras = [camera for camera in info.cameras if options.takes(IMAGE_PREFIX + camera.name)]
         arguments |= {
             "physics_hz": info.simulated.physics_hz,
             **({"width": cameras[0].width, "height": cameras[0].height} if cameras else {}),
@@ -208,23 +206,21 @@ def _attributes(episode: ExportEpisode) -> dict[str, str | int]:
     }
 
 
-def _states(
-    trajectory: Trajectory, rows: NDArray[np.intp], info: EpisodeInfo
-) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """(T, D) float64 state of the simulated world as recorded, and the names of its components.
+def _states(episode: Hdf5Episode) -> tuple[NDArray[np.float64], tuple[str, ...]]:
+    """(T, D) float64 state of the scene as recorded, and the names of its components.
 
     Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:
     xyz (m) and quaternion xyzw.
     """
+    trajectory, joints = episode.recording.trajectory(), episode.info.simulated.robot.joint_names
     parts = [trajectory.joint_position, trajectory.joint_velocity, *trajectory.object_poses.values()]
-    joints = info.simulated.robot.joint_names
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]
     names += [f"{body}.{axis}" for body in trajectory.object_poses for axis in ("x", "y", "z", "qx", "qy", "qz", "qw")]
-    return np.concatenate(parts, axis=1)[rows], tuple(names)
+    return np.concatenate(parts, axis=1)[episode.rows], tuple(names)
 
 
 def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], components: Sequence[str]) -> None:
-    """(T, D) numbers as a dataset whose attribute `names` has those of the D components."""
+    """Write (T, D) numbers as a dataset; its attribute `names` lists the D components."""
     stored = group.create_dataset(name, data=values)
     stored.attrs["names"] = json.dumps(components)
 
@@ -232,7 +228,7 @@ def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], comp
 def _add_images(
     group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
 ) -> None:
-    """(T, H, W, 3) uint8 colours or (T, H, W, 1) float32 distances, each image a chunk that is read by itself."""
+    """Write (T, H, W, 3) uint8 colours or (T, H, W, 1) float32 distances; each image is a chunk."""
     stored = group.create_dataset(
         name,
         shape,

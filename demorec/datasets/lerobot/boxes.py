@@ -8,36 +8,19 @@ from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO
 
+from demorec.annotate import BoxEntry
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing, open_regular, sync_path
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 
-if TYPE_CHECKING:
-    from demorec.annotate.boxes import SeenObject
-
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 
 
-BoxEntry = tuple[int, str, Mapping[str, Any]]
-"""Row of a box in its episode, its category, and its other values as the file has them."""
 SeenByCamera = tuple[int, int, tuple[BoxEntry, ...]]
 """Width and height of a camera's images in an episode, px, and what is seen in them, row by row."""
-
-
-def box_entry(item: SeenObject) -> BoxEntry:
-    """Return the box of an object as the file has it."""
-    values = {
-        "bbox": list(item.box),
-        "area": item.area,
-        "iscrowd": 0,
-        "object": item.name,
-        "color": item.color,
-        "visible_fraction": item.visible_fraction,
-    }
-    return item.row, item.noun, values
 
 
 ReadBox = tuple[int, str, tuple[float, float, float, float]]

@@ -1,6 +1,6 @@
 """The dataset card: README.md, as the Hugging Face Hub shows it.
 
-Everything in it is read back from the finished dataset, so it is right after an append too.
+It is written from the finished dataset, so it covers appended episodes too.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.text import markdown
+from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
 from demorec.datasets.lerobot.files import rows_in
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
@@ -34,22 +35,27 @@ from demorec.episode.features import (
 from demorec.episode.sensed import SENSED
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
-"""The last line of a card: with it a card that was edited is known from one that was not."""
+"""Last line of a card; its digest reveals whether the card was edited."""
 _MEANING = {
+    **dict.fromkeys(AUTOMATIC_FEATURES, "filled in by LeRobot's rules"),
+    "timestamp": "seconds since the episode's start",
+    DONE: "true at the last frame",
+}
+"""Feature -> meaning in every dataset."""
+_SIMULATED_MEANING = {
     STATE: "joint positions (rad), gripper opening (m)",
     VELOCITY: "joint velocities (rad/s), speed of the gripper's opening (m/s)",
     EE_POSE: "tool centre point in the base frame: position (m), quaternion xyzw with x >= 0",
     ENVIRONMENT_STATE: "privileged: TCP, objects and goals, symmetric and relative quantities first, raw poses last "
     "(m, rad; base frame)",
     COMMAND: "what the motors were sent: joint targets (rad), gripper opening (m)",
-    "next.reward": "1 at the last frame of a success, else 0",
-    "next.done": "true at the last frame",
-    "next.success": "true at the last frame of a success",
-    "intervention": "true where the expert acts in an episode that a policy began; its other frames are the policy's",
-    "timestamp": "seconds since the episode's start",
+    REWARD: "1 at the last frame of a success, else 0",
+    SUCCESS: "true at the last frame of a success",
+    INTERVENTION: "true where the expert acts in an episode that a policy began; its other frames are the policy's",
     PERSISTENT: "what is said of the episode, each entry from its `timestamp` on until the next one of its style; all "
     "of it in every row",
     EVENTS: "what is said at this row alone",
+    **{name: row.meaning for name, row in SENSED.items()},
 }
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
@@ -60,23 +66,25 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
     "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
     "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
 }
-_EXTERNAL_ROWS = (
-    "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
-    "period; the frames' own stamps, and how old each sample was, are in the recordings."
-)
+
+
 _SIMULATED_ROWS = (
     "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
     "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
     "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
     "wall clock."
 )
-_BESIDE_EXTERNAL = (
-    f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
+_RECORDED_ROWS = (
+    "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
+    "period; the frames' own stamps, and how old each sample was, are in the recordings."
 )
-_BESIDE_SIMULATED = (
+_SIMULATED_SIDECAR = (
     f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
     "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
     "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
+)
+_RECORDED_SIDECAR = (
+    f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
 )
 
 
@@ -86,8 +94,8 @@ def write_card(
     """Write the card of a finished dataset folder.
 
     Args:
-        configs: Config digest -> configuration of the runs; none where demorec simulated no episode.
-        is_transcoded: Whether any images were encoded anew.
+        configs: Config digest -> configuration of the runs; empty if demorec simulated no episode.
+        is_transcoded: Whether any images were transcoded.
     """
     there = root / CARD_PATH
     path = root / SECOND_CARD_PATH if has_own_card(root) else there
@@ -96,7 +104,7 @@ def write_card(
 
 
 def has_own_card(root: Path) -> bool:
-    """Whether a dataset's card is the user's own: one that `write_card` did not write, or that was edited since."""
+    """Whether a dataset's card belongs to the user: `write_card` did not write it, or it was edited since."""
     path = root / CARD_PATH
     if not os.path.lexists(path):
         return False
@@ -117,23 +125,20 @@ def _card(
     configs: Mapping[str, Any],
     is_transcoded: bool,
 ) -> Iterable[str]:
-    is_simulated = bool(configs)
+    meaning = {**_MEANING, **(_simulated_meaning(options) if configs else {})}
     tasks = read_tasks(root)
     minutes = info.total_frames / info.fps / 60
     pictures = "some pictures were coded anew" if is_transcoded else "every video packet is the one that was recorded"
     yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
-    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if is_simulated else []))
+    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if configs else []))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
     yield from (f"# {options.repo_id}", "")
-    robot = markdown(str(info.robot_type))
-    plural = "" if info.total_episodes == 1 else "s"
-    whose = (
-        f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
-        if is_simulated
-        else f"demonstration{plural} of {robot}"
-    )
+    robot, plural = markdown(str(info.robot_type)), "" if info.total_episodes == 1 else "s"
+    kind = f"demonstration{plural} of {robot}"
+    if configs:
+        kind = f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
     yield (
-        f"{info.total_episodes} {whose}, "
+        f"{info.total_episodes} {kind}, "
         f"{info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the LeRobot v3.0 format. Recorded "
         f"and exported by demorec; {pictures}."
     )
@@ -146,19 +151,19 @@ def _card(
     yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
     for key, item in info.features.items():
         name = f"`{key}`" if markdown(key) == key else markdown(key)
-        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_meaning(key, item, options, is_simulated)} |"
+        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_feature_meaning(key, item, meaning)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
-    yield from (_SIMULATED_ROWS if is_simulated else _EXTERNAL_ROWS, "")
+    yield from (_SIMULATED_ROWS if configs else _RECORDED_ROWS, "")
     yield from _success_section(root)
-    yield from ("## What stands beside", "", _BESIDE_SIMULATED if is_simulated else _BESIDE_EXTERNAL)
+    yield from ("## What stands beside", "", _SIMULATED_SIDECAR if configs else _RECORDED_SIDECAR)
     yield from _robot_section(root)
     yield ""
-    if is_simulated:
+    if configs:
         yield from _origin_section(root, configs, options)
 
 
 def _robot_section(root: Path) -> Iterable[str]:
-    """What draws the arm, of a dataset that holds it."""
+    """Describe the URDFs, if the dataset has any."""
     urdfs = sorted((root / ROBOTS_DIR).glob("*.urdf"))
     if urdfs:
         names = ", ".join(f"`{path.relative_to(root).as_posix()}`" for path in urdfs)
@@ -169,20 +174,20 @@ def _robot_section(root: Path) -> Iterable[str]:
         )
 
 
-def _meaning(key: str, item: DatasetFeature, options: ExportOptions, is_simulated: bool) -> str:
-    if not is_simulated and not key.startswith(IMAGE_PREFIX) and key not in AUTOMATIC_FEATURES and key != "next.done":
-        return "as it was recorded"
-    if key == ACTION:
-        return _ACTION_MEANING[options.action]
-    if key == STATE and options.state == "joint_ee":
-        return f"{_MEANING[STATE]}, {_MEANING[EE_POSE]}"
+def _simulated_meaning(options: ExportOptions) -> dict[str, str]:
+    """Return feature -> meaning in a dataset of simulated episodes."""
+    meaning = {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
+    if options.state == "joint_ee":
+        meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
+    return meaning
+
+
+def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str]) -> str:
     if item.is_depth:
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
     if key.startswith(IMAGE_PREFIX):
         return f"camera {markdown(key.removeprefix(IMAGE_PREFIX))}, RGB"
-    if key in SENSED:
-        return SENSED[key].meaning
-    return _MEANING.get(key, "filled in by LeRobot's rules")
+    return meaning.get(key, "as it was recorded")
 
 
 def _origin_section(root: Path, configs: Mapping[str, Any], options: ExportOptions) -> Iterable[str]:

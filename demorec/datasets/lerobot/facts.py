@@ -17,8 +17,7 @@ import json
 import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from itertools import pairwise
+from itertools import chain, pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,14 +25,15 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from demorec.annotate.progress import WHOLE_TASK, StageRun, dense_stages, progress, proportions
+from demorec.annotate.progress import StageRun, dense_stages, progress, proportions
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import sync_path
+from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 
 if TYPE_CHECKING:
-    from demorec.episode.episode import SuccessCheck, Trajectory
-    from demorec.episode.info import EpisodeInfo
+    from demorec.episode.episode import SuccessCheck
+    from demorec.episode.info import Simulation
     from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
@@ -50,75 +50,51 @@ STAGE_COLUMNS: dict[str, pa.DataType] = {
 """Column of the table of episodes -> its type."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class EpisodeProgress:
-    """The stages of one episode.
+def stage_columns(runs: Sequence[StageRun]) -> dict[str, Any]:
+    """Return the entries of an episode's stages in the table of episodes."""
+    return {
+        STAGE_NAMES: [run.stage for run in runs],
+        STAGE_STARTS: [run.first for run in runs],
+        STAGE_ENDS: [run.last for run in runs],
+    }
 
-    Attributes:
-        num_goals: Goals of its scene.
-        runs: Stages in order, without gaps.
-    """
 
-    num_goals: int
-    runs: tuple[StageRun, ...]
-
-    @property
-    def num_frames(self) -> int:
-        """T."""
-        return self.runs[-1].last + 1
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """All stages that an episode with this number of goals has."""
-        if self.runs[0].stage == WHOLE_TASK:
-            return (WHOLE_TASK,)
-        return dense_stages(self.num_goals, self.runs)
-
-    def row(self) -> dict[str, Any]:
-        """Its entries in the table of episodes."""
-        return {
-            STAGE_NAMES: [run.stage for run in self.runs],
-            STAGE_STARTS: [run.first for run in self.runs],
-            STAGE_ENDS: [run.last for run in self.runs],
-        }
-
-    @classmethod
-    def from_row(cls, row: Mapping[str, Any]) -> EpisodeProgress:
-        """Inverse of `row`; ValueError, TypeError or KeyError for an invalid row."""
-        runs = tuple(
-            StageRun(stage=str(name), first=int(first), last=int(last))
-            for name, first, last in zip(row[STAGE_NAMES], row[STAGE_STARTS], row[STAGE_ENDS], strict=True)
-        )
-        if not runs or runs[0].first != 0 or any(b.first != a.last + 1 for a, b in pairwise(runs)):
-            raise ValueError("stages that leave gaps")
-        return cls(num_goals=int(row["num_goals"]), runs=runs)
+def _stage_runs(row: Mapping[str, Any]) -> list[StageRun]:
+    """Inverse of `stage_columns`; ValueError, TypeError or KeyError for an invalid row."""
+    runs = [
+        StageRun(stage=str(name), first=int(first), last=int(last))
+        for name, first, last in zip(row[STAGE_NAMES], row[STAGE_STARTS], row[STAGE_ENDS], strict=True)
+    ]
+    if not runs or runs[0].first != 0 or any(b.first != a.last + 1 for a, b in pairwise(runs)):
+        raise ValueError("stages that leave gaps")
+    return runs
 
 
 def write_progress(root: Path) -> None:
-    """Write the files of a whole dataset, durably, from the stages in its table of episodes.
+    """Write the files of progress durably, from the stages in the dataset's table of episodes.
 
     Raises:
         ExportError: The stages cannot be read.
     """
     try:
-        rows = rows_in(root, "meta/episodes", [*STAGE_COLUMNS, "num_goals"])
-        episodes = [EpisodeProgress.from_row(row) for row in rows]
+        rows = list(rows_in(root, "meta/episodes", [*STAGE_COLUMNS, "num_goals"]))
+        episodes = [_stage_runs(row) for row in rows]
+        stages = [dense_stages(int(row["num_goals"]), runs) for row, runs in zip(rows, episodes, strict=True)]
     except (ValueError, TypeError, KeyError) as error:
         raise ExportError(
             f"The stages of the dataset's episodes cannot be used ({describe_error(error)}): {root}"
         ) from error
-    stages = tuple(dict.fromkeys(stage for episode in episodes for stage in episode.stages))
-    shares = proportions([episode.runs for episode in episodes], stages)
-    pq.write_table(_progress_table(episodes, shares), root / PROGRESS_PATH, use_dictionary=["episode_index"])
+    shares = proportions(episodes, tuple(dict.fromkeys(chain.from_iterable(stages))))
+    parts = [progress(runs, possible, shares) for runs, possible in zip(episodes, stages, strict=True)]
+    pq.write_table(_progress_table(parts), root / PROGRESS_PATH, use_dictionary=["episode_index"])
     sync_path(root / PROGRESS_PATH)
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2) + "\n")
     sync_path(root / PROPORTIONS_PATH)
 
 
-def _progress_table(episodes: Sequence[EpisodeProgress], shares: dict[str, float]) -> pa.Table:
-    """`index`, `episode_index`, `frame_index`, `progress_dense` (0..1) of every row."""
-    lengths = [episode.num_frames for episode in episodes]
-    parts = [progress(episode.runs, episode.stages, shares) for episode in episodes]
+def _progress_table(parts: Sequence[Array]) -> pa.Table:
+    """Return `index`, `episode_index`, `frame_index` and `progress_dense` (0..1) of every row of these episodes."""
+    lengths = [len(part) for part in parts]
     return pa.table(
         {
             "index": np.arange(sum(lengths)),
@@ -142,12 +118,12 @@ _LEROBOT_COLUMN = re.compile(
 
 
 def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
-    """Column of a fact -> its type; a fact that is not listed is a number."""
+    """Return column of a fact -> type; a fact that is not listed is a number."""
     return {name: _TYPES.get(name, pa.float64()) for name in names}
 
 
 def fact_columns(root: Path) -> dict[str, pa.DataType]:
-    """Columns of the table of episodes beyond LeRobot's own -> their types; empty before v3.0.
+    """Return column of the table of episodes beyond LeRobot's own -> type; empty before v3.0.
 
     Raises:
         ExportError: The table is damaged.
@@ -157,32 +133,32 @@ def fact_columns(root: Path) -> dict[str, pa.DataType]:
     return {item.name: item.type for item in schema if not _LEROBOT_COLUMN.match(item.name)}
 
 
-def episode_facts(recording: Recording, trajectory: Trajectory) -> dict[str, Any]:
-    """Name -> value for a simulated episode; positions in the world frame at the start, metres."""
-    info, outcome = recording.info, recording.outcome
+def episode_facts(recording: Recording) -> dict[str, Any]:
+    """Return fact -> value for an episode with a scene; positions in the world frame at the start, metres."""
+    info, outcome, simulation = recording.info, recording.outcome, recording.info.simulated
     facts: dict[str, Any] = {
         "success": outcome is not None and outcome.success,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "interrupted" if outcome is None else outcome.failure_reason,
         "num_retries": 0 if outcome is None else outcome.num_retries,
-        "has_deliberate_miss": bool(trajectory.is_deliberate_miss.any()),
-        "duration_s": trajectory.num_frames / info.fps,
-        "task_name": info.simulated.task,
-        "split": str(info.simulated.config.get("split", "")),
-        "variation": str(info.simulated.config.get("variation", "")),
-        "seed": info.simulated.root_seed,
+        "has_deliberate_miss": bool(recording.trajectory().is_deliberate_miss.any()),
+        "duration_s": recording.num_frames / info.fps,
+        "task_name": simulation.task,
+        "split": str(simulation.config.get("split", "")),
+        "variation": str(simulation.config.get("variation", "")),
+        "seed": simulation.root_seed,
         "run_episode_index": info.episode_index,
         "attempt": info.attempt,
-        "num_goals": len(info.simulated.scene.goals),
-        **first_goal(info.simulated.scene),
+        "num_goals": len(simulation.scene.goals),
+        **first_goal(simulation.scene),
     }
-    facts |= {f"drawn/{name}": value for name, value in sorted(_drawn(info).items())}
+    facts |= {f"drawn/{name}": value for name, value in sorted(_drawn(simulation).items())}
     checks = () if outcome is None else outcome.checks
     return facts | {f"success_checks/{name}": value for name, value in _nearest_to_limit(checks).items()}
 
 
 def first_goal(scene: Scene | None) -> dict[str, Any]:
-    """The first object to be moved, its position and that of its goal at the start (m, world frame)."""
+    """Return the first object to be moved, its position and that of its goal at the start (m, world frame)."""
     found: dict[str, Any] = {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
     if scene is not None and scene.goals:
         goal = scene.goals[0]
@@ -192,11 +168,10 @@ def first_goal(scene: Scene | None) -> dict[str, Any]:
     return found
 
 
-def _drawn(info: EpisodeInfo) -> Mapping[str, float]:
-    """Values drawn for the episode: behaviour, the first object's size, mass and friction, gravity, light."""
-    scene = info.simulated.scene
-    drawn = dict(info.simulated.behaviour)
-    light = scene.light
+def _drawn(simulation: Simulation) -> Mapping[str, float]:
+    """Return the values drawn for the episode: behaviour, light, gravity; size, mass and friction of the object."""
+    scene, light = simulation.scene, simulation.scene.light
+    drawn = dict(simulation.behaviour)
     drawn |= {"light_ambient": light.ambient, "light_diffuse": light.diffuse, "light_shadow": light.shadow}
     drawn["light_turn"] = math.atan2(light.direction[1], light.direction[0])
     drawn["light_elevation"] = math.atan2(light.direction[2], math.hypot(light.direction[0], light.direction[1]))
@@ -210,7 +185,7 @@ def _drawn(info: EpisodeInfo) -> Mapping[str, float]:
 
 
 def _nearest_to_limit(checks: Iterable[SuccessCheck]) -> dict[str, float]:
-    """Condition -> value found; of several objects, the one that failed, or is nearest to failing."""
+    """Return condition -> measured value; for several objects, the one that failed or is nearest to failing."""
     worst: dict[str, SuccessCheck] = {}
     for check in checks:
         name = check.name.partition(":")[0]

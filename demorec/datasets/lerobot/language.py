@@ -63,7 +63,7 @@ def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLan
     """The statements in LeRobot's form; times are bit-exact those of the `timestamp` column."""
     persistent = [
         {
-            "role": statement.role,
+            "role": "user" if statement.kind == "task_aug" else "assistant",
             "content": statement.text,
             "style": statement.kind,
             "timestamp": float(np.float32(statement.row / fps)),

@@ -1,7 +1,7 @@
-"""What draws and moves the arm of a dataset's episodes, in the folder `demorec/robots/` of the dataset.
+"""Descriptions of the arms of a dataset's episodes, in the folder `demorec/robots/` of the dataset.
 
-Each arm has two files that are named after a digest of both: `DIGEST.urdf`, and `DIGEST.json` with what no URDF says.
-Episodes name their arm by it, so that arms that differ can stand in one dataset, and appending adds at most a pair.
+Each arm has two files, named by a digest of both: `DIGEST.urdf`, and `DIGEST.json` with everything that a URDF cannot
+express. Episodes refer to their arm by the digest, so one dataset can hold episodes of different arms.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.writer import write_text
-from demorec.episode.features import ACTION, STATE
+from demorec.episode.features import ACTION, EE_POSE, STATE
 from demorec.episode.info import Feature
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
@@ -35,14 +35,14 @@ if TYPE_CHECKING:
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
 ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
-"""What of the name of an element is not that of its joint."""
+"""Ending of an element's name after the name of its joint."""
 _DIGEST = re.compile(r"[0-9a-f]{16}")
 IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
-"""Rows of `ROBOTS` whose joints LeRobot itself has, in other units -> the arm as LeRobot drives it."""
+"""Row of `ROBOTS` that LeRobot drives too, in other units -> LeRobot's arm."""
 _IN_METRES = "gripper.width"
-"""A gripper's element whose name says so; LeRobot's is gripper.pos."""
+"""Name of a gripper's element in metres; LeRobot's own is gripper.pos."""
 _KEPT = ("material", "link", "joint")
-"""What of a URDF places and draws links; the rest is for simulators and controllers, and full of paths."""
+"""Parts of a URDF that place and draw links; the others are for simulators and controllers, and full of paths."""
 _IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")
 """An absolute path into an installed ROS package."""
 _ABSOLUTE = re.compile(r"^(file:|/|~|[A-Za-z]:[\\/]|\\\\)")
@@ -50,16 +50,16 @@ _ABSOLUTE = re.compile(r"^(file:|/|~|[A-Za-z]:[\\/]|\\\\)")
 
 @dataclass(frozen=True, kw_only=True)
 class RobotRecord:
-    """What is known of an arm beside its URDF.
+    """Properties of an arm that its URDF cannot express.
 
     Attributes:
         name: The dataset's `robot_type`.
         urdf_sha256: SHA-256 (hex) of the URDF's file.
-        joints: Feature -> for each of its elements the joint of the URDF of which it is the position, "" for none.
-        units: Feature -> of its elements, where they are known; positions are in rad and m otherwise.
-        calibration: Feature -> of its elements, as `Feature` has it; only of servos that say something else.
+        joints: Feature -> joint of the URDF for each element that is its position, "" for the others.
+        units: Feature -> units of its elements, if known; positions are in rad and m otherwise.
+        calibration: Feature -> calibration of its elements (`Feature.calibration`), for servos in other units.
         spec: TCP link, limits and gripper of a simulated arm, and `urdf`, its model with meshes; the URDF here has
-            boxes in their place.
+            boxes instead.
     """
 
     name: str
@@ -70,7 +70,7 @@ class RobotRecord:
     calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
     def described(self, feature: Feature) -> Feature:
-        """A feature with what is known of it here, as far as that fits its elements."""
+        """Return a feature with its joints, units and calibration, as far as they fit its elements."""
 
         def fitting[T](found: Mapping[str, tuple[T, ...]]) -> tuple[T, ...]:
             values = found.get(feature.name, ())
@@ -86,39 +86,43 @@ class RobotRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetRobot:
-    """An arm: what its two files hold."""
+    """The content of an arm's two files."""
 
     record: RobotRecord
     urdf: str
 
     @functools.cached_property
     def digest(self) -> str:
-        """The name of its files: of all that is in them."""
+        """Digest of both files, and their name."""
         return digest(self.record)
 
     @functools.cached_property
     def model(self) -> Urdf:
-        """The joint tree; lengths are those of the arm, whatever its scale was."""
+        """Joint tree; lengths are those of the arm at any scale."""
         return Urdf.parse(self.urdf)
 
 
-def robot_of(episode: ExportEpisode) -> DatasetRobot | None:
-    """The robot of an episode, and which of its joints the features move; None where its URDF is not known.
+def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
+    """Return the robot of an episode with the joints that the features move; None if its URDF is unknown.
 
     Raises:
         RecordingError: The recording is damaged.
     """
     if not (text := episode.urdf):
         return None
-    name, moving = episode.recording.info.robot_name, episode.moving()
-    if episode.info.simulation is None:
-        return _robot(name, portable_urdf(text), moving)
-    spec = episode.info.simulated.robot
-    return _robot(name, text, moving, spec=spec)
+    info = episode.info
+    if episode.scene is None:
+        return _robot(info.robot_name, portable_urdf(text), [each for each in info.features if any(each.joints)])
+    recorded = {feature.name: feature for feature in info.features}
+    state, pose = recorded[STATE], recorded[EE_POSE]
+    if episode.state == "joint_ee":
+        no_joints = ("",) * len(pose.names)
+        state = replace(state, joints=(*state.joints, *no_joints), units=(*state.units, *pose.units))
+    return _robot(info.robot_name, text, [state], spec=info.simulated.robot)
 
 
 def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> DatasetRobot:
-    """An arm whose joints these features move, with what else of its record is known."""
+    """Build an arm whose joints these features move; `known` are further attributes of its record."""
     record = RobotRecord(
         name=name,
         urdf_sha256=_sha256(urdf),
@@ -132,10 +136,11 @@ def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> Dat
 
 @functools.cache
 def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
-    """The arm of ours whose joints the elements of observation.state are called after, "panda_joint1.pos" or the like.
+    """Return the row of `ROBOTS` whose joints name the elements of observation.state, such as "panda_joint1.pos".
 
-    Of a dataset that does not say what its robot is; lengths are those of the model. LeRobot's own arms are left out
-    unless the gripper is called in metres: their joints are called the same in degrees and in shares of their ranges.
+    This is for datasets without a description of the robot; lengths are those of the model. LeRobot's own arms are left
+    out unless the name of the gripper implies metres: their joints have the same names in degrees and in shares of
+    their ranges.
     """
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
@@ -146,7 +151,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
             continue
         if set(robot.arm_joints) <= set(stems):
             urdf = robot_description(robot.urdf, 1.0)
-            # An opening in metres is no angle of the jaw.
+            # An opening in metres is not an angle of the jaw.
             known = zip(names, stems, strict=True)
             joints = tuple(stem if stem in robot.joint_names and name != _IN_METRES else "" for name, stem in known)
             return _robot(robot.name, urdf, [Feature(name=STATE, names=names, joints=joints)])
@@ -154,14 +159,14 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
 
 
 def motor_features(motors: Motors) -> tuple[Feature, ...]:
-    """State and action as LeRobot records them of a real arm."""
+    """Describe state and action as LeRobot records them from a real arm."""
     known: Any = {"units": motors.units, "joints": motors.joints, "calibration": motors.to_positions}
     return tuple(Feature(name=name, names=motors.names, **known) for name in (STATE, ACTION))
 
 
 @functools.cache
 def robot_of_motors(motors: Motors) -> DatasetRobot:
-    """The arm that has these servos."""
+    """Return the arm with these servos."""
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
     (model,) = (ROBOTS.load(name).urdf for name, arm in IN_MOTOR_UNITS.items() if arm.robot_type == motors.robot_type)
@@ -170,10 +175,10 @@ def robot_of_motors(motors: Motors) -> DatasetRobot:
 
 @functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
 def portable_urdf(text: str) -> str:
-    """The links, joints and materials of a URDF, without a path of the machine that it comes from.
+    """Return the links, joints and materials of a URDF, without paths of the machine that it comes from.
 
-    What lies in a ROS package is named by it (package://NAME/...), any other absolute path by the file's name alone.
-    Comments go, in which xacro writes where it was run.
+    Files in a ROS package are named by it (package://NAME/...), other absolute paths by the file's name alone. Comments
+    are removed, since xacro writes the folder in which it ran.
     """
     robot = parse_xml(text)
     for part in list(robot):
@@ -193,7 +198,7 @@ def _portable(name: str) -> str:
 
 
 def write_robot(root: Path, robot: DatasetRobot) -> None:
-    """Write the files of an arm, unless the dataset has them."""
+    """Write the files of an arm unless they exist."""
     folder = root / ROBOTS_DIR
     folder.mkdir(parents=True, exist_ok=True)
     for name, text in ((".urdf", robot.urdf), (".json", to_json(robot.record, indent=2) + "\n")):
@@ -203,7 +208,7 @@ def write_robot(root: Path, robot: DatasetRobot) -> None:
 
 
 def read_robot(root: Path, name: str) -> DatasetRobot:
-    """The arm that the episodes of a dataset call by this digest.
+    """Read the arm with this digest from a dataset.
 
     Raises:
         ExportError: It is missing, has changed since it was written, or cannot be used.

@@ -6,7 +6,7 @@
 - `camera_poses/`: one row per frame, for cameras that move.
 - `attempts/`: one row per attempt, failed ones included, for success rates. A failed attempt precedes the attempt that
   became an episode.
-- `robots/`: what draws and moves the arms, in a form that needs nothing of ours (`demorec.datasets.lerobot.robots`).
+- `robots/`: the arms as URDFs (`demorec.datasets.lerobot.robots`).
 - `configs.json`: config digest -> resolved configuration; `export.json`: how the dataset was made.
 """
 
@@ -15,13 +15,11 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from demorec.core.files import Closing
 from demorec.core.geometry import Array
@@ -37,11 +35,12 @@ from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
 from demorec.datasets.lerobot.writer import write_text
+from demorec.episode.episode import Outcome, consecutive_runs
 
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
-    from demorec.episode.episode import Trajectory
-    from demorec.episode.info import Camera
+    from demorec.episode.info import Camera, Simulation
+    from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -105,13 +104,13 @@ ATTEMPT_SCHEMA = pa.schema(
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRecord:
-    """What stands beside one episode of the dataset.
+    """The sidecar's data about one episode of the dataset.
 
     Attributes:
-        row: Of the episodes' table, less the index.
+        row: Row of the table of episodes, without the index.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
-        config: Configuration of its run.
-        robot: What draws and moves its arm; None where that is not known.
+        config: Configuration of the run.
+        robot: The arm; None if unknown.
     """
 
     row: Mapping[str, Any]
@@ -120,57 +119,52 @@ class EpisodeRecord:
     config: Mapping[str, Any] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, episode: ExportEpisode) -> EpisodeRecord:
-        """Of an episode; frame numbers are those of the dataset."""
-        info, rows, attempt = episode.info, episode.rows, attempt_row(episode.recording)
+    def of(cls, episode: ExportEpisode[Any]) -> EpisodeRecord:
+        """Describe an episode; frame numbers are those of the dataset."""
+        info, recording = episode.info, episode.recording
+        attempt, simulation = attempt_row(recording, episode.scene), info.simulation
         row = {
             **{name: attempt[name] for name in ("source", "run_episode_index", "attempt", "success", "failure_reason")},
-            "origin": episode.origin,
+            "origin": info.origin if isinstance(info.origin, str) else to_json(info.origin),
             "cameras": [_described_camera(camera) for camera in info.cameras],
         }
-        moving: dict[str, Array] = {}
-        if (simulation := info.simulation) is not None:
-            row |= _simulated_row(episode)
-            poses = episode.trajectory.world_from_camera
-            moving = {camera.name: poses[camera.name][rows] for camera in info.cameras if camera.mount != "world"}
+        if simulation is None:
+            return cls(row=row, moving_cameras={}, robot=robot_of(episode))
+        poses = recording.trajectory().world_from_camera
+        moving = [camera.name for camera in info.cameras if camera.mount != "world"]
         return cls(
-            row=row,
-            moving_cameras=moving,
-            config={} if simulation is None else simulation.config,
+            row=row | _simulated_row(simulation, episode),
+            moving_cameras={name: poses[name][episode.rows] for name in moving},
+            config=simulation.config,
             robot=robot_of(episode),
         )
 
 
-def _simulated_row(episode: ExportEpisode) -> dict[str, Any]:
-    """What is known of a simulated episode; it failed where its recording ends without an outcome."""
-    info, trajectory, outcome = episode.info, episode.trajectory, episode.recording.outcome
+def _simulated_row(simulation: Simulation, episode: ExportEpisode[Any]) -> dict[str, Any]:
+    """Return the columns that need a simulation; one that was cut off had no outcome yet."""
+    trajectory, recording = episode.recording.trajectory(), episode.recording
+    outcome = recording.outcome or Outcome(num_frames=recording.num_frames)
     return {
-        "root_seed": info.simulated.root_seed,
-        "config_digest": info.simulated.config_digest,
-        "failure_phase": "" if outcome is None else outcome.failure_phase,
-        "num_retries": 0 if outcome is None else outcome.num_retries,
-        "final_state_digest": "" if outcome is None else outcome.final_state_digest,
-        "checks": [] if outcome is None else [to_plain(check) for check in outcome.checks],
-        "phases": _phases(trajectory, episode.rows),
+        "root_seed": simulation.root_seed,
+        "config_digest": simulation.config_digest,
+        "failure_phase": outcome.failure_phase,
+        "num_retries": outcome.num_retries,
+        "final_state_digest": outcome.final_state_digest,
+        "checks": [to_plain(check) for check in outcome.checks],
+        "phases": [
+            {"name": name, "from": first, "to": end}
+            for name, first, end in consecutive_runs([trajectory.phase[frame] for frame in episode.rows])
+        ],
         "objects": [
             {"name": name, "world_from_object_end": poses[-1].tolist()}
             for name, poses in trajectory.object_poses.items()
         ],
-        "episode_info": to_json(info),
+        "episode_info": to_json(episode.info),
     }
 
 
-def _phases(trajectory: Trajectory, rows: NDArray[np.intp]) -> list[dict[str, Any]]:
-    """Name, first frame and frame after the last, of each phase."""
-    phases = []
-    for name, group in groupby(range(len(rows)), key=lambda index: trajectory.phase[rows[index]]):
-        numbers = list(group)
-        phases.append({"name": name, "from": numbers[0], "to": numbers[-1] + 1})
-    return phases
-
-
 def _described_camera(camera: Camera) -> dict[str, Any]:
-    """A camera of a recording; None for unknown values."""
+    """Return the entry of a camera; None for unknown values."""
     intrinsics = camera.intrinsics
     placed = camera.mount_from_camera
     return {
@@ -184,11 +178,11 @@ def _described_camera(camera: Camera) -> dict[str, Any]:
 
 
 class SidecarWriter(Closing):
-    """Writes the sidecar's tables as the episodes come; `finish` completes them.
+    """Context manager that writes the sidecar's tables episode by episode; `finish` completes them.
 
     Args:
-        root: Folder of the dataset; what it holds of a sidecar already is gone on with.
-        configs: Config digest -> configuration, of the episodes that are there.
+        root: Folder of the dataset; an existing sidecar is continued.
+        configs: Config digest -> configuration, of the existing episodes.
     """
 
     def __init__(self, root: Path, info: DatasetInfo, configs: Mapping[str, Any]) -> None:
@@ -205,12 +199,12 @@ class SidecarWriter(Closing):
         return table
 
     def close(self) -> None:
-        """Let go of the tables; those that are not finished are left as they are."""
+        """Close the tables without completing them."""
         for table in self._tables:
             table.abort()
 
     def add(self, episode_index: int, digest: str, record: EpisodeRecord, attempt: Mapping[str, Any]) -> None:
-        """What belongs to an episode of the dataset with this digest, and the attempt that it was."""
+        """Add an episode of the dataset, its digest, and the attempt that it was."""
         robot = record.robot
         added = {"episode_index": episode_index, "content_digest": digest}
         self._episodes.add_row({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
@@ -223,7 +217,7 @@ class SidecarWriter(Closing):
             self._add_camera_poses(episode_index, record.moving_cameras)
 
     def add_attempt(self, attempt: Mapping[str, Any], episode_index: int | None = None) -> None:
-        """Add an attempt; None: it is not in the dataset."""
+        """Add an attempt; `episode_index` is None if it is not in the dataset."""
         self._attempts.add_row({**attempt, "episode_index": episode_index})
 
     def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:
@@ -247,10 +241,10 @@ class SidecarWriter(Closing):
         return self._configs
 
 
-def attempt_row(recording: Recording) -> dict[str, Any]:
-    """One attempt, as far as success rates need it, from the recording's metadata alone, less `episode_index`.
+def attempt_row(recording: Recording, scene: Scene | None) -> dict[str, Any]:
+    """Return one attempt, as far as success rates need it, from the recording's metadata alone, less `episode_index`.
 
-    Positions are in the world frame, metres, at the start; `success` is None where nobody said.
+    Positions are in the world frame, metres, at the start; `success` is None where it is unknown.
     """
     info, outcome = recording.info, recording.outcome
     return {
@@ -260,5 +254,5 @@ def attempt_row(recording: Recording) -> dict[str, Any]:
         "success": recording.success,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
-        **first_goal(None if info.simulation is None else info.simulated.scene),
+        **first_goal(scene),
     }

@@ -1,8 +1,7 @@
-"""Opens a finished dataset with the installed LeRobot and compares samples of it with the recordings.
+"""Comparison of a finished dataset, read by the installed LeRobot, with the recordings.
 
-Nothing of the writing code is used to read: LeRobot finds the rows, the files and the images by itself. It runs in
-a process of its own, since LeRobot brings PyTorch (seconds to load, hundreds of megabytes) and keeps copies of the
-tables in a cache, which here is a temporary folder.
+LeRobot alone finds the rows, files and images. It runs in a separate process, since it loads PyTorch (seconds,
+hundreds of megabytes) and keeps copies of the tables in a cache, here a temporary folder.
 """
 
 from __future__ import annotations
@@ -23,39 +22,39 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, ExportError, describe_error, resource_error
 from demorec.core.processes import SPAWN, exit_silently
-from demorec.datasets.episode import ExportCamera, ExportEpisode
+from demorec.datasets.episode import ExportCamera
 from demorec.datasets.lerobot.depth import code_values, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
-from demorec.datasets.lerobot.motor_units import recording_of
+from demorec.datasets.lerobot.motor_units import export_episode
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.prepare import prepare_episode, reason_to_transcode
-from demorec.mcap import Recording
+from demorec.datasets.lerobot.prepare import LeRobotEpisode, language_of, reason_to_transcode
+from demorec.mcap import open_recording
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
-"""What pip has to install for a verification; a test compares it with pyproject.toml."""
+"""Requirement for a verification; a test compares it with pyproject.toml."""
 
 MAX_EPISODES = 500
-"""Samples are taken of so many episodes, spread evenly, if there are more."""
+"""Maximum number of episodes from which samples are taken, evenly spaced."""
 
 _TRANSCODED_TOLERANCE = 12.0
-"""Mean absolute difference in levels (0..255) allowed of an image that was encoded anew; others must be equal."""
+"""Maximum mean absolute difference of a transcoded image, in levels (0..255); others must be equal."""
 _DEPTH_TOLERANCE = 6e-4
 """Metres; LeRobot rounds distances to millimetres."""
 
 
 _GRACE_S = 5.0
-"""How long the process may take to end by itself."""
+"""Time for the process to end by itself."""
 
 
 def lerobot_is_installed() -> bool:
-    """Whether there is a LeRobot that could verify; tells it without loading it."""
+    """Whether LeRobot is installed; does not load it."""
     return importlib.util.find_spec("lerobot") is not None
 
 
 class Verifier:
-    """Context manager over the process that verifies; it starts loading LeRobot at once, while the export runs.
+    """Context manager over the process that verifies; it loads LeRobot while the export runs.
 
-    The process is ended with the context, whatever it does then: with too little memory, loading may never end.
+    Leaving the context ends the process in any state: with too little memory, loading may never end.
     """
 
     def __init__(self) -> None:
@@ -98,7 +97,7 @@ class Verifier:
 
 
 def _serve(pipe: Connection[Any, Any], cache: str) -> None:
-    """Life of the process: load LeRobot, verify what comes through the pipe, answer with a count or an error."""
+    """Load LeRobot, verify the dataset named through the pipe, and answer with a count or an error."""
     signal.signal(signal.SIGTERM, exit_silently)  # an orderly end: libraries left semaphores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; who exports ends us
     os.environ.update(HF_HUB_OFFLINE="1", HF_DATASETS_OFFLINE="1", HF_DATASETS_CACHE=cache)
@@ -125,26 +124,23 @@ def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOpti
 
     try:
         dataset = LeRobotDataset(options.repo_id, root=root, video_backend="pyav", return_uint8=True)
-    except Exception as error:  # whatever LeRobot says, the dataset must not be handed out
+    except Exception as error:  # on any error of LeRobot, the dataset is dropped
         raise resource_error(error) or ExportError(
             f"The new dataset was dropped, LeRobot cannot open it ({describe_error(error)})."
         ) from error
     frames = 0
     for number, (episode_index, path) in enumerate(samples):
-        with recording_of(path, options) as recording:
-            frames += _compare_episode(dataset, episode_index, recording, options, number)
+        with open_recording(path) as recording:
+            frames += _compare_episode(dataset, episode_index, export_episode(recording, options), number)
     return frames
 
 
-def _compare_episode(
-    dataset: Any, episode_index: int, recording: Recording, options: ExportOptions, number: int
-) -> int:
+def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, number: int) -> int:
     first = int(dataset.meta.episodes[episode_index]["dataset_from_index"])
-    episode = ExportEpisode(recording, options)
     length = len(episode.rows)
     # The last frame, where offsets add up, and one more that differs from episode to episode.
     moments = sorted({(number * 37) % length, length - 1})
-    expected = prepare_episode(episode, options, encode_depth=False)
+    language = language_of(episode)
     for moment in moments:
         try:
             item = dataset[first + moment]
@@ -154,10 +150,10 @@ def _compare_episode(
                 f"({describe_error(error)})."
             ) from error
         wrong = [
-            name for name, values in expected.columns.items() if name in item and not _equal(item[name], values[moment])
+            name for name, values in episode.columns.items() if name in item and not _equal(item[name], values[moment])
         ]
-        wrong += _wrong_language(item, expected.language, moment)
-        if item["task"] != expected.task:
+        wrong += _wrong_language(item, language, moment)
+        if item["task"] != episode.info.instruction:
             wrong.append("task")
         if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
             wrong.append("timestamp")
@@ -169,7 +165,7 @@ def _compare_episode(
         if wrong:
             raise ExportError(
                 f"The new dataset was dropped: read through LeRobot, {', '.join(wrong)} of frame {moment} of episode "
-                f"{episode_index} differ from the recording: {recording.path}"
+                f"{episode_index} differ from the recording: {episode.recording.path}"
             )
     return len(moments)
 
@@ -184,8 +180,8 @@ def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[s
     return [name for name, expected in rows.items() if name in item and item[name] != list(expected)]
 
 
-def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, moment: int) -> bool:
-    """Whether an image differs from the one that the frame shows; of depth, as far as its codes tell."""
+def _is_wrong_image(tensor: Any, episode: LeRobotEpisode, camera: ExportCamera, moment: int) -> bool:
+    """Whether an image differs from the recorded one, for depth beyond the resolution of its codes."""
     number, recording = int(episode.numbers(camera)[moment]), episode.recording
     if camera.is_depth:
         return _is_wrong_depth(tensor, next(islice(recording.depth(camera.name), number, None)))
@@ -195,7 +191,7 @@ def _is_wrong_image(tensor: Any, episode: ExportEpisode, camera: ExportCamera, m
 
 
 def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
-    """Whether distances, which LeRobot gives in mm, are not the recorded ones (H, W), m, as far as its codes tell."""
+    """Whether distances from LeRobot, mm, differ from the recorded ones (H, W), m, beyond the codes' resolution."""
     found = tensor.numpy()
     found = found.reshape(found.shape[-2:]) / 1000
     return bool(np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
