@@ -22,6 +22,7 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.writer import write_text
+from demorec.episode.element_names import joint_of
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import Feature
 from demorec.robots.motors import Motors
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
-ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
-"""What of the name of an element is not that of its joint."""
 _DIGEST = re.compile(r"[0-9a-f]{16}")
 IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
 """Rows of `ROBOTS` whose joints LeRobot itself has, in other units -> the arm as LeRobot drives it."""
@@ -69,11 +68,16 @@ class RobotRecord:
     spec: RobotSpec | None = None
     calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
-    def described(self, feature: Feature) -> Feature:
-        """A feature with what is known of it here, as far as that fits its elements."""
+    def described(self, feature: Feature, usual_name: str = "") -> Feature:
+        """A feature with what is known of it here, as far as that fits its elements.
+
+        Args:
+            feature: As the dataset describes it.
+            usual_name: Under which it is known here, where its own name is not; "" for none.
+        """
 
         def fitting[T](found: Mapping[str, tuple[T, ...]]) -> tuple[T, ...]:
-            values = found.get(feature.name, ())
+            values = found.get(feature.name, found.get(usual_name, ()))
             return values if len(values) == len(feature.names) else ()
 
         return replace(
@@ -139,7 +143,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
-    stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
+    stems = [joint_of(name) for name in names]
     for row in ROBOTS.names():
         robot = ROBOTS.load(row)
         if robot.name in IN_MOTOR_UNITS and _IN_METRES not in names:
