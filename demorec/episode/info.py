@@ -46,7 +46,7 @@ class Feature:
         source: Where it came from, in words: "/joint_states position, latest before, header stamps".
         calibration: For each element a factor and an offset: factor times the value plus offset is rad or m, of servos
             that say something else; empty where the unit says it.
-        role: Role that the user named; "" where names in common use say it (`demorec.episode.roles`).
+        role: Role that its name does not say; "" where names in common use do (`demorec.episode.roles`).
     """
 
     name: str

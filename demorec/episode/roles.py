@@ -34,8 +34,8 @@ camera: images."""
 
 ROLES: tuple[Role | None, ...] = (*get_args(Role), None)
 """The order in which people are shown features."""
-RECORDED_ROLES = ("state", "action", "gripper")
-"""Roles that an import records of the features that the user named."""
+RecordedRole = Literal["", "state", "action", "gripper"]
+"""Role that a recording keeps of a feature; "" where names alone say it."""
 SIMULATED_ROLES = (
     "--state, --action and --gripper are for data that demorec did not simulate; leave them out for its own."
 )
@@ -113,7 +113,7 @@ class NamedRoles:
     def __bool__(self) -> bool:
         return bool(self.state or self.action or self.gripper)
 
-    def role_of(self, feature: str) -> Literal["", "state", "action", "gripper"]:
+    def role_of(self, feature: str) -> RecordedRole:
         """The role that the user names for a feature, "" for none."""
         if feature in self.state:
             return "state"
@@ -197,6 +197,17 @@ class Roles:
             return np.array([part in chosen or name in chosen for part, name in elements], dtype=np.bool_)
         return np.array([self.of[part] == "gripper" or is_gripper(name) for part, name in elements], dtype=np.bool_)
 
+    def beyond_names(self) -> dict[str, RecordedRole]:
+        """Features whose role is not found by names alone, for a recording to keep."""
+        usual = find_roles(self.columns, NO_NAMES)
+        grippers = [name for name in self.having("gripper") if usual.of[name] != "gripper"]
+        found: dict[str, RecordedRole] = dict.fromkeys(grippers, "gripper")
+        if self.state != usual.state:
+            found |= dict.fromkeys(self.having("state"), "state")
+        if self.action != usual.action:
+            found |= dict.fromkeys(self.having("action"), "action")
+        return found
+
     def notes(self) -> Iterator[str]:
         """Sentences about what has no role."""
         if missing := [word for word, parts in (("state", self.state), ("action", self.action)) if not parts]:
@@ -221,7 +232,9 @@ def roles_of_features(features: Iterable[Feature], named: NamedRoles) -> Roles:
     """The roles of features as recordings describe them; errors as `find_roles`."""
     features = tuple(features)
     free = [feature for feature in features if not named.role_of(feature.name)]
-    recorded = {role: tuple(feature.name for feature in free if feature.role == role) for role in RECORDED_ROLES}
+    recorded = {
+        role: tuple(feature.name for feature in free if feature.role == role) for role in ("state", "action", "gripper")
+    }
     merged = NamedRoles(**{role: getattr(named, role) or names for role, names in recorded.items()})
     return find_roles({feature.name: Column(feature.dtype, feature.names) for feature in features}, merged)
 
@@ -247,8 +260,8 @@ def find_roles(columns: Mapping[str, Column], named: NamedRoles, modality: Modal
     _check_named(columns, {"state": named.state, "action": named.action, "gripper": gripper_features})
     taken = {*named.state, *named.action, *gripper_features}
     free = [name for name, column in columns.items() if column.is_vector and name not in taken]
-    state = named.state or _present(modality.state, free) or _state_parts(free)
-    action = named.action or _present(modality.action, free) or _action_parts(free)
+    state = named.state or tuple(filter(free.__contains__, modality.state)) or _state_parts(free)
+    action = named.action or tuple(filter(free.__contains__, modality.action)) or _action_parts(free)
     of = {name: _role_by_name(name, column) for name, column in columns.items()}
     for name in modality.labels:
         if name in of:
@@ -329,11 +342,6 @@ def _role_by_name(name: str, column: Column) -> Role | None:
     kind = _kind(words)
     is_observation = bool(head) or _JOINTS.search("_".join(words)) is not None
     return kind or ("sensor" if is_observation else None)
-
-
-def _present(wanted: Sequence[str], free: Sequence[str]) -> tuple[str, ...]:
-    """Those that are there."""
-    return tuple(name for name in wanted if name in free)
 
 
 def _state_parts(free: Sequence[str]) -> tuple[str, ...]:

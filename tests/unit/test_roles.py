@@ -60,13 +60,15 @@ def test_the_spoilt_episode_has_the_lowest_score(name: str, tmp_path: Path, caps
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_an_import_keeps_what_is_found(name: str, tmp_path: Path, capsys: Capture) -> None:
     root, run = write_convention(tmp_path / "d", CONVENTIONS[name]), tmp_path / "run"
-    if "v2" in CONVENTIONS[name].version or CONVENTIONS[name].modality is None:
-        assert exit_code("import", "lerobot", root, "--out", run) == 0
-        capsys.readouterr()
-        assert exit_code("info", run, "--json") == 0
-        roles = json.loads(capsys.readouterr().out)["roles"]
-        assert {*roles["state"]} == {*CONVENTIONS[name].state}
-        assert {*roles["action"]} == {*CONVENTIONS[name].action}
+    assert exit_code("info", root, "--json") == 0
+    there = json.loads(capsys.readouterr().out)["roles"]
+    assert exit_code("import", "lerobot", root, "--out", run) == 0
+    capsys.readouterr()
+    assert exit_code("info", run, "--json") == 0
+    roles = json.loads(capsys.readouterr().out)["roles"]
+    assert {*roles["state"]} == {*CONVENTIONS[name].state}
+    assert {*roles["action"]} == {*CONVENTIONS[name].action}
+    assert roles["grippers"] == there["grippers"]
 
 
 def test_without_state_and_action_the_verdict_says_what_was_not_looked_at(tmp_path: Path, capsys: Capture) -> None:

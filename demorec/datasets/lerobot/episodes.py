@@ -11,7 +11,7 @@ where it is there. Memory is that of an episode's numbers.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -67,7 +67,7 @@ class LeRobotDataset(OpenDataset):
         keys: Camera, as recordings call it -> feature.
         left_out: What no recording can hold, by its name in the dataset -> why.
         motors: The servos whose values its state and actions are, where the user says so.
-        roles: The role of each feature; one that the user named is also in `features`.
+        roles: The role of each feature; one that no name says is also in `features`.
 
     Raises:
         ExportError: As `OpenDataset`.
@@ -78,6 +78,7 @@ class LeRobotDataset(OpenDataset):
         super().__init__(root)
         self.motors = motors
         self.roles = dataset_roles(root, self.info, named)
+        roles = self.roles.beyond_names()
         if motors is not None and self.roles.elements(self.roles.state) != motors.names:
             raise ConfigError(
                 f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
@@ -95,7 +96,8 @@ class LeRobotDataset(OpenDataset):
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
                 self.keys[camera] = name
             elif name not in AUTOMATIC_FEATURES:
-                self.features += (replace(_feature(name, feature), role=named.role_of(name)),)
+                vector = _feature(name, feature, self.roles.columns[name].elements)
+                self.features += (replace(vector, role=roles.get(name, "")),)
         self.left_out |= dict(self._left_out_beside())
         self._cameras: dict[str, Camera] = {}
         self._videos: dict[tuple[str, int], EpisodeVideo] = {}
@@ -245,9 +247,9 @@ def _why_no_distances(feature: DatasetFeature) -> str:
     return ""
 
 
-def _feature(name: str, feature: DatasetFeature) -> Feature:
+def _feature(name: str, feature: DatasetFeature, elements: Sequence[str]) -> Feature:
     count = int(np.prod(feature.shape))
-    names = tuple(name.replace(",", " ") for name in feature.elements)
+    names = tuple(name.replace(",", " ") for name in elements)
     if len(set(names)) != count:
         names = numbers(count)
     return Feature(name=name, dtype=_RECORDED[feature.dtype], names=names, source=name)
