@@ -7,16 +7,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from demorec.cli.shared import role_lines
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
-from demorec.cli.shared.role_lines import (
-    feature_rows,
-    recording_features,
-    role_facts,
-    roles_as_plain,
-    roles_of_dataset,
-    roles_of_run,
-)
 from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
@@ -145,7 +138,7 @@ def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]
         facts.append(("objects", ", ".join(plain["objects"]) or "none"))
     if origin := plain["origin"]:
         facts.append(("origin", origin if isinstance(origin, str) else _origin(origin)))
-    facts += recording_features(plain["features"])
+    facts += role_lines.recording_features(plain["features"])
     facts += [(f"camera {camera['name']}", ", ".join(_camera(camera, is_simulated))) for camera in plain["cameras"]]
     facts += [(f"dropped {what}", str(count)) for what, count in plain["drops"].items()]
     for check in plain["checks"]:
@@ -207,7 +200,7 @@ def _run(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     run = load_any_run_file(path)
     if run.generation is None:
         left_out = _left_out(path)
-        roles = roles_of_run(path, run, named)
+        roles = role_lines.roles_of_run(path, run, named)
         plain = {
             "kind": "external run",
             "path": str(path),
@@ -215,7 +208,7 @@ def _run(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
             "digest": run.digest,
             **run.plain(),
         }
-        plain |= {"roles": None if roles is None else roles_as_plain(roles), "left_out": left_out}
+        plain |= {"roles": None if roles is None else role_lines.roles_as_plain(roles), "left_out": left_out}
         return plain, [*_external_run_lines(path, run, roles), *_left_out_lines(left_out)]
     if named:
         from demorec.episode.roles import SIMULATED_ROLES
@@ -276,7 +269,7 @@ def _external_run_lines(path: Path, run: RunFile, roles: Roles | None) -> list[s
         ("episodes", f"{len(run.attempts)}{f' ({parts})' if parts else ''}"),
         ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
         ("size", size_in_words(sum(line.num_bytes for line in run.attempts))),
-        *(() if roles is None else role_facts(roles)),
+        *(() if roles is None else role_lines.role_facts(roles)),
         ("digest", run.digest),
     ]
     if run.unfinished:
@@ -330,20 +323,20 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
             ("robot", str(info["robot_type"])),
             ("size", size_in_words(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
         ]
-        roles = roles_of_dataset(path, named)
+        roles = role_lines.roles_of_dataset(path, named)
         more, problems = _dataset_content(path)
         facts += [
-            *([] if roles is None else role_facts(roles)),
+            *([] if roles is None else role_lines.role_facts(roles)),
             *more,
             *(("problem", problem) for problem in problems[:_MOST_PROBLEMS]),
         ]
         if len(problems) > _MOST_PROBLEMS:
             facts.append(("problems", f"{len(problems)} in all; demorec check says more"))
-        rows = feature_rows(path, info, roles)
+        rows = role_lines.feature_rows(path, info, roles)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
     plain: dict[str, Any] = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
-    plain["roles"] = None if roles is None else roles_as_plain(roles)
+    plain["roles"] = None if roles is None else role_lines.roles_as_plain(roles)
     return plain, [*aligned(facts), "", *aligned(rows)]
 
 
