@@ -8,6 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
+import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Form
@@ -18,12 +19,14 @@ from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, read_table, tables_in
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
+from demorec.datasets.lerobot.modality import dataset_roles
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places, read_tasks
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
-from demorec.episode.features import ACTION, STATE, ActionKind, action_names
+from demorec.episode.features import ACTION, ActionKind, action_names
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 from demorec.episode.validity import read_episode_info
 from demorec.robots.motors import Motors
 
@@ -59,22 +62,29 @@ class Dataset:
         path: Its folder.
         urdf: Text of its robot's description that the user names, "" for none.
         motors: The servos whose values its state and actions are, if the user says so.
+        named: Features whose role the user names.
     """
 
     form: ClassVar[Form] = "dataset"
     has_equal_starts: ClassVar[bool] = False
     """Not recorded in datasets."""
 
-    def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None) -> None:
+    def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
         self.path = path
         self.urdf = urdf
         self.motors = motors
+        self.named = named
         self._rows: list[Rows] | ExportError | None = None
 
     @cached_property
     def info(self) -> DatasetInfo:
         """meta/info.json."""
         return DatasetInfo.load(self.path)
+
+    @cached_property
+    def roles(self) -> Roles:
+        """The role of each feature."""
+        return dataset_roles(self.path, self.info, self.named)
 
     @cached_property
     def places(self) -> list[EpisodePlace]:
@@ -116,13 +126,12 @@ class Dataset:
     @cached_property
     def motions(self) -> Motions:
         """Those of its episodes."""
-        return Motions(list(motions_of_dataset(self.info, self.rows, self._arms, self.urdf)))
+        return Motions(list(motions_of_dataset(self.info, self.roles, self.rows, self._arms, self.urdf)))
 
     @property
     def _arms(self) -> dict[int, DatasetRobot]:
         """Episode -> its arm, where the sidecar has it or the user has named its servos."""
-        names = self.info.features[STATE].names if STATE in self.info.features else None
-        if self.motors is not None and names == self.motors.names:
+        if self.motors is not None and self.roles.elements(self.roles.state) == self.motors.names:
             return dict.fromkeys(range(len(self.places)), robot_of_motors(self.motors))
         named = {row["episode_index"]: row["robot_digest"] for row in self.sidecar if row.get("robot_digest")}
         robots = {name: read_robot(self.path, name) for name in sorted(set(named.values()))}
@@ -155,7 +164,8 @@ class Dataset:
 
     def courses(self) -> tuple[list[str], list[Array]]:
         """Names of the episodes and their motions."""
-        motions = [motion_vector(rows[STATE]) for rows in self.rows] if STATE in self.info.features else []
+        state = self.roles.state
+        motions = [motion_vector(np.hstack([rows[part] for part in state])) for rows in self.rows] if state else []
         return [f"episode {number}" for number in range(len(motions))], motions
 
     def check_simulated(self) -> None:

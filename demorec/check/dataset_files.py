@@ -166,8 +166,8 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | NotMeasured:
 
 @dataset_check(measures="statements of info.json that its tables and videos contradict")
 def dataset_schema(dataset: Dataset) -> Measurement:
-    """Compare columns, types, shapes, names; codec, size and rate of each video file."""
-    wrong = [*_columns(dataset), *_names(dataset), *_videos(dataset)]
+    """Compare columns, types and shapes; codec, size and rate of each video file."""
+    wrong = [*_columns(dataset), *_videos(dataset)]
     found = f"{len(dataset.info.features)} features"
     return counted(wrong, found)
 
@@ -200,16 +200,6 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
     if size is not None and size != math.prod(feature.shape):
         return False
     return bool(found == _TYPES[feature.dtype] or (feature.dtype == "string" and pa.types.is_large_string(found)))
-
-
-def _names(dataset: Dataset) -> Iterator[str]:
-    for name, feature in dataset.info.features.items():
-        if feature.names is None or len(feature.shape) != 1:
-            continue
-        if len(feature.names) != feature.shape[0]:
-            yield f"{name} has {len(feature.names)} names for {feature.shape[0]} components"
-        if len(set(feature.names)) != len(feature.names):
-            yield f"{name} names a component twice"
 
 
 def _videos(dataset: Dataset) -> Iterator[str]:

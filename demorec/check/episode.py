@@ -18,6 +18,7 @@ from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Table, Trajectory, frame_time_ns
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
@@ -31,12 +32,14 @@ class CheckedEpisode(ExitStack):
         path: The recording.
         named_urdf: Text of the robot's description that the user names, for a recording that is not simulated; "" for
             none.
+        named: Features whose role the user names, in a recording that is not simulated.
     """
 
-    def __init__(self, path: Path, named_urdf: str = "") -> None:
+    def __init__(self, path: Path, named_urdf: str = "", named: NamedRoles = NO_NAMES) -> None:
         super().__init__()
         self.path = path
         self._named_urdf = named_urdf
+        self._named = named
 
     def __exit__(self, *error: Any) -> bool | None:
         """Free everything: parts that refer to the whole would keep its images until the next garbage collection."""
@@ -55,6 +58,11 @@ class CheckedEpisode(ExitStack):
         with suppress(RecordingError):
             return "simulated" if self.info.simulation is not None else "external"
         return "simulated"
+
+    @cached_property
+    def roles(self) -> Roles:
+        """The roles of its features."""
+        return roles_of_recording(self.info, self._named)
 
     @property
     def info(self) -> EpisodeInfo:
@@ -96,7 +104,7 @@ class CheckedEpisode(ExitStack):
         info = self.info
         if self.form == "external":
             table, urdf = self.table, self._named_urdf or info.urdf
-            return motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns)
+            return motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns, named=self._named)
         if not self.num_frames:
             return None
         return motion_of_simulated(info, self.recording.trajectory(), Urdf.parse(self.recording.description()))

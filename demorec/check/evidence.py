@@ -1,13 +1,12 @@
 """The motion of a robot in each episode: the one form in which the checks of any episode see it.
 
-The elements of `observation.state` are identified by the recording, the sidecar, the URDF that the user names, or the
-known robot whose joints have their names. What is not known is absent.
+State, action and grippers are found by `demorec.episode.roles`. The state's elements are identified by the recording,
+the sidecar, the URDF that the user names, or the known robot whose joints have their names. What is unknown is absent.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -19,16 +18,15 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array, signs_of_course
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot
+from demorec.episode.element_names import joint_of
 from demorec.episode.episode import Trajectory
-from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE
 from demorec.episode.info import EpisodeInfo, Feature
+from demorec.episode.roles import NamedRoles, Roles, roles_of_features
 from demorec.robots.urdf import Urdf
 
 GRIPPER = "gripper.width"
 """The element that is the opening of a simulated gripper, metres."""
-_GRIPPER_WORDS = ("gripper", "finger")
-_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
-"""The part of an element's name that is not the name of its joint."""
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 MIN_FRAMES = 30
@@ -44,13 +42,14 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Motion:
-    """The motion of a robot in one episode; elements are those of observation.state.
+    """The motion of a robot in one episode; elements are those of the state.
 
     Attributes:
         where: "episode 3", or "" where there is only one.
         fps: Frames per second.
         steps_s: (T - 1,) time from each frame to the next, seconds.
         names: Of the D elements.
+        grippers: (D,) which of them are grippers or their fingers.
         state: (T, D) rad or m where the joint is known, otherwise as recorded; quaternions by `course_of`.
         velocity, action: (T, D) of the same elements and units, NaN where an element has none; None for no element.
         lower, upper: (D,) limits; infinite where they are not known.
@@ -65,6 +64,7 @@ class Motion:
     fps: float
     steps_s: Array
     names: tuple[str, ...]
+    grippers: Flags
     state: Array
     velocity: Array | None = None
     action: Array | None = None
@@ -75,11 +75,6 @@ class Motion:
     ee_pose: Array | None = None
     tcp_link: str = ""
     sensors: Mapping[str, Array] = field(default_factory=dict)
-
-    @property
-    def grippers(self) -> Flags:
-        """(D,) elements named after a gripper or its fingers."""
-        return np.array([any(word in name.lower() for word in _GRIPPER_WORDS) for name in self.names], dtype=np.bool_)
 
     @property
     def joint_position(self) -> dict[str, Array]:
@@ -177,6 +172,7 @@ def motion_of_simulated(info: EpisodeInfo, c: Trajectory, urdf: Urdf) -> Motion:
         fps=info.fps,
         steps_s=np.full(max(c.num_frames - 1, 0), 1 / info.fps),
         names=(*robot.arm_joints, GRIPPER),
+        grippers=np.array([*[False] * n, True]),
         state=np.column_stack([c.joint_position[:, :n], c.gripper_width]),
         velocity=np.column_stack([c.joint_velocity[:, :n], np.full(c.num_frames, np.nan)]),
         action=np.column_stack([c.action_joint_target, c.action_gripper]),
@@ -202,6 +198,8 @@ def motion_of_features(
     fps: float,
     urdf: str = "",
     time_ns: NDArray[np.int64] | None = None,
+    *,
+    named: NamedRoles,
 ) -> Motion | None:
     """The motion in arrays (T, D) by their names; None without a state.
 
@@ -211,39 +209,47 @@ def motion_of_features(
         fps: Frames per second.
         urdf: Text of the robot's description; "" for the robot whose joints the state's names are.
         time_ns: (T,) of the frames, where they have timestamps of their own.
+        named: Features whose role the user names.
     """
     known = {feature.name: feature for feature in described}
-    if STATE not in known or not len(features[STATE]):
+    roles = roles_of_features(known.values(), named)
+    if not roles.state or not len(features[roles.state[0]]):
         return None
-    arm = _arm(known[STATE].names, urdf, known[STATE].joints)
-    return _motion("", fps, features, known, arm=arm, time_ns=time_ns)
+    arm = _arm(roles.elements(roles.state), urdf, _joints([known[part] for part in roles.state]))
+    return _motion("", fps, features, known, roles, arm=arm, time_ns=time_ns)
 
 
 def motions_of_dataset(
-    info: DatasetInfo, rows_of: Sequence[Mapping[str, NDArray[Any]]], robots: Mapping[int, DatasetRobot], urdf: str
+    info: DatasetInfo,
+    roles: Roles,
+    rows_of: Sequence[Mapping[str, NDArray[Any]]],
+    robots: Mapping[int, DatasetRobot],
+    urdf: str,
 ) -> Iterator[Motion]:
     """The motion of every episode that has a state; by its own robot, otherwise by the URDF that the user names."""
-    features = info.features
-    if STATE not in features or features[STATE].dtype not in ("float32", "float64"):
+    if not roles.state:
         return
-    described = {
-        name: Feature(name=name, names=feature.names or tuple(map(str, range(feature.shape[0]))))
-        for name, feature in features.items()
-        if feature.is_numeric and len(feature.shape) == 1
-    }
+    described = {name: Feature(name=name, names=item.elements) for name, item in roles.columns.items() if item.elements}
     unnamed: _Arm | None = None  # recognising a robot takes time
     for number, rows in enumerate(rows_of):
         robot = robots.get(number)
         where = f"episode {number}"
         if robot is None:
-            unnamed = unnamed or _arm(described[STATE].names, urdf)
-            yield _motion(where, info.fps, rows, described, arm=unnamed)
+            unnamed = unnamed or _arm(roles.elements(roles.state), urdf)
+            yield _motion(where, info.fps, rows, described, roles, arm=unnamed)
             continue
         spec = robot.record.spec
         opening = math.inf if spec is None else spec.gripper.max_width
-        known = {name: robot.record.described(feature) for name, feature in described.items()}
-        motion = _motion(where, info.fps, rows, known, arm=_Arm.of(robot), opening=opening)
+        known = {name: robot.record.described(feature, roles.usual_name(name)) for name, feature in described.items()}
+        arm = _Arm(urdf=robot.model, joints=_joints([known[part] for part in roles.state]))
+        motion = _motion(where, info.fps, rows, known, roles, arm=arm, opening=opening)
         yield motion if spec is None else replace(motion, tcp_link=spec.tcp_link)
+
+
+def _joints(parts: Sequence[Feature]) -> tuple[str, ...]:
+    """The joints of the elements of joined features, empty where none is known."""
+    joints = tuple(joint for part in parts for joint in part.joints or ("",) * len(part.names))
+    return joints if any(joints) else ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -253,25 +259,20 @@ class _Arm:
     urdf: Urdf | None = None
     joints: Sequence[str] = ()
 
-    @classmethod
-    def of(cls, robot: DatasetRobot) -> _Arm:
-        """The arm of a dataset's robot."""
-        return cls(urdf=robot.model, joints=robot.record.joints.get(STATE, ()))
-
 
 def _arm(names: Sequence[str], urdf: str, joints: Sequence[str] = ()) -> _Arm:
     """By a URDF (its text, "" for none), whose joints the elements are named after or follow, or by their names."""
     if urdf:
         tree = Urdf.parse(urdf)
         movable = [joint.name for joint in tree.depth_first() if joint.kind != "fixed"]
-        stems = [_SUFFIX.sub("", name) for name in names]
+        stems = [joint_of(name) for name in names]
         if not any(joints):
             joints = [stem if stem in movable else "" for stem in stems]
         if not any(joints) and len(movable) >= len(names) - 1 and len(movable) - len(names) in (-1, 0):
             joints = [*movable, ""][: len(names)]  # in the order of the tree; the last one is a gripper
         return _Arm(urdf=tree, joints=joints)
     robot = recognised_robot(tuple(names))
-    return _Arm() if robot is None else _Arm.of(robot)
+    return _Arm() if robot is None else _Arm(urdf=robot.model, joints=robot.record.joints[STATE])
 
 
 def _motion(
@@ -279,13 +280,13 @@ def _motion(
     fps: float,
     features: Mapping[str, NDArray[Any]],
     described: Mapping[str, Feature],
+    roles: Roles,
     *,
     arm: _Arm,
     opening: float = math.inf,
     time_ns: NDArray[np.int64] | None = None,
 ) -> Motion:
-    names = {name: feature.names for name, feature in described.items()}
-    elements = names[STATE]
+    elements = roles.elements(roles.state)
     tree = {} if arm.urdf is None else {joint.name: joint for joint in arm.urdf.joints}
     found = [tree.get(joint) for joint in arm.joints] or [None] * len(elements)
     lower = np.array([-math.inf if joint is None else joint.lower for joint in found])
@@ -293,38 +294,41 @@ def _motion(
     if opening < math.inf and GRIPPER in elements:
         place = list(elements).index(GRIPPER)
         lower[place], upper[place] = 0.0, opening
-    state = course_of(described[STATE].in_si(features[STATE]), elements)
-    action = _same_elements(ACTION, features, described)
+    state = course_of(_joined(roles.state, features, described), elements)
+    action = _same_elements(roles.action, features, described, roles)
     if action is not None:
         _turn_nearest(action, state, elements)
     return Motion(
         where=where,
         fps=fps,
         steps_s=np.full(len(state) - 1, 1 / fps) if time_ns is None else np.maximum(np.diff(time_ns) / 1e9, 0.5 / fps),
-        names=tuple(elements),
+        names=elements,
+        grippers=roles.grippers(),
         state=state,
-        velocity=_same_elements(VELOCITY, features, described),
+        velocity=_same_elements(roles.having("velocity"), features, described, roles),
         action=action,
         lower=lower,
         upper=upper,
         joints=tuple(arm.joints),
         urdf=arm.urdf if any(arm.joints) else None,
-        ee_pose=_poses(features, names),
-        sensors=_sensors(features, names),
+        ee_pose=_poses(features, roles),
+        sensors=_sensors(features, roles),
     )
 
 
+def _joined(parts: Sequence[str], features: Mapping[str, NDArray[Any]], described: Mapping[str, Feature]) -> Array:
+    """(T, D) of features one behind the other, each in SI by its own units: a leader may record degrees."""
+    return np.concatenate([described[part].in_si(features[part]) for part in parts], axis=1)
+
+
 def _same_elements(
-    feature: str, features: Mapping[str, NDArray[Any]], described: Mapping[str, Feature]
+    parts: Sequence[str], features: Mapping[str, NDArray[Any]], described: Mapping[str, Feature], roles: Roles
 ) -> Array | None:
-    """(T, D) of a feature's elements that are named as those of the state, NaN for others; None where none is."""
-    if feature not in features or feature not in described:
-        return None
-    values = described[feature].in_si(features[feature])  # by its own units: a leader may record degrees
-    places = {_SUFFIX.sub("", name): index for index, name in enumerate(described[feature].names)}
-    columns = [places.get(_SUFFIX.sub("", name)) for name in described[STATE].names]
+    """(T, D) of the elements of features that are those of the state, NaN for others; None where none is."""
+    columns = roles.in_state(parts) if parts else []
     if all(column is None for column in columns):
         return None
+    values = _joined(parts, features, described)
     missing = np.full(len(values), np.nan)
     return np.stack([missing if column is None else values[:, column] for column in columns], axis=1)
 
@@ -336,24 +340,25 @@ def _turn_nearest(action: Array, state: Array, names: Sequence[str]) -> None:
         action[:, turn] *= np.where((action[:, turn] * state[:, turn]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
 
 
-def _sensors(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> dict[str, NDArray[Any]]:
+def _sensors(features: Mapping[str, NDArray[Any]], roles: Roles) -> dict[str, NDArray[Any]]:
     """The observations other than the state, without the simulator's truth."""
-    others = (STATE, ENVIRONMENT_STATE)
+    measured = roles.having("sensor", "velocity", "pose", "gripper")
     return {
-        name: values.reshape(len(values), -1)
-        for name, values in features.items()
-        if name.startswith("observation.") and name in names and name not in others
+        name: features[name].reshape(len(features[name]), -1)
+        for name in measured
+        if roles.columns[name].elements and name not in (ENVIRONMENT_STATE, *roles.state)
     }
 
 
-def _poses(features: Mapping[str, NDArray[Any]], names: Mapping[str, Sequence[str]]) -> Array | None:
+def _poses(features: Mapping[str, NDArray[Any]], roles: Roles) -> Array | None:
     """(T, 7) position and quaternion xyzw of the EE pose, or of a pose at the end of the state."""
-    for feature in (EE_POSE, STATE):
-        if feature not in features or features[feature].shape[1] < len(_POSE):
+    for feature in (EE_POSE, *roles.state):
+        names = roles.columns[feature].elements if feature in roles.columns else ()
+        if len(names) < len(_POSE):
             continue
-        words = [name.rpartition(".")[2].rpartition("_")[2] for name in names[feature][-7:]]
+        words = [name.rpartition(".")[2].rpartition("_")[2] for name in names[-7:]]
         is_ordered = set(_POSE[3:]) <= set(words[3:])
-        is_pose = features[feature].shape[1] == 7 if feature == EE_POSE else words[:3] == [*_POSE[:3]] and is_ordered
+        is_pose = len(names) == 7 if feature == EE_POSE else words[:3] == [*_POSE[:3]] and is_ordered
         if is_pose:
             order = [0, 1, 2, *(words.index(word) if is_ordered else 3 + k for k, word in enumerate(_POSE[3:]))]
             return np.asarray(features[feature].astype(np.float64)[:, -7:][:, order])

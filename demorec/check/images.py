@@ -11,7 +11,6 @@ from demorec.check.dataset import Episodes
 from demorec.check.evidence import Motion, without_gaps
 from demorec.check.films import Film
 from demorec.check.rest import longest_rest, moves_of
-from demorec.episode.features import STATE
 
 MAX_SAME_STEP = 0.1
 """Mean change of an image's parts, of 255, up to which it shows the same; a frozen image changes so when encoded again,
@@ -42,7 +41,7 @@ def images_decode(subject: Episodes) -> Measurement | None:
     unit="s",
     warn=0.5,
     fail=1.0,
-    needs=f"images and {STATE}",
+    needs="images and a state",
     needs_images=True,
 )
 def frozen_images(subject: Episodes) -> Iterator[Found]:
@@ -63,7 +62,7 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
             blind += int((same & moves)[rest.outside].sum())
             others += int(moves[rest.outside].sum())
         if not found:
-            yield NotMeasured(why=f"it needs images and {STATE}")
+            yield NotMeasured(why="it needs images and a state")
         elif blind > MAX_BLIND_SHARE * others:
             yield NotMeasured(why=f"{camera} hardly sees the robot move")
         else:

@@ -13,7 +13,6 @@ from demorec.check.evidence import MIN_RANGE, Motion, without_gaps
 from demorec.check.rest import longest_rest, moves_of
 from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
-from demorec.episode.features import STATE
 
 URDF = "a robot whose URDF is known (--urdf FILE)"
 VELOCITIES = "velocities of the state's elements"
@@ -134,7 +133,7 @@ def _products(motion: Motion) -> Array:
     unit="s",
     warn=0.3,
     fail=1.0,
-    needs=STATE,
+    needs="a state",
 )
 def frozen_sensors(subject: Episodes) -> Iterator[Found]:
     """Find sensors that stop changing while the robot moves, and elements of the state that ignore their action.

@@ -12,9 +12,10 @@ from demorec.check.base import Check, Form, Level, Result
 from demorec.check.dataset import Dataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
-from demorec.core.errors import check_option
+from demorec.core.errors import ExportError, RecordingError, check_option
 from demorec.core.processes import process_pool
 from demorec.core.tables import CHECKS
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.robots.motors import Motors
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
@@ -38,6 +39,7 @@ class CheckOptions:
         lerobot: Whether LeRobot opens each dataset; otherwise only those in which another check failed.
         urdf: Text of the description of the robot, for recordings and datasets that do not have one; "" for none.
         motors: The servos whose values LeRobot recorded in datasets with elements of their names.
+        named: Features whose role the user names, in what demorec did not simulate.
     """
 
     images: bool = True
@@ -46,6 +48,7 @@ class CheckOptions:
     lerobot: bool = False
     urdf: str = ""
     motors: Motors | None = None
+    named: NamedRoles = NO_NAMES
 
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
@@ -86,9 +89,11 @@ class SubjectReport(Subject):
 
     Attributes:
         results: In the order of the table.
+        notes: Sentences about features without a role, which no check looked at.
     """
 
     results: tuple[Result, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def level(self) -> Level:
@@ -148,16 +153,28 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
-    """All checks of one recording, run or dataset."""
+    """All checks of one recording, run or dataset; ConfigError where it lacks a feature that the user names."""
     if subject.kind == "recording":
-        with CheckedEpisode(subject.path, options.urdf) as episode:
+        with CheckedEpisode(subject.path, options.urdf, options.named) as episode:
+            notes = _notes(episode)
             found = _run(options, episode)
     elif subject.kind == "run":
-        found = _run(options, CheckedRun(subject.path))
+        notes = ()
+        found = _run(options, CheckedRun(subject.path, options.named))
     else:
-        found = _run(options, Dataset(subject.path, options.urdf, options.motors))
+        dataset = Dataset(subject.path, options.urdf, options.motors, options.named)
+        notes = _notes(dataset)
+        found = _run(options, dataset)
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
-    return SubjectReport(**vars(subject), results=results)
+    return SubjectReport(**vars(subject), results=results, notes=notes)
+
+
+def _notes(subject: CheckedEpisode | Dataset) -> tuple[str, ...]:
+    """What has no role; nothing of what cannot be read, which the checks report."""
+    try:
+        return tuple(subject.roles.notes())
+    except (RecordingError, ExportError):
+        return ()
 
 
 Checked = CheckedEpisode | Dataset | CheckedRun

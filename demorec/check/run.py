@@ -12,14 +12,16 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from demorec.check.base import Form, Found, Measurement, counted, run_check
 from demorec.check.evidence import motion_vector
 from demorec.core.errors import DemorecError, RecordingError, resource_error
 from demorec.core.files import sha256_of
 from demorec.core.geometry import Array
 from demorec.core.plain import to_plain
-from demorec.episode.features import STATE
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.mcap import open_recording
 from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
@@ -38,10 +40,12 @@ class CheckedRun:
 
     Args:
         path: The folder with run.json.
+        named: Features whose role the user names, in recordings that are not simulated.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, named: NamedRoles = NO_NAMES) -> None:
         self.path = path
+        self._named = named
 
     @cached_property
     def form(self) -> Form:
@@ -86,8 +90,9 @@ class CheckedRun:
             try:
                 with open_recording(path) as recording:
                     features = recording.table().features
-                    if STATE in features:
-                        yield path.name, motion_vector(features[STATE])
+                    state = roles_of_recording(recording.info, self._named).state
+                    if state:
+                        yield path.name, motion_vector(np.hstack([features[part] for part in state]))
             except (RecordingError, OSError):
                 continue  # reported by the checks of that recording
 

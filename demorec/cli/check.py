@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,6 +14,7 @@ from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, describe_error
 from demorec.robots.motors import MotorUnits
 
@@ -40,6 +41,7 @@ class CheckCommand:
       demorec check datasets/cubes --json
       demorec check monday.mcap --mapping robot.toml
       demorec check datasets/so101_cups --motor-units degrees
+      demorec check datasets/cups --state joint_angles --action joint_targets
       demorec check datasets/cubes --lerobot
       demorec check recordings/cubes/episodes/episode_000007.mcap --deep
     """
@@ -59,6 +61,7 @@ class CheckCommand:
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
     strict: bool = False
     """Warnings count as failures."""
     lerobot: bool = False
@@ -97,6 +100,7 @@ class CheckCommand:
             lerobot=self.lerobot,
             urdf=self._description(),
             motors=named_motors(self.motor_units, self.calibration),
+            named=self.roles.named,
         )
         options.validate()
         reports = []
@@ -166,6 +170,7 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     yield f"{report.level:<4}  {report.kind} {report.path}: {counts}"
+    yield from _noted([report])
     for result in report.results:
         if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
             yield f"      {_result(result)}"
@@ -173,6 +178,14 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
         yield from _not_measured([report])
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
+
+
+def _noted(reports: Sequence[SubjectReport]) -> Iterator[str]:
+    """One line for each note about features without a role."""
+    notes = Counter(note for report in reports for note in report.notes)
+    for note, count in notes.items():
+        times = "" if count == 1 else f" ({count} times)"
+        yield f"      {note}{times}"
 
 
 def _not_measured(reports: Sequence[SubjectReport]) -> Iterator[str]:
@@ -196,6 +209,7 @@ def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
     unmeasured = f", {skipped} not measured" if skipped else ""
     things = ", ".join(counted(number, kind) for kind, number in kinds.items())
     yield f"pass  {things}: {passed} checks passed{unmeasured}"
+    yield from _noted(reports)
     yield from _not_measured(reports)
 
 
@@ -225,7 +239,8 @@ def _plain(report: SubjectReport) -> dict[str, Any]:
     for result in results:
         if result["value"] is not None and abs(result["value"]) == float("inf"):
             result["value"] = None  # JSON has no infinity; the level and the detail tell
-    return {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results}
+    plain = {"path": str(report.path), "kind": report.kind, "level": report.level, "results": results}
+    return plain | {"notes": list(report.notes)}
 
 
 def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:

@@ -13,6 +13,7 @@ from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
@@ -46,6 +47,7 @@ class Import:
       demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
       demorec import bags/ --mapping robot.toml --out runs/robot --skip-bad
       demorec import lerobot datasets/cups --out runs/cups
+      demorec import lerobot cups --out runs/cups --state joints --action targets
       demorec import hdf5 demo.hdf5 --suggest > mapping.toml
       demorec import hdf5 demo.hdf5 --mapping mapping.toml --out runs/demo
     """
@@ -69,6 +71,7 @@ class Import:
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
     """How images are encoded that come as pixels."""
 
@@ -83,6 +86,11 @@ class Import:
         form, motors = FORMATS.get(word), named_motors(self.motor_units, self.calibration)
         if motors is not None and (form is None or not form.has_motor_units):
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
+        if self.roles.named and (form is None or not form.has_roles):
+            raise ConfigError(
+                "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
+                "bags and HDF5 files say it in their mapping."
+            )
         if form is not None:
             return self._import_frames(word, form, self.bags[1:], motors)
         if not self.bags[0].exists() and (near := nearest_match(word, FORMATS)):
@@ -125,7 +133,7 @@ class Import:
         if self.out is None:
             raise ConfigError(f"An import needs --out: {example}.")
         self.video.validate()
-        result = form.read(paths, self.mapping, self.out, self.video, motors)
+        result = form.read(paths, self.mapping, self.out, self.video, motors, self.roles.named)
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")

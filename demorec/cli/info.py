@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from demorec.cli.shared import role_lines
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
-from demorec.core.errors import ExportError, RecordingError, describe_error, resource_error, without_path
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.runs.find import Found, expect, find
 
 if TYPE_CHECKING:
+    from demorec.episode.roles import NamedRoles, Roles
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
@@ -36,15 +39,19 @@ class Info:
     mapping: MappingFile = None
     json: bool = False
     """Print JSON: one object, or a list for several paths."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
         """Read and print; 1 when something among several paths cannot be read."""
         need_paths(self.paths, "info")
-        bags = [path for path in self.paths if self.mapping is None and find(path).kind == "rosbag"]
+        named = self.roles.named
+        bags = [path for path in self.paths if self.mapping is None and not named and find(path).kind == "rosbag"]
         others = [path for path in self.paths if path not in bags]
         with reading(others, self.mapping) as read:
             places = dict(zip(others, read, strict=True))
-            self._show([_describe(places[path]) if path in places else _bag_or_bags(path) for path in self.paths])
+            self._show(
+                [_describe(places[path], named) if path in places else _bag_or_bags(path) for path in self.paths]
+            )
         return 0
 
     def _show(self, found: Sequence[tuple[dict[str, Any], list[str]]]) -> None:
@@ -56,11 +63,13 @@ class Info:
                 say(*([""] if number else []), *lines)
 
 
-def _describe(path: Path) -> tuple[dict[str, Any], list[str]]:
+def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     """Plain data for --json, and the lines for people."""
     found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
     describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
-    plain, lines = _folder(found) if describe is None else describe(path)
+    if describe is None and named:
+        raise ConfigError(f"--state, --action and --gripper are for a recording, a run or a dataset: {path}")
+    plain, lines = _folder(found) if describe is None else describe(path, named)
     if found.unfinished:
         plain["unfinished"] = [str(file) for file in found.unfinished]
         lines += ["", f"Left out: {found.left}."]
@@ -108,10 +117,10 @@ def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
     return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
 
 
-def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
+def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     from demorec.mcap.summary import summarize
 
-    plain = summarize(path)
+    plain = summarize(path, named)
     is_simulated = plain["kind"] == "recording"
     form = f"{'' if is_simulated else 'external, '}format {plain['format_version']}"
     rate = f", {plain['rate']:.2f} Hz (nominal {plain['fps']} Hz)"
@@ -129,7 +138,7 @@ def _recording(path: Path) -> tuple[dict[str, Any], list[str]]:
         facts.append(("objects", ", ".join(plain["objects"]) or "none"))
     if origin := plain["origin"]:
         facts.append(("origin", origin if isinstance(origin, str) else _origin(origin)))
-    facts += [(f"feature {feature['name']}", ", ".join(_feature(feature))) for feature in plain["features"]]
+    facts += role_lines.recording_features(plain["features"])
     facts += [(f"camera {camera['name']}", ", ".join(_camera(camera, is_simulated))) for camera in plain["cameras"]]
     facts += [(f"dropped {what}", str(count)) for what, count in plain["drops"].items()]
     for check in plain["checks"]:
@@ -166,13 +175,6 @@ def _origin(origin: Mapping[str, Any]) -> str:
     return " ".join([origin["kind"], *(file["name"] for file in origin["files"])])
 
 
-def _feature(feature: Mapping[str, Any]) -> Iterator[str]:
-    yield f"{len(feature['elements'])} {feature['dtype']}"
-    yield f"at most {1000 * feature['oldest']:.3g} ms old"
-    if feature["source"]:
-        yield feature["source"]
-
-
 def _camera(camera: Mapping[str, Any], is_simulated: bool) -> Iterator[str]:
     video = camera["video"]
     yield f"{video['width']}x{video['height']} {video['codec']}{' as it came' if camera['is_kept'] else ''}"
@@ -192,12 +194,13 @@ def _camera(camera: Mapping[str, Any], is_simulated: bool) -> Iterator[str]:
         yield camera["source"]
 
 
-def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
+def _run(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     from demorec.runs.run_file import load_any_run_file
 
     run = load_any_run_file(path)
     if run.generation is None:
         left_out = _left_out(path)
+        roles = role_lines.roles_of_run(path, run, named)
         plain = {
             "kind": "external run",
             "path": str(path),
@@ -205,7 +208,12 @@ def _run(path: Path) -> tuple[dict[str, Any], list[str]]:
             "digest": run.digest,
             **run.plain(),
         }
-        return plain | {"left_out": left_out}, [*_external_run_lines(path, run), *_left_out_lines(left_out)]
+        plain |= {"roles": None if roles is None else role_lines.roles_as_plain(roles), "left_out": left_out}
+        return plain, [*_external_run_lines(path, run, roles), *_left_out_lines(left_out)]
+    if named:
+        from demorec.episode.roles import SIMULATED_ROLES
+
+        raise ConfigError(SIMULATED_ROLES)
     plain = {
         "kind": "run",
         "path": str(path),
@@ -250,7 +258,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
     return [*aligned(facts), "", *aligned(rows)]
 
 
-def _external_run_lines(path: Path, run: RunFile) -> list[str]:
+def _external_run_lines(path: Path, run: RunFile, roles: Roles | None) -> list[str]:
     """About a run."""
     frames = sum(line.num_frames for line in run.attempts)
     counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
@@ -261,6 +269,7 @@ def _external_run_lines(path: Path, run: RunFile) -> list[str]:
         ("episodes", f"{len(run.attempts)}{f' ({parts})' if parts else ''}"),
         ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
         ("size", size_in_words(sum(line.num_bytes for line in run.attempts))),
+        *(() if roles is None else role_lines.role_facts(roles)),
         ("digest", run.digest),
     ]
     if run.unfinished:
@@ -300,7 +309,7 @@ def _left_out_lines(left_out: list[dict[str, str]]) -> list[str]:
     return ["", *aligned(rows)] if left_out else []
 
 
-def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
+def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     from demorec.datasets.lerobot.files import read_json
 
     file = path / INFO_PATH
@@ -314,17 +323,20 @@ def _dataset(path: Path) -> tuple[dict[str, Any], list[str]]:
             ("robot", str(info["robot_type"])),
             ("size", size_in_words(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
         ]
+        roles = role_lines.roles_of_dataset(path, named)
         more, problems = _dataset_content(path)
-        facts += [*more, *(("problem", problem) for problem in problems[:_MOST_PROBLEMS])]
+        facts += [
+            *([] if roles is None else role_lines.role_facts(roles)),
+            *more,
+            *(("problem", problem) for problem in problems[:_MOST_PROBLEMS]),
+        ]
         if len(problems) > _MOST_PROBLEMS:
             facts.append(("problems", f"{len(problems)} in all; demorec check says more"))
-        rows = [("feature", "dtype", "shape", "names")]
-        for name, feature in info["features"].items():
-            shape = "x".join(map(str, feature["shape"]))
-            rows.append((name, str(feature["dtype"]), shape, _names(feature.get("names"))))
+        rows = role_lines.feature_rows(path, info, roles)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
-    plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
+    plain: dict[str, Any] = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
+    plain["roles"] = None if roles is None else role_lines.roles_as_plain(roles)
     return plain, [*aligned(facts), "", *aligned(rows)]
 
 
@@ -355,12 +367,6 @@ def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
             raise lack from error
         problems.append(without_path(error, path))
     return facts, problems
-
-
-def _names(names: object) -> str:
-    if not isinstance(names, list):
-        return ""
-    return ", ".join(map(str, names)) if len(names) <= 4 else f"{names[0]} .. {names[-1]}"
 
 
 def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:

@@ -6,7 +6,7 @@ import math
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,6 +17,7 @@ from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.registry import modules_of
 from demorec.core.tables import load_robot
@@ -74,6 +75,7 @@ class Replay:
     calibration: Path | None = None
     """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
     says)."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
     out: OptionalTarget = None
     """Folder for recordings of the replays, images included."""
     view: bool = False
@@ -102,6 +104,7 @@ class Replay:
             allowed=allowed,
             robot=load_robot(self.robot, allowed) if self.robot else None,
             motors=named_motors(self.motor_units, self.calibration),
+            named=self.roles.named,
         )
         if options.robot is not None and (self.out is not None or self.view):
             raise ConfigError("--robot compares numbers, of a scene nothing is known: leave --out, --view out.")

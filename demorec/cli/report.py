@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,7 @@ from tyro.conf import Positional, arg
 from demorec.cli.shared.output import counted, say, size_in_words
 from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
 from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT
@@ -47,6 +48,7 @@ class ReportCommand:
     """Processes that read and check recordings."""
     overwrite: bool = False
     """Replace an existing report."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
         """Gather, then write."""
@@ -63,10 +65,13 @@ class ReportCommand:
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
-        checks = CheckOptions(images=self.images) if self.checks else None
+        named = self.roles.named
+        checks = CheckOptions(images=self.images, named=named) if self.checks else None
         with atomic_write(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path])) as part:
             with reading([self.path], self.mapping) as (path,), ProgressBar("reading", unit="item") as bar:
-                report = gather(path, camera=self.camera, checks=checks, workers=self.workers, advance=bar.set)
+                report = gather(
+                    path, camera=self.camera, checks=checks, workers=self.workers, named=named, advance=bar.set
+                )
             size = write_page(report, part)
         say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
         return 0

@@ -5,7 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -22,6 +22,7 @@ from demorec.cli.shared.paths import (
     tell_incomplete,
     tell_unfinished,
 )
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.atomic import atomic_write, atomic_write_all
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
@@ -79,6 +80,7 @@ class View:
     """A module or package of your own; models of robots and objects beside it may be read."""
     overwrite: bool = False
     """Replace an existing file of --save or --screenshot."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
         """Convert, then show, save, take a screenshot or serve."""
@@ -94,7 +96,8 @@ class View:
         from demorec.view.sources import find_episodes, select
         from demorec.view.viewer import need_screen
 
-        sources = select(find_episodes(self.paths, include_failures=self.include_failures), self.episodes)
+        found = find_episodes(self.paths, include_failures=self.include_failures, named=self.roles.named)
+        sources = select(found, self.episodes)
         tell_unfinished(self.paths)
         tell_incomplete(self.paths)
         if self.rank is not None:
@@ -157,7 +160,7 @@ class View:
         found = {
             f"{path}: episode {episode.episode_index}": episode
             for path in self.paths
-            for episode in score_dataset(path)
+            for episode in score_dataset(path, self.roles.named)
         }
         ranked = sorted(sources, key=lambda source: found[source.name].score)
         for episode in [found[source.name] for source in ranked[:_MOST_REASONS]]:

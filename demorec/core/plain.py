@@ -13,6 +13,7 @@ from typing import Any
 
 import cattrs
 import numpy as np
+from cattrs.gen import make_dict_unstructure_fn, override
 from cattrs.preconf.json import make_converter
 from cattrs.v import format_exception
 
@@ -116,6 +117,12 @@ def from_plain[T](data: object, cls: type[T]) -> T:
         raise ValueError(listed(words)) from None
     except (TypeError, AttributeError) as error:  # no object where the outermost one is expected
         raise ValueError(f"{reprlib.repr(data)} is no {cls.__name__}") from error
+
+
+def leave_out_default(cls: type, name: str) -> None:
+    """Write a dataclass without a field that has its default value."""
+    changes: Any = {name: override(omit_if_default=True)}
+    _converter.register_unstructure_hook(cls, make_dict_unstructure_fn(cls, _converter, **changes))
 
 
 def parse_json(text: str, *, allow_nan: bool = False) -> Any:

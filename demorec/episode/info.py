@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array, Pose
+from demorec.core.plain import leave_out_default
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
 
@@ -45,6 +46,7 @@ class Feature:
         source: Where it came from, in words: "/joint_states position, latest before, header stamps".
         calibration: For each element a factor and an offset: factor times the value plus offset is rad or m, of servos
             that say something else; empty where the unit says it.
+        role: Role that its name does not say; "" where names in common use do (`demorec.episode.roles`).
     """
 
     name: str
@@ -54,6 +56,7 @@ class Feature:
     joints: tuple[str, ...] = ()
     source: str = ""
     calibration: tuple[tuple[float, float], ...] = ()
+    role: Literal["", "state", "action", "gripper"] = ""
 
     def in_si(self, values: NDArray[Any]) -> Array:
         """(..., D) float64 of values (..., D): positions in rad and m, other values unchanged."""
@@ -62,6 +65,9 @@ class Feature:
         scale = self.calibration or [degree if unit in ("deg", "degree") else (1.0, 0.0) for unit in units]
         factor, offset = np.array(scale).T
         return np.asarray(values.astype(np.float64) * factor + offset)
+
+
+leave_out_default(Feature, "role")
 
 
 @dataclass(frozen=True, kw_only=True)

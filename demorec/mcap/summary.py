@@ -10,11 +10,12 @@ import numpy as np
 from demorec.core.plain import to_plain
 from demorec.episode.episode import NO_IMAGE, Outcome
 from demorec.episode.info import FORMAT_VERSION
+from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
 from demorec.mcap.recording import Recording, open_recording
 
 
-def summarize(path: Path) -> dict[str, Any]:
+def summarize(path: Path, named: NamedRoles = NO_NAMES) -> dict[str, Any]:
     """Read a recording, all of its content included, and say what it holds, as `demorec info --json` prints it.
 
     Every recording has the same keys. `task`, `root_seed` and `physics_hz` are None of an episode that demorec did not
@@ -23,13 +24,19 @@ def summarize(path: Path) -> dict[str, Any]:
     a frame holds, in seconds. `depth` and `segmentation` say whether these were recorded: of a simulated camera beside
     colour, of a depth camera alone.
 
+    Args:
+        path: Of the recording.
+        named: Features whose role the user names, in one that demorec did not simulate.
+
     Raises:
+        ConfigError: It lacks a feature that the user names, or is simulated.
         RecordingError: It is none, or damaged.
     """
     with open_recording(path) as recording:
         info, facts = recording.info, simulation_facts(recording.info)
         outcome = recording.outcome or Outcome(num_frames=recording.num_frames)
         seconds, rate = _length(recording)
+        roles = roles_of_recording(info, named)
         return {
             "kind": "recording" if facts else "external recording",
             "path": str(path),
@@ -55,7 +62,7 @@ def summarize(path: Path) -> dict[str, Any]:
             "physics_hz": facts.get("physics_hz"),
             "seconds": seconds,
             "rate": rate,
-            "features": _features(recording),
+            "features": _features(recording, roles),
             "cameras": _cameras(recording),
             "streams": [
                 {"topic": topic, "type": kind, "messages": count} for topic, (kind, count) in recording.topics.items()
@@ -77,10 +84,11 @@ def _length(recording: Recording) -> tuple[float, float]:
     return span + 1 / recording.info.fps, (len(times) - 1) / span if span else 0.0
 
 
-def _features(recording: Recording) -> list[dict[str, Any]]:
+def _features(recording: Recording, roles: Roles) -> list[dict[str, Any]]:
     return [
         {
             "name": feature.name,
+            "role": roles.of[feature.name],
             "dtype": feature.dtype,
             "elements": feature.names,
             "units": feature.units,

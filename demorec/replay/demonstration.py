@@ -22,6 +22,7 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
 from demorec.episode.info import EpisodeInfo, Simulation
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.scene import Physics, RobotPlacement, Scene
 from demorec.episode.simulated import simulated_info
 from demorec.mcap import Recording, open_recording
@@ -50,6 +51,7 @@ class ReplayOptions:
         allowed: The user's own modules that may be imported for what the demonstrations name.
         robot: The arm that does what a real one did, by its numbers alone; None: that of each recorded scene.
         motors: The servos whose values the states and actions of datasets are, if the user says so.
+        named: Features of a real arm's data whose role the user names.
     """
 
     states: bool = False
@@ -60,6 +62,7 @@ class ReplayOptions:
     allowed: tuple[str, ...] = ()
     robot: RobotSpec | None = None
     motors: Motors | None = None
+    named: NamedRoles = NO_NAMES
 
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
@@ -73,6 +76,8 @@ class ReplayOptions:
             raise ConfigError("--states and --export-hz are for recordings with a scene: leave them out with --robot.")
         if self.motors is not None and self.robot is None:
             raise ConfigError("--motor-units says how the dataset of a real arm is to be read: add --robot so101.")
+        if self.named and self.robot is None:
+            raise ConfigError("--state, --action and --gripper say how the data of a real arm are read: add --robot.")
 
     @property
     def is_plain(self) -> bool:
@@ -196,7 +201,9 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
             if recording.info.simulation is not None:
                 raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
             info, table = recording.info, recording.table()
-            motion = motion_of_features(table.features, info.features, info.fps, info.urdf, table.time_ns)
+            motion = motion_of_features(
+                table.features, info.features, info.fps, info.urdf, table.time_ns, named=options.named
+            )
         return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=info.episode_index)
     with open_recording(path, simulated=True) as recording:
         return replace(open_demonstration(recording, options), source=path)
@@ -221,7 +228,7 @@ def dataset_demonstrations(
 
     if options.states or options.export_hz:
         raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
-    dataset = Dataset(path, motors=options.motors)
+    dataset = Dataset(path, motors=options.motors, named=options.named)
     if options.robot is not None:
         for number, motion in enumerate(dataset.motions.all):
             if not wanted(number):
@@ -274,7 +281,9 @@ def demonstration_of(
     from demorec.tasks.furniture import table_and_floor
 
     if motion is None or motion.action is None:
-        raise ConfigError(f"There is no observation.state with an action of the same elements to replay: {where}")
+        raise ConfigError(
+            f"There is no state with an action of the same elements to replay (--state, --action name them): {where}"
+        )
     state, action = (_of_robot(values, motion, robot, where) for values in (motion.state, motion.action))
     if np.isnan(action).any():
         raise ConfigError(f"Not every joint of {robot.name} has an action, so it cannot be replayed: {where}")
@@ -320,7 +329,7 @@ def _of_robot(values: Array, motion: Motion, robot: RobotSpec, where: Path) -> A
     if missing := [joint for joint in wanted if joint not in motion.joints]:
         motors = ", or --motor-units is missing" if robot.name in IN_MOTOR_UNITS else ""
         raise ConfigError(
-            f"The elements of observation.state ({', '.join(motion.names)}) are not known to be the joints "
+            f"The elements of the state ({', '.join(motion.names)}) are not known to be the joints "
             f"{', '.join(missing)} of {robot.name}: it is of another robot{motors}: {where}"
         )
     arm = values[:, [motion.joints.index(joint) for joint in robot.arm_joints]]

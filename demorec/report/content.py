@@ -81,17 +81,17 @@ MAX_SAMPLES = 200
 """Frames of each episode that a distribution is drawn from, beside its extremes."""
 
 
-Components = dict[tuple[str, str], list[NDArray[np.float32]]]
-"""(feature, name of the component) -> its sampled values, episode by episode."""
+Components = dict[tuple[Literal["state", "action"], str], list[NDArray[np.float32]]]
+"""(role, name of the component) -> its sampled values, episode by episode."""
 
 
-def add_values(into: Components, feature: str, names: Iterable[str], values: NDArray[Any]) -> None:
-    """Add the values of a feature (T, D) in one episode: finite ones, evenly spaced, and the extremes."""
+def add_values(into: Components, role: Literal["state", "action"], names: Iterable[str], values: NDArray[Any]) -> None:
+    """Add the values of state or action (T, D) in one episode: finite ones, evenly spaced, and the extremes."""
     for name, column in zip(names, values.T, strict=False):
         finite = column[np.isfinite(column)]
         if len(finite):
             sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
-            parts = into.setdefault((feature, name), [])
+            parts = into.setdefault((role, name), [])
             parts.append(np.array([*sampled, finite.min(), finite.max()], dtype=np.float32))
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +16,16 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError, ExportError, describe_error, without_path
 from demorec.datasets.lerobot.files import read_table
 from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.modality import dataset_roles
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.scoring.score import MIN_EPISODES, MIN_SOUND, score_dataset
+from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome, SuccessCheck
-from demorec.episode.features import ACTION, IMAGE_PREFIX, STATE
+from demorec.episode.features import IMAGE_PREFIX
+from demorec.episode.roles import NamedRoles, Roles
 from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, add_values, common_facts
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 
@@ -38,27 +41,28 @@ _ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", 
 _Row = Mapping[str, Any]
 
 
-def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance: Callable[[int, int], None]) -> Report:
+def dataset_report(
+    root: Path, camera: str, checks: CheckOptions | None, named: NamedRoles, advance: Callable[[int, int], None]
+) -> Report:
     """The content of a page about a dataset; arguments and errors as of `demorec.report.gather.gather`."""
     info = DatasetInfo.load(root)
+    roles = dataset_roles(root, info, named)
     rows, left_out = _read_sidecar(root)
-    missing = list(_missing(info, has_sidecar=bool(rows)))
+    missing = list(_missing(info, roles, has_sidecar=bool(rows)))
     key = _camera_key(info, camera, root)
     stored = None if key is None or info.features[key].is_video else StoredImages(info, key)
-    wanted = {
-        name: item
-        for name, item in info.features.items()
-        if name in (STATE, ACTION, _SUCCESS) and item.dtype in _NUMBERS and len(item.shape) == 1
-    }
+    wanted = dict.fromkeys((*roles.state, *roles.action))
+    if _SUCCESS in info.features and info.features[_SUCCESS].column.elements:
+        wanted[_SUCCESS] = None
     reader = RowStream(info, list(wanted)) if wanted else None
     total = info.total_episodes + len(left_out) + (checks is not None)
     stride = max(1, -(-info.total_episodes // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    flags = {} if checks is None else _flags(root, info, missing)
+    flags = {} if checks is None else _flags(root, info, named, missing)
     for number, place in enumerate(episode_places(root, info)):
         columns = {} if reader is None else reader.numbers(place)
-        _count_components(components, root, info, columns)
+        _count_components(components, roles, columns)
         strip, problem = None, ""
         odd = flags.get(place.episode_index, ())
         if key is not None and (odd or number % stride == 0):
@@ -86,12 +90,12 @@ def dataset_report(root: Path, camera: str, checks: CheckOptions | None, advance
     )
 
 
-def _flags(root: Path, info: DatasetInfo, missing: list[str]) -> dict[int, tuple[Result]]:
+def _flags(root: Path, info: DatasetInfo, named: NamedRoles, missing: list[str]) -> dict[int, tuple[Result]]:
     """Return episode_index -> its score, of the worst below `MIN_SOUND`; why there are none goes into `missing`."""
     if info.total_episodes < MIN_EPISODES:
         return {}
     try:
-        found = sorted(score_dataset(root), key=lambda episode: episode.score)
+        found = sorted(score_dataset(root, named), key=lambda episode: episode.score)
     except ExportError as error:
         missing.append(f"Its episodes have no scores: {without_path(error, root)}")
         return {}
@@ -212,20 +216,23 @@ def _left_out(row: _Row) -> ReportedEpisode:
     )
 
 
-def _count_components(into: Components, root: Path, info: DatasetInfo, columns: Mapping[str, NDArray[Any]]) -> None:
-    for feature in (STATE, ACTION):
-        if feature not in columns:
-            continue
-        values = columns[feature]
-        if values.dtype.kind not in "fiub":
-            raise ExportError(f"The column {feature} holds something else than numbers: {root}")
-        names = info.features[feature].names or ()
-        if len(names) != values.shape[1]:
-            names = tuple(f"component {number}" for number in range(values.shape[1]))
-        add_values(into, feature, names[:_MAX_COMPONENTS], values)
+def _count_components(into: Components, roles: Roles, columns: Mapping[str, NDArray[Any]]) -> None:
+    drawn: tuple[tuple[Literal["state", "action"], tuple[str, ...]], ...] = (
+        ("state", roles.state),
+        ("action", roles.action),
+    )
+    for role, parts in drawn:
+        if parts:
+            values = np.hstack([columns[part] for part in parts])
+            add_values(into, role, _component_names(roles.elements(parts))[:_MAX_COMPONENTS], values)
 
 
-def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
+def _component_names(names: tuple[str, ...]) -> tuple[str, ...]:
+    """Names of elements, "component 0" where they have none."""
+    return tuple(f"component {name}" for name in names) if is_numbered(names) else names
+
+
+def _missing(info: DatasetInfo, roles: Roles, *, has_sidecar: bool) -> Iterator[str]:
     """Sentences about what the dataset does not contain."""
     if not has_sidecar:
         yield (
@@ -236,12 +243,10 @@ def _missing(info: DatasetInfo, *, has_sidecar: bool) -> Iterator[str]:
             yield f"No column {_SUCCESS} states which episodes succeeded."
     if all(info.features[key].is_depth for key in _cameras(info)):
         yield "It has no color images, so there are no filmstrips."
-    for feature in (STATE, ACTION):
-        item = info.features.get(feature)
-        if item is None or item.dtype not in _NUMBERS or len(item.shape) != 1:
-            yield f"It has no column {feature} of numbers, so nothing is drawn of it."
-        elif item.shape[0] > _MAX_COMPONENTS:
-            yield f"Of the {item.shape[0]} components of {feature} the first {_MAX_COMPONENTS} are drawn."
+    yield from roles.notes()
+    for role, parts in (("state", roles.state), ("action", roles.action)):
+        if (count := len(roles.elements(parts))) > _MAX_COMPONENTS:
+            yield f"Of the {count} components of the {role} the first {_MAX_COMPONENTS} are drawn."
 
 
 def _facts(

@@ -6,8 +6,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
@@ -16,7 +17,7 @@ from demorec.core.processes import in_turn
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import Outcome, consecutive_runs
-from demorec.episode.features import ACTION, STATE
+from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
 from demorec.mcap import Recording, open_recording
 from demorec.report.content import (
@@ -47,8 +48,8 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
-_Vectors = dict[str, tuple[Sequence[str], NDArray[Any]]]
-"""Feature -> the names of its components, and its values (T, D)."""
+_Vectors = dict[Literal["state", "action"], tuple[Sequence[str], NDArray[Any]]]
+"""Role -> the names of its components, and its values (T, D)."""
 _Read = tuple[ReportedEpisode, _Vectors, SubjectReport | None]
 _AHEAD = 2
 """Episodes that a process may have read before they are counted here."""
@@ -60,6 +61,7 @@ def gather(
     camera: str = "",
     checks: CheckOptions | None = None,
     workers: int = 1,
+    named: NamedRoles = NO_NAMES,
     advance: Callable[[int, int], None] = lambda done, total: None,
 ) -> Report:
     """The content of a page about a recording, a run, an evaluation, a folder of recordings or a dataset.
@@ -69,6 +71,7 @@ def gather(
         camera: Which images the filmstrips show; "" for the first camera.
         checks: Which checks are run; None for none.
         workers: Processes that read and check recordings.
+        named: Features whose role the user names, in what demorec did not simulate.
         advance: Called with the number of finished items and of all items.
 
     Raises:
@@ -77,12 +80,17 @@ def gather(
     """
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
-        return dataset_report(path, camera, checks, advance)
-    return _recordings_report(found, camera, checks, workers, advance)
+        return dataset_report(path, camera, checks, named, advance)
+    return _recordings_report(found, camera, checks, workers, named, advance)
 
 
 def _recordings_report(
-    found: Found, camera: str, checks: CheckOptions | None, workers: int, advance: Callable[[int, int], None]
+    found: Found,
+    camera: str,
+    checks: CheckOptions | None,
+    workers: int,
+    named: NamedRoles,
+    advance: Callable[[int, int], None],
 ) -> Report:
     path = found.path
     run, missing = _run_file(found)
@@ -99,12 +107,13 @@ def _recordings_report(
     total = len(subjects) + len(folders)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for episode, vectors, checked in _read_all(path, camera, checks, subjects, workers):
+    for episode, vectors, checked in _read_all(path, camera, checks, subjects, workers, named):
         episodes.append(episode)
-        for feature, (names, values) in vectors.items():
-            add_values(components, feature, names, values)
+        for role, (names, values) in vectors.items():
+            add_values(components, role, names, values)
         if checked is not None:
             summaries.add(checked.results, episode.name)
+            missing += [note for note in checked.notes if note not in missing]
         advance(len(episodes), total)
     if checks is None:
         missing.append("No checks were run (--no-checks).")
@@ -129,17 +138,22 @@ def _recordings_report(
 
 
 def _read_all(
-    root: Path, camera: str, checks: CheckOptions | None, subjects: Sequence[Subject], workers: int
+    root: Path,
+    camera: str,
+    checks: CheckOptions | None,
+    subjects: Sequence[Subject],
+    workers: int,
+    named: NamedRoles,
 ) -> Iterator[_Read]:
     stride = -(-len(subjects) // MAX_SHOWN)
     budget = strip_budget(len(subjects))
     strips = [0 if number % stride and s.path.parent.name != FAILED else budget for number, s in enumerate(subjects)]
     return in_turn(
-        partial(_read, root, camera, checks), list(zip(subjects, strips, strict=True)), workers, ahead=_AHEAD
+        partial(_read, root, camera, checks, named), list(zip(subjects, strips, strict=True)), workers, ahead=_AHEAD
     )
 
 
-def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Subject, int]) -> _Read:
+def _read(root: Path, camera: str, checks: CheckOptions | None, named: NamedRoles, given: tuple[Subject, int]) -> _Read:
     """Read and check a recording, in any process, its strip within so many bytes; a damaged one is reported as such."""
     subject, strip_bytes = given
     checked = None if checks is None else check_subject(subject, checks)
@@ -149,13 +163,15 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, given: tuple[Sub
     source = path.name if path == root else path.relative_to(root).as_posix()
     try:
         with open_recording(path) as recording:
-            episode, vectors = _read_recording(recording, camera, strip_bytes)
+            episode, vectors = _read_recording(recording, camera, strip_bytes, named)
     except RecordingError as error:
         episode, vectors = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
     return replace(episode, source=source, flags=tuple(flags)), vectors, checked
 
 
-def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tuple[ReportedEpisode, _Vectors]:
+def _read_recording(
+    recording: Recording, camera: str, strip_bytes: int, named: NamedRoles
+) -> tuple[ReportedEpisode, _Vectors]:
     info, content = recording.info, ExportEpisode(recording, CommonOptions())
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
@@ -180,16 +196,22 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> tupl
         filmstrip=strip,
         facts=tuple(_facts_of(recording)),
     )
-    return episode, _vectors(content)
+    return episode, _vectors(content, named)
 
 
-def _vectors(content: ExportEpisode[CommonOptions]) -> _Vectors:
+def _vectors(content: ExportEpisode[CommonOptions], named: NamedRoles) -> _Vectors:
     """State and action as an export has them; nothing of an episode that could not be exported."""
+    roles = roles_of_recording(content.recording.info, named)
     try:
         vectors = content.vectors
-        return {name: (content.names[name], vectors[name]) for name in (STATE, ACTION) if name in vectors}
     except ExportError:  # no frames, or numbers that are not finite, which the checks report
         return {}
+    found: _Vectors = {}
+    if roles.state:
+        found["state"] = roles.elements(roles.state), np.hstack([vectors[part] for part in roles.state])
+    if roles.action:
+        found["action"] = roles.elements(roles.action), np.hstack([vectors[part] for part in roles.action])
+    return found
 
 
 def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:

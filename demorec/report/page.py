@@ -23,7 +23,6 @@ from numpy.typing import NDArray
 from demorec.check.base import Result
 from demorec.core.replacing import REPORT_MARK
 from demorec.core.text import printable
-from demorec.episode.features import ACTION, STATE
 from demorec.report import charts
 from demorec.report.charts import Chart, css_color
 from demorec.report.content import LEVELS, MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
@@ -162,8 +161,8 @@ def _words(episode: ReportedEpisode) -> str:
 
 def _distributions(report: Report) -> Iterator[Chart]:
     by_name: dict[str, list[tuple[str, NDArray[np.float32]]]] = {}
-    for (feature, name), parts in report.distributions.items():
-        by_name.setdefault(name, []).append(({STATE: "state", ACTION: "action"}[feature], np.concatenate(parts)))
+    for (role, name), parts in report.distributions.items():
+        by_name.setdefault(name, []).append((role, np.concatenate(parts)))
     for name, series in by_name.items():
         unit = _unit(name) if report.has_units else ""
         yield charts.distribution(f"{name} ({unit})" if unit else name, series)

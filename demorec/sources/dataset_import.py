@@ -19,6 +19,7 @@ from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.datasets.lerobot.videos import why_transcoded
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.robots.motors import Motors
 from demorec.runs.external import episode_path, open_external_run, planned_episode
 from demorec.runs.find import expect
@@ -32,6 +33,7 @@ def import_lerobot(
     *,
     video: VideoConfig | None = None,
     motors: Motors | None = None,
+    named: NamedRoles = NO_NAMES,
 ) -> FramesImport:
     """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, whoever wrote it, into a run.
 
@@ -41,6 +43,7 @@ def import_lerobot(
         out: The run's folder; one that the same dataset began is continued.
         video: How images are encoded whose packets cannot pass through.
         motors: The servos whose values LeRobot recorded as state and action.
+        named: Features whose role the user names; the recordings keep it.
 
     Raises:
         ConfigError: This is no dataset, not one of these servos, it has what no recording can hold, or the folder holds
@@ -52,7 +55,9 @@ def import_lerobot(
         raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
     root = roots[0]
     expect(root, "dataset")
-    dataset = LeRobotDataset(root, motors)
+    dataset = LeRobotDataset(root, motors, named)
+    if elements := [name for name in named.gripper if name not in dataset.info.features]:
+        raise ConfigError(f"An import takes whole features: --gripper names {elements[0]!r}, an element of the state.")
     if not dataset.places:
         raise ConfigError(f"The dataset has no episodes: {root}")
     if empty := [place.episode_index for place in dataset.places if place.length < 1]:

@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, cast
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.robots.motors import Motors
 from demorec.runs.find import IMPORT_WORDS, PathKind, find
 from demorec.sources.mapping import SourceKind, SourceMapping
@@ -37,6 +38,7 @@ class SourceFormat:
         importer: "module:function", which `read` calls with its arguments.
         mapping: Whose keys its mappings have; None where it needs none.
         has_motor_units: Whether its numbers may be those of an arm's servos.
+        has_roles: Whether the user may name the roles of its features; a mapping says them otherwise.
         suggester: "module:function", path -> the lines of a mapping, where it needs one.
     """
 
@@ -46,19 +48,25 @@ class SourceFormat:
     importer: str
     mapping: SourceKind | None = None
     has_motor_units: bool = False
+    has_roles: bool = False
     suggester: str = ""
 
     def read(
-        self, paths: Sequence[Path], mapping: Path | None, out: Path, video: VideoConfig, motors: Motors | None
+        self,
+        paths: Sequence[Path],
+        mapping: Path | None,
+        out: Path,
+        video: VideoConfig,
+        motors: Motors | None = None,
+        named: NamedRoles = NO_NAMES,
     ) -> FramesImport:
         """Make or continue the run `out`; pixels are encoded as `video` says, numbers those of `motors`.
 
         Raises:
             DemorecError: As the importer.
         """
-        return cast(
-            "FramesImport", pkgutil.resolve_name(self.importer)(paths, mapping, out, video=video, motors=motors)
-        )
+        importer = pkgutil.resolve_name(self.importer)
+        return cast("FramesImport", importer(paths, mapping, out, video=video, motors=motors, named=named))
 
     def suggest(self, path: Path) -> list[str]:
         """The lines of a mapping of a format that needs one."""
@@ -72,6 +80,7 @@ _ROWS = (
         example="datasets/cups --out runs/cups",
         importer="demorec.sources.dataset_import:import_lerobot",
         has_motor_units=True,
+        has_roles=True,
     ),
     SourceFormat(
         kind="hdf5",
@@ -126,7 +135,7 @@ def opened(
             if form is None or form.mapping:
                 chosen = mapping or _suggested(path, form, Path(folder) / f"{number}.toml", tell)
             if form is not None:
-                for line in form.read([path], chosen, run, VideoConfig(), None).left_out_lines():
+                for line in form.read([path], chosen, run, VideoConfig()).left_out_lines():
                     tell(line)
             elif chosen is not None:
                 _import_bag(path, chosen, run, tell)

@@ -25,6 +25,7 @@ from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome, Vector
 from demorec.episode.info import EpisodeInfo, SourceFile
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.validity import find_problems
 from demorec.robots.motors import Motors
 from demorec.runs.external import differences, open_external_run, planned_episode
@@ -47,6 +48,7 @@ def import_hdf5(
     *,
     video: VideoConfig | None = None,
     motors: Motors | None = None,
+    named: NamedRoles = NO_NAMES,
 ) -> FramesImport:
     """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
 
@@ -56,6 +58,7 @@ def import_hdf5(
         out: The run's folder; one that the same files and mapping began is continued.
         video: How images are encoded that come as pixels.
         motors: Unused: the mapping says what the numbers are.
+        named: Unused: the mapping says which features there are.
 
     Raises:
         ConfigError: The mapping is impossible, the files differ, or the folder holds something else.

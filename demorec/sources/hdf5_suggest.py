@@ -15,7 +15,8 @@ import numpy as np
 
 from demorec.core.errors import without_path
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, StoredArray
-from demorec.episode.features import EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
+from demorec.episode.features import EE_POSE, STATE
+from demorec.episode.roles import HDF5_PARTS
 from demorec.runs.find import expect
 from demorec.sources.hdf5_arrays import is_camera
 from demorec.sources.hdf5_import import episode_places, found_attribute, stated_rate
@@ -33,18 +34,6 @@ _ALOHA_FPS = 50
 _ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 _TASKS = ("instruction", "ep_meta.lang", "problem_info.language_instruction", "language_instruction")
 _ROBOTS = ("env_args.env_kwargs.robot", "env_args.env_kwargs.robots", "env_args.env_kwargs.robots.0")
-_PARTS = {
-    "joint_pos": STATE,
-    "gripper_qpos": STATE,
-    "joint_vel": VELOCITY,
-    "gripper_qvel": VELOCITY,
-    "eef_pos": EE_POSE,
-    "eef_quat": EE_POSE,
-    "object": ENVIRONMENT_STATE,
-    "qpos": STATE,
-    "qvel": VELOCITY,
-}
-"""How an observation's name ends -> the feature that it is a part of; others are features of their own."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,7 +221,7 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
         yield "# its quaternions are w, x, y, z."
     for name in (name for name in vectors if _is_observed(name, layout)):
         last = name.removeprefix(layout.folder)
-        known = (feature for end, feature in _PARTS.items() if last == end or last.endswith(f"_{end}"))
+        known = (feature for end, feature in HDF5_PARTS.items() if last == end or last.endswith(f"_{end}"))
         feature = STATE if last in layout.states else next(known, f"observation.{_word(last)}")
         if absolute and feature == STATE:
             feature = f"observation.{_word(last)}"
@@ -251,8 +240,8 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
 def _order(name: str) -> tuple[str, int]:
     """Of the parts of a feature: robot after robot, the arm in front of its gripper, positions before orientations."""
     last = name.rpartition("/")[2]
-    ends = [index for index, end in enumerate(_PARTS) if last == end or last.endswith(f"_{end}")]
-    robot = last.removesuffix(list(_PARTS)[ends[0]]) if ends else last
+    ends = [index for index, end in enumerate(HDF5_PARTS) if last == end or last.endswith(f"_{end}")]
+    robot = last.removesuffix(list(HDF5_PARTS)[ends[0]]) if ends else last
     return robot, ends[0] if ends else 0
 
 

@@ -70,6 +70,7 @@ class PlayedEpisode:
         outcome: How it ended, None when nobody knows.
         time_ns: (T,) of the frames, since the first one.
         curves: Name -> measured values.
+        roles: Curve that is a feature -> its role (`demorec.episode.roles`), where it has one.
         videos: Camera -> encoded images.
         depth: Camera -> reads (time_ns, distances) of each of its images.
         statements: What is said of it.
@@ -96,6 +97,7 @@ class PlayedEpisode:
     time_ns: NDArray[np.int64]
     curves: Mapping[str, Curves]
     videos: Mapping[str, Video]
+    roles: Mapping[str, str] = field(default_factory=dict)
     depth: Mapping[str, Depth] = field(default_factory=dict)
     statements: Statements = ()
     robot_description: str | None = None

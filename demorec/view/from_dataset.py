@@ -31,6 +31,7 @@ from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED
 from demorec.episode.validity import read_episode_info
@@ -51,14 +52,15 @@ def dataset_episodes(root: Path) -> list[int]:
 
 
 @contextmanager
-def open_dataset_episode(root: Path, episode_index: int) -> Iterator[PlayedEpisode]:
-    """One episode of a dataset.
+def open_dataset_episode(root: Path, episode_index: int, named: NamedRoles = NO_NAMES) -> Iterator[PlayedEpisode]:
+    """One episode of a dataset, and features whose role the user names.
 
     Raises:
+        ConfigError: It lacks a feature that the user names.
         RecordingError: It cannot be read.
     """
     try:
-        episode = _read_episode(LeRobotDataset(root), episode_index)
+        episode = _read_episode(LeRobotDataset(root, named=named), episode_index)
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
         unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {root}")
         raise resource_error(error) or unreadable from error
@@ -87,9 +89,9 @@ def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
         return _simulated(recording, row, known | {"identity": f"dataset-{group}-{episode_index}"})
     info, robot = recording.info, recording.robot
     if not info.urdf and robot is not None:
-        info = with_robot(info, robot)
+        info = with_robot(info, robot, recording.dataset.roles)
     known["identity"] = hashlib.sha256(f"{root.resolve()} {episode_index}".encode()).hexdigest()[:16]
-    return played_episode(recording, known, info)
+    return played_episode(recording, known, info, recording.dataset.roles)
 
 
 def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str, Any]) -> PlayedEpisode:
@@ -119,7 +121,8 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
         joints["velocity"] = data["observation.velocity"]
     if export.get("action") == "joint":
         joints["target"] = data["action"]
-    episode = played_episode(recording, known, replace(info, features=recording.info.features))
+    shown = replace(info, features=recording.info.features)
+    episode = played_episode(recording, known, shown, recording.dataset.roles)
     return replace(
         episode,
         outcome=_outcome(row, len(state)),

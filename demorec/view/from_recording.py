@@ -18,6 +18,7 @@ from demorec.core.geometry import Array
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.episode import NO_IMAGE, Table, Trajectory
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.roles import NO_NAMES, ROLES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.sensed import ObservationRows
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.channels import JOINT_STATES, description_topic
@@ -27,10 +28,11 @@ from demorec.view.episode import Curves, PlayedEpisode, Video, simulated_curves,
 
 
 @contextmanager
-def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
+def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[PlayedEpisode]:
     """The episode of a recording; its images can be read until the context is left.
 
     Raises:
+        ConfigError: It lacks a feature whose role the user names, or is simulated.
         RecordingError: It cannot be read.
     """
     folder = path.resolve().parent
@@ -43,7 +45,8 @@ def open_recorded(path: Path) -> Iterator[PlayedEpisode]:
     with open_recording(path) as recording:
         times = recording.time_ns
         statements = tuple((int(times[frame] - times[0]), "subtask", text) for frame, text in recording.subtasks)
-        episode = played_episode(recording, known | {"statements": statements}, recording.info)
+        roles = roles_of_recording(recording.info, named)
+        episode = played_episode(recording, known | {"statements": statements}, recording.info, roles)
         yield episode if episode.scene is None else _with_simulation(episode, recording)
 
 
@@ -71,8 +74,10 @@ def _with_simulation(episode: PlayedEpisode, recording: Recording) -> PlayedEpis
     )
 
 
-def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo) -> PlayedEpisode:
-    """What every episode has: features and images; `info` may describe its robot."""
+def played_episode(
+    recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo, roles: Roles
+) -> PlayedEpisode:
+    """What every episode has: features and images; `info` may describe its robot. Curves are in the order of roles."""
     table = recording.table()
     time_ns = table.time_ns - (table.time_ns[0] if table.num_frames else 0)
     places = joint_places(info.features)
@@ -80,6 +85,7 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
     return PlayedEpisode(
         **known,
         info=info,
+        roles={name: role for name, role in roles.of.items() if role is not None},
         robot_description=info.urdf or None,
         outcome=recording.outcome,
         time_ns=time_ns,
@@ -88,7 +94,7 @@ def played_episode(recording: Recording | DatasetRecording, known: dict[str, Any
             feature.name: Curves(
                 time_ns=time_ns, values=table.features[feature.name].astype(np.float64), names=feature.names
             )
-            for feature in info.features
+            for feature in sorted(info.features, key=lambda feature: ROLES.index(roles.of[feature.name]))
         },
         videos={
             camera: video_of(recording, camera, shown_at(table, camera, time_ns))

@@ -9,6 +9,7 @@ from typing import Literal
 import rerun as rr
 import rerun.blueprint as rrb
 
+from demorec.episode.features import ACTION, STATE
 from demorec.episode.sensed import SENSED
 from demorec.view.episode import PlayedEpisode
 from demorec.view.paths import FRAMES, SECONDS, Paths
@@ -215,8 +216,14 @@ def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
     tabs = [item for title, names in plots.items() if title not in _SIDE and (item := view(title, *names)) is not None]
     beside = [
         *((title, plots[title]) for title in _SIDE),
-        *((name, (name,)) for name in episode.curves if name not in known),
+        *((_feature_title(name, episode.roles), (name,)) for name in episode.curves if name not in known),
     ]
     columns: list[rrb.View | rrb.Container] = [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
     columns += [item for title, names in beside if (item := view(title, *names)) is not None]
     return rrb.Horizontal(*columns, column_shares=[1.8, *([1.0] * (len(columns) - 1))] if tabs else None)
+
+
+def _feature_title(name: str, roles: Mapping[str, str]) -> str:
+    """The title of a feature's plot: its name, and its role where the name in common use is another."""
+    is_usual = name in (STATE, ACTION) or name not in roles
+    return name if is_usual else f"{roles[name]}: {name}"

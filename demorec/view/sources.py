@@ -9,6 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, OptionError
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.view.episode import PlayedEpisode
 from demorec.view.from_dataset import dataset_episodes, open_dataset_episode
@@ -28,8 +29,15 @@ class PlaybackSource:
     open: Callable[[], AbstractContextManager[PlayedEpisode]]
 
 
-def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> list[PlaybackSource]:
+def find_episodes(
+    paths: Sequence[Path], *, include_failures: bool = False, named: NamedRoles = NO_NAMES
+) -> list[PlaybackSource]:
     """Every episode below the paths, in their order; a run's failures only when asked for, an evaluation's always.
+
+    Args:
+        paths: Recordings, runs, folders of recordings, datasets.
+        include_failures: Whether failed attempts count.
+        named: Features whose role the user names.
 
     Raises:
         ConfigError: A path is not there, or holds nothing that can be shown.
@@ -37,14 +45,14 @@ def find_episodes(paths: Sequence[Path], *, include_failures: bool = False) -> l
     """
     if not paths:
         raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec view recordings/demo.")
-    return [source for path in paths for source in _sources(path, include_failures)]
+    return [source for path in paths for source in _sources(path, include_failures, named)]
 
 
-def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
+def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[PlaybackSource]:
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
         return [
-            PlaybackSource(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index))
+            PlaybackSource(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index, named))
             for index in dataset_episodes(path)
         ]
     shows_failures = include_failures or found.kind == "evaluation"  # whose failed rollouts are results like others
@@ -52,7 +60,7 @@ def _sources(path: Path, include_failures: bool) -> list[PlaybackSource]:
     if not files and found.failed:
         raise ConfigError(f"The folder holds failed attempts only, which --include-failures shows: {path}")
     expect_recordings(found, files)
-    return [PlaybackSource(name=str(file), open=partial(open_recorded, file)) for file in files]
+    return [PlaybackSource(name=str(file), open=partial(open_recorded, file, named)) for file in files]
 
 
 def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSource]:

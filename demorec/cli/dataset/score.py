@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from demorec.cli.dataset.edit import DatasetPath, dataset_at
 from demorec.cli.shared.output import counted, say, say_json, tell
 from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError
 from demorec.core.targets import OptionalTarget
@@ -26,6 +27,7 @@ class Score:
     Examples:
       demorec dataset score cups
       demorec dataset score cups --out scores.json
+      demorec dataset score cups --state joint_angles --action joint_targets
     """
 
     dataset: DatasetPath
@@ -35,15 +37,19 @@ class Score:
     """Replace an existing file of scores."""
     json: bool = False
     """Print JSON."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
         """Score, print, and write."""
         from demorec.datasets.lerobot.files import leave_pandas_out
+        from demorec.datasets.lerobot.layout import DatasetInfo
+        from demorec.datasets.lerobot.modality import dataset_roles
         from demorec.datasets.scoring.score import score_dataset, to_json
 
         leave_pandas_out()
         root = dataset_at(self.dataset)
-        found = score_dataset(root) if self.out is None else self._written(root, self.out)
+        tell(*dataset_roles(root, DatasetInfo.load(root), self.roles.named).notes())
+        found = score_dataset(root, self.roles.named) if self.out is None else self._written(root, self.out)
         if self.json:
             say_json(to_json(found))
         for episode in () if self.json else sorted(found, key=lambda episode: episode.score):
@@ -63,7 +69,7 @@ class Score:
         if not out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {out.parent}.")
         with atomic_write(out, SCORES, overwrite=self.overwrite, sources=[root]) as part:
-            found = score_dataset(root)
+            found = score_dataset(root, self.roles.named)
             write_scores(part, found)
         return found
 

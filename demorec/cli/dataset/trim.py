@@ -28,8 +28,8 @@ class Trim(EditOne):
     """Frames to cut off at the end."""
     idle: bool = False
     """Cut off the frames before the first and after the last motion."""
-    idle_feature: str = "observation.state"
-    """With --idle: feature whose changes count as motion."""
+    idle_feature: str | None = None
+    """With --idle: feature whose changes count as motion (auto: the state)."""
     idle_threshold: float = 0.01
     """With --idle: motion is a change by more than this share of the feature's range."""
     idle_margin: int = 3
@@ -42,5 +42,16 @@ class Trim(EditOne):
         if self.idle == bool(self.head or self.tail):
             raise ConfigError("Give either --idle, or frames by --head and --tail.")
         if self.idle:
-            return operations.trim_idle(sources[0], self.idle_feature, self.idle_threshold, self.idle_margin)
+            features = self._state(sources[0]) if self.idle_feature is None else (self.idle_feature,)
+            return operations.trim_idle(sources[0], features, self.idle_threshold, self.idle_margin)
         return operations.trim(sources[0], self.head, self.tail)
+
+    def _state(self, source: Source) -> tuple[str, ...]:
+        """The features that are the state; ConfigError if none is found."""
+        from demorec.datasets.lerobot.modality import dataset_roles
+        from demorec.episode.roles import NO_NAMES
+
+        found = dataset_roles(source.root, source.info, NO_NAMES).state
+        if not found:
+            raise ConfigError(f"No state was found: name a feature by --idle-feature: {source.root}")
+        return found

@@ -129,19 +129,14 @@ def _converted(
     target = model or own
     elements = None
     if "elements" in item:
-        elements = tuple(_element_names(own).index(text) for text in item["elements"])
+        elements = tuple(own.elements.index(text) for text in item["elements"])
         if model is None:
-            target = replace(own, shape=(len(elements),), names=tuple(item["elements"]))
+            target = own.with_elements(tuple(item["elements"]))
     width = own.shape[0] if elements is None else len(elements)
     if width != target.shape[0]:
         raise ValueError(f"it gives another number of elements than {target.shape[0]}")
     scale, offset = _unit(item, width)
     return target, FeatureMapping(feature=origin, elements=elements, scale=scale, offset=offset)
-
-
-def _element_names(feature: DatasetFeature) -> tuple[str, ...]:
-    """Names of a vector's elements, their numbers where they have none."""
-    return feature.names or tuple(map(str, range(feature.shape[0])))
 
 
 def _unit(item: Mapping[str, Any], width: int) -> tuple[Any, Any]:
@@ -193,7 +188,7 @@ def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
         for name in common:
             if not _fits(features[name], first[name]):
                 yield f"[dataset.feature.{_quoted(name)}]"
-                yield f"elements = {_quoted(_element_names(first[name]))}"
+                yield f"elements = {_quoted(first[name].elements)}"
         yield ""
 
 
@@ -201,7 +196,7 @@ def _can_give(own: DatasetFeature | None, first: DatasetFeature) -> bool:
     """Whether a feature equals that of the first dataset, or has all of its elements."""
     if own is None or own.dtype != first.dtype:
         return False
-    return _fits(own, first) or (_is_vector(own, first) and set(_element_names(first)) <= set(_element_names(own)))
+    return _fits(own, first) or (_is_vector(own, first) and set(first.elements) <= set(own.elements))
 
 
 def _other_names(first: Plan, plan: Plan) -> Iterator[str]:

@@ -104,27 +104,29 @@ def trim(source: Source, head: int, tail: int) -> Plan:
     return plan.with_cuts([replace(cut, first=head, last=cut.last - tail) for cut in plan.cuts])
 
 
-def trim_idle(source: Source, feature: str, threshold: float, margin: int) -> Plan:
+def trim_idle(source: Source, features: Sequence[str], threshold: float, margin: int) -> Plan:
     """Every episode without the frames in which nothing moves at its beginning and end.
 
     Args:
         source: The dataset.
-        feature: Whose numbers are looked at.
+        features: Whose numbers are looked at.
         threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
         margin: Frames that stay at either end.
     """
     numeric = [name for name in _own(source) if source.info.features[name].is_numeric]
-    check_choice("feature of numbers", feature, numeric)
+    for feature in features:
+        check_choice("feature of numbers", feature, numeric)
     if not 0 < threshold <= 1:
         raise OptionError("idle_threshold", f"is {threshold}, allowed are shares above 0 and up to 1.")
     check_option("idle_margin", margin, 0, 2**63 - 1, "frames")
     plan = Plan.whole(source)
-    rows = RowStream(source.info, [feature])
+    rows = RowStream(source.info, features)
 
     def numbers() -> Any:
         for cut in plan.cuts:
-            column = rows.read(source.places[cut.episode]).column(feature)
-            yield cut, column_numbers(column.combine_chunks()).astype(np.float64)
+            table = rows.read(source.places[cut.episode])
+            columns = [column_numbers(table.column(feature).combine_chunks()) for feature in features]
+            yield cut, np.hstack(columns).astype(np.float64)
 
     low, high = np.inf, -np.inf
     for _, values in numbers():

@@ -11,7 +11,8 @@ where it is there. Memory is that of an episode's numbers.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -25,13 +26,16 @@ from demorec.datasets.lerobot.depth import DepthScale
 from demorec.datasets.lerobot.files import column_numbers, open_table, table_batches, tables_in
 from demorec.datasets.lerobot.language import COLUMNS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
+from demorec.datasets.lerobot.modality import dataset_roles
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, OpenDataset, RowStream
 from demorec.datasets.lerobot.robots import DatasetRobot, read_robot
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages, codec_of, opened_video
-from demorec.episode.features import IMAGE_PREFIX, STATE
+from demorec.episode.element_names import numbers
+from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.info import Camera, Feature, Kept
+from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.mcap.video import Rgb
 from demorec.robots.motors import Motors
 
@@ -63,17 +67,19 @@ class LeRobotDataset(OpenDataset):
         keys: Camera, as recordings call it -> feature.
         left_out: What no recording can hold, by its name in the dataset -> why.
         motors: The servos whose values its state and actions are, where the user says so.
+        roles: The role of each feature; one that no name says is also in `features`.
 
     Raises:
         ExportError: As `OpenDataset`.
-        ConfigError: Two cameras would get one name, or it has no state of the servos.
+        ConfigError: Two cameras would get one name, it has no state of the servos, or lacks what the user names.
     """
 
-    def __init__(self, root: Path, motors: Motors | None = None) -> None:
+    def __init__(self, root: Path, motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
         super().__init__(root)
         self.motors = motors
-        state = self.info.features.get(STATE)
-        if motors is not None and (state is None or state.names != motors.names):
+        self.roles = dataset_roles(root, self.info, named)
+        roles = self.roles.beyond_names()
+        if motors is not None and self.roles.elements(self.roles.state) != motors.names:
             raise ConfigError(
                 f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
             )
@@ -90,7 +96,8 @@ class LeRobotDataset(OpenDataset):
                     raise ConfigError(f"Two cameras of the dataset would be called {camera!r}: {root}")
                 self.keys[camera] = name
             elif name not in AUTOMATIC_FEATURES:
-                self.features += (_feature(name, feature),)
+                vector = _feature(name, feature, self.roles.columns[name].elements)
+                self.features += (replace(vector, role=roles.get(name, "")),)
         self.left_out |= dict(self._left_out_beside())
         self._cameras: dict[str, Camera] = {}
         self._videos: dict[tuple[str, int], EpisodeVideo] = {}
@@ -240,9 +247,9 @@ def _why_no_distances(feature: DatasetFeature) -> str:
     return ""
 
 
-def _feature(name: str, feature: DatasetFeature) -> Feature:
+def _feature(name: str, feature: DatasetFeature, elements: Sequence[str]) -> Feature:
     count = int(np.prod(feature.shape))
-    names = tuple(name.replace(",", " ") for name in feature.names or ())
-    if len(names) != count or len(set(names)) != count or not all(text and text.isprintable() for text in names):
-        names = tuple(str(number) for number in range(count))
+    names = tuple(name.replace(",", " ") for name in elements)
+    if len(set(names)) != count:
+        names = numbers(count)
     return Feature(name=name, dtype=_RECORDED[feature.dtype], names=names, source=name)

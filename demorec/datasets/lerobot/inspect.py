@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
+from demorec.datasets.lerobot.files import open_table, read_json, read_table, rows_in, tables_in
 from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.mp4_index import check_video
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.reader import RowStream, episode_places, read_tasks
+from demorec.datasets.lerobot.robots import read_robot
 from demorec.datasets.lerobot.videos import PacketReader
 
 
@@ -27,6 +28,19 @@ def attempt_counts(path: Path) -> tuple[int, int] | None:
         return None
     successes = sum(row["success"] is True for row in rows_in(path, f"{SIDECAR_DIR}/episodes", ["success"]))
     return successes, sum(open_table(file).metadata.num_rows for file in attempts)
+
+
+def known_units(path: Path) -> Mapping[str, tuple[str, ...]]:
+    """Feature -> units of its elements, as demorec keeps them beside its datasets; empty for anybody else's.
+
+    Raises:
+        ExportError: The tables or the robot's description are damaged.
+    """
+    for file in tables_in(path, f"{SIDECAR_DIR}/episodes"):
+        if "robot_digest" in open_table(file).schema_arrow.names:
+            digests = read_table(file, ["robot_digest"]).column(0).drop_null()
+            return read_robot(path, digests[0].as_py()).record.units if len(digests) else {}
+    return {}
 
 
 def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:

@@ -26,6 +26,8 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.language import TYPES, language_feature
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.episode.element_names import numbers, read_names
+from demorec.episode.roles import Column
 
 CODEBASE_VERSION = "v3.0"
 """Of what is written."""
@@ -73,14 +75,33 @@ class DatasetFeature:
     Attributes:
         dtype: LeRobot's name of the type.
         shape: Without the frame dimension; (1,) is a scalar column.
-        names: Component names of a vector, dimension names of a camera, None for a scalar.
+        names: Names of a vector's elements, of a camera's dimensions; None where they are unknown.
         info: Of cameras only: the `video.*` entries.
+        written_names: `names` as info.json has them, where that is no list of these names.
+        other: Other keys of the entry.
     """
 
     dtype: FeatureType
     shape: tuple[int, ...]
     names: tuple[str, ...] | None = None
     info: dict[str, Any] | None = None
+    written_names: Any = field(default=None, compare=False)
+    other: Mapping[str, Any] = field(default_factory=dict, compare=False)
+
+    @property
+    def elements(self) -> tuple[str, ...]:
+        """Names of a vector's elements, their numbers where they have no names."""
+        return self.names or numbers(self.shape[0])
+
+    @property
+    def column(self) -> Column:
+        """The feature as its role is found."""
+        is_vector = self.is_numeric and len(self.shape) == 1
+        return Column(self.dtype, self.elements if is_vector else ())
+
+    def with_elements(self, names: tuple[str, ...]) -> DatasetFeature:
+        """The vector with other elements."""
+        return replace(self, shape=(len(names),), names=names, written_names=None)
 
     @property
     def is_video(self) -> bool:
@@ -114,21 +135,17 @@ class DatasetFeature:
 
     def to_json(self) -> dict[str, Any]:
         """The entry as info.json has it."""
-        entry: dict[str, Any] = {
-            "dtype": self.dtype,
-            "shape": list(self.shape),
-            "names": None if self.names is None else list(self.names),
-        }
+        names = self.written_names
+        if names is None and self.names is not None:
+            names = list(self.names)
+        entry: dict[str, Any] = {"dtype": self.dtype, "shape": list(self.shape), "names": names}
         if self.info is not None:
             entry["info"] = self.info
-        return entry
+        return entry | dict(self.other)
 
     @classmethod
     def from_json(cls, entry: dict[str, Any]) -> DatasetFeature:
         """Inverse of `to_json`, for datasets written by anyone."""
-        names = entry.get("names")
-        if isinstance(names, dict):  # older recordings of real robots: {"motors": [...]}
-            names = [name for group in names.values() for name in group]
         shape, info = entry["shape"], entry.get("info")
         if not isinstance(entry["dtype"], str):
             raise ValueError("a feature without dtype")
@@ -138,14 +155,19 @@ class DatasetFeature:
             raise ValueError(f"a video of shape {reprlib.repr(shape)}")
         if info is not None and not isinstance(info, dict):
             raise ValueError("the info of a feature is no object")
+        written = entry.get("names")
+        names = read_names(written, int(shape[0]) if len(shape) == 1 else len(shape))
         return cls(
             dtype=entry["dtype"],  # type: ignore[arg-type]
             shape=tuple(shape),
-            names=None if names is None else tuple(str(name) for name in names),
+            names=names,
             info=info,
+            written_names=None if names is not None and written == list(names) else written,
+            other={key: value for key, value in entry.items() if key not in _FEATURE_KEYS},
         )
 
 
+_FEATURE_KEYS = frozenset(("dtype", "shape", "names", "info"))
 AUTOMATIC_FEATURES: dict[str, DatasetFeature] = {
     "timestamp": DatasetFeature(dtype="float32", shape=(1,)),
     **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), DatasetFeature(dtype="int64", shape=(1,))),

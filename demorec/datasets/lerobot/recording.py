@@ -20,8 +20,9 @@ from demorec.datasets.lerobot.language import PERSISTENT, EpisodeLanguage, spoke
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Outcome, Table, frame_time_ns
-from demorec.episode.features import DEPTH_SUFFIX, STATE
+from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
+from demorec.episode.roles import Roles
 from demorec.mcap.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
@@ -82,7 +83,7 @@ class DatasetRecording:
             cameras=tuple(cameras),
             origin=Origin(kind="dataset"),
         )
-        return info if robot is None else with_robot(info, robot)
+        return info if robot is None else with_robot(info, robot, self.dataset.roles)
 
     def _instruction(self) -> str:
         indices = dict.fromkeys(self._rows["task_index"][:, 0].tolist())
@@ -98,10 +99,10 @@ class DatasetRecording:
         """The arm that the sidecar keeps, that of the named servos, or one of ours that has joints of these names."""
         if (name := self.known.get("robot_digest")) is not None:
             return self.dataset.robot(str(name))
-        state = self.dataset.info.features.get(STATE)
         if self.dataset.motors is not None:
             return robot_of_motors(self.dataset.motors)
-        return recognised_robot(state.names) if state is not None and state.names and not self.known else None
+        roles = self.dataset.roles
+        return None if self.known else recognised_robot(roles.elements(roles.state))
 
     @cached_property
     def outcome(self) -> Outcome:
@@ -237,9 +238,10 @@ class DatasetRecording:
                 yield frame, name, box
 
 
-def with_robot(info: EpisodeInfo, robot: DatasetRobot) -> EpisodeInfo:
+def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
     """The description with an arm, and which of its joints the features move."""
-    return replace(info, urdf=robot.urdf, features=tuple(map(robot.record.described, info.features)))
+    features = tuple(robot.record.described(feature, roles.usual_name(feature.name)) for feature in info.features)
+    return replace(info, urdf=robot.urdf, features=features)
 
 
 def _described(camera: Camera, found: Mapping[str, Any] | None, links: set[str]) -> Camera:

@@ -22,6 +22,7 @@ from demorec.core.tables import ROBOTS
 from demorec.datasets.lerobot.files import MAX_JSON_BYTES
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.writer import write_text
+from demorec.episode.element_names import joint_of
 from demorec.episode.features import ACTION, EE_POSE, STATE
 from demorec.episode.info import Feature
 from demorec.robots.motors import Motors
@@ -34,8 +35,6 @@ if TYPE_CHECKING:
 
 ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
-ELEMENT_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
-"""Ending of an element's name after the name of its joint."""
 _DIGEST = re.compile(r"[0-9a-f]{16}")
 IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
 """Row of `ROBOTS` that LeRobot drives too, in other units -> LeRobot's arm."""
@@ -69,11 +68,16 @@ class RobotRecord:
     spec: RobotSpec | None = None
     calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
-    def described(self, feature: Feature) -> Feature:
-        """Return a feature with its joints, units and calibration, as far as they fit its elements."""
+    def described(self, feature: Feature, usual_name: str = "") -> Feature:
+        """Return a feature with its joints, units and calibration, as far as they fit its elements.
+
+        Args:
+            feature: As the dataset describes it.
+            usual_name: Under which it is known here, where its own name is not; "" for none.
+        """
 
         def fitting[T](found: Mapping[str, tuple[T, ...]]) -> tuple[T, ...]:
-            values = found.get(feature.name, ())
+            values = found.get(feature.name, found.get(usual_name, ()))
             return values if len(values) == len(feature.names) else ()
 
         return replace(
@@ -144,7 +148,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """
     from demorec.mcap.description import robot_description  # loads all that reads recordings
 
-    stems = [ELEMENT_SUFFIX.sub("", name) for name in names]
+    stems = [joint_of(name) for name in names]
     for row in ROBOTS.names():
         robot = ROBOTS.load(row)
         if robot.name in IN_MOTOR_UNITS and _IN_METRES not in names:

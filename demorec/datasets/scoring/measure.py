@@ -6,7 +6,6 @@ alike.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -15,15 +14,13 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.modality import dataset_roles
 from demorec.datasets.lerobot.reader import EpisodePlace, OpenDataset, RowStream
-from demorec.episode.features import ACTION, STATE
+from demorec.episode.roles import NO_NAMES, NamedRoles
 
 _MIN_FRAMES = 8
-_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width)$")
-"""Ending of an element's name that is not part of its joint's name."""
-_GRIPPER = re.compile("gripper|finger", re.IGNORECASE)
 _HIGH = 0.65
 """Share of its range above which a gripper's command counts as high."""
 _LOW = 0.35
@@ -58,34 +55,45 @@ class MeasuredEpisode(NamedTuple):
     readings: Mapping[str, Reading]
 
 
-def measure_dataset(root: Path) -> list[MeasuredEpisode]:
-    """Measure all episodes of a dataset, in order. Raises ExportError if its tables cannot be read."""
+def measure_dataset(root: Path, named: NamedRoles = NO_NAMES) -> list[MeasuredEpisode]:
+    """Measure all episodes of a dataset, in order.
+
+    Args:
+        root: Its folder.
+        named: Features whose role the user names.
+
+    Raises:
+        ConfigError: A named feature is missing.
+        ExportError: It has no state, or its tables cannot be read.
+    """
     dataset = OpenDataset(root)
-    features = {
-        name: feature
-        for name, feature in dataset.info.features.items()
-        if name in (STATE, ACTION) and feature.is_numeric and len(feature.shape) == 1
-    }
-    names = _names(features[STATE]) if STATE in features else []
-    column_of = {name: index for index, name in enumerate(_names(features[ACTION]) if ACTION in features else [])}
-    columns = [column_of[name] for name in names] if set(names) <= set(column_of) else None
-    is_gripper = np.array([_GRIPPER.search(name) is not None for name in names], dtype=np.bool_)
-    stream = RowStream(dataset.info, list(features))
+    roles = dataset_roles(root, dataset.info, named)
+    if not roles.state:
+        raise ExportError(f"No state was found to score episodes by, name it by --state FEATURE: {root}")
+    columns = [place for place in roles.in_state(roles.action) if place is not None] if roles.action else []
+    has_action = len(columns) == len(roles.elements(roles.state))
+    is_gripper = roles.grippers()
+    stream = RowStream(dataset.info, list(dict.fromkeys((*roles.state, *roles.action))))
     flaws: list[str] = []
     motions: list[Motion | None] = []
     for place in dataset.places:
         rows = stream.numbers(place)
         flaws.append(_flaw(rows, place.length))
-        if flaws[-1] or STATE not in rows:
+        if flaws[-1]:
             motions.append(None)
             continue
-        state = rows[STATE].astype(np.float32)
-        motions.append(Motion(state, state if columns is None else rows[ACTION][:, columns].astype(np.float32)))
+        state = _joined(roles.state, rows)
+        motions.append(Motion(state, _joined(roles.action, rows)[:, columns] if has_action else state))
     known = [motion for motion in motions if motion is not None]
     ranges = Motion(_range([motion.state for motion in known]), _range([motion.action for motion in known]))
     fps = float(dataset.info.fps)
     readings = [{} if motion is None else _readings(motion, ranges, is_gripper, fps) for motion in motions]
     return [MeasuredEpisode(*parts) for parts in zip(dataset.places, flaws, readings, strict=True)]
+
+
+def _joined(parts: Sequence[str], rows: Mapping[str, NDArray[Any]]) -> NDArray[np.float32]:
+    """(T, D) of features one behind the other."""
+    return np.hstack([rows[part] for part in parts]).astype(np.float32)
 
 
 def _flaw(rows: Mapping[str, NDArray[Any]], length: int) -> str:
@@ -96,14 +104,6 @@ def _flaw(rows: Mapping[str, NDArray[Any]], length: int) -> str:
         if not is_whole.all():
             return f"lacks numbers of {name}, first in frame {int(np.argmin(is_whole))}"
     return ""
-
-
-def _names(feature: DatasetFeature) -> list[str]:
-    """Return the names of the elements without what says position or speed; their numbers if they have none."""
-    names = feature.names or ()
-    if len(names) != feature.shape[0]:
-        names = tuple(map(str, range(feature.shape[0])))
-    return [_SUFFIX.sub("", name) for name in names]
 
 
 def _range(values: Sequence[NDArray[Any]]) -> Array:

@@ -20,6 +20,7 @@ from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import MAX_JSON_BYTES, read_json_limited
 from demorec.core.replacing import ReplaceableKind
 from demorec.datasets.scoring.measure import Reading, measure_dataset
+from demorec.episode.roles import NO_NAMES, NamedRoles
 
 MIN_SOUND = 0.8
 """Score from which a demonstration is sound."""
@@ -69,9 +70,9 @@ class EpisodeScore:
     reasons: tuple[Reason, ...]
 
 
-def score_dataset(root: Path) -> list[EpisodeScore]:
-    """Score all episodes of a LeRobot dataset, in order. Raises ExportError if it cannot be read."""
-    episodes = measure_dataset(root)
+def score_dataset(root: Path, named: NamedRoles = NO_NAMES) -> list[EpisodeScore]:
+    """Score all episodes of a LeRobot dataset, in order; arguments and errors as `measure_dataset`."""
+    episodes = measure_dataset(root, named)
     reasons: list[list[Reason]] = [
         [Reason("flaw", 0.0, each.flaw, 0, each.place.length - 1)] if each.flaw else [] for each in episodes
     ]

@@ -1,0 +1,128 @@
+"""Lines about the roles of features: what was taken for what, and what is known of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from demorec.core.errors import ExportError, RecordingError
+from demorec.episode.element_names import is_numbered
+
+if TYPE_CHECKING:
+    from demorec.episode.roles import NamedRoles, Role, Roles
+    from demorec.runs.run_file import RunFile
+
+_NO_ROLE = "no role"
+_MAX_NAMES = 4
+
+
+def roles_as_plain(roles: Roles) -> dict[str, Any]:
+    """The roles as JSON has them."""
+    return {
+        "of": dict(roles.of),
+        "state": list(roles.state),
+        "action": list(roles.action),
+        "grippers": _grippers(roles),
+    }
+
+
+def role_facts(roles: Roles) -> Iterator[tuple[str, str]]:
+    """(name, value) of what has no role, of state, action and grippers."""
+    if roles.unknown:
+        yield _NO_ROLE, ", ".join(roles.unknown)
+    for role, parts in (("state", roles.state), ("action", roles.action)):
+        count = len(roles.elements(parts))
+        yield role, f"{', '.join(parts)} ({count} elements)" if parts else _not_found(role)
+    yield "gripper", ", ".join(_grippers(roles)) or "not found: --gripper NAME names it"
+
+
+def _not_found(role: str) -> str:
+    """What is said of a state or an action that no feature is."""
+    return f"not found: --{role} FEATURE names it"
+
+
+def _grippers(roles: Roles) -> list[str]:
+    """Elements of the state that are grippers."""
+    elements = zip(roles.elements(roles.state), roles.grippers().tolist(), strict=True)
+    return [name for name, is_gripper in elements if is_gripper]
+
+
+def roles_of_dataset(path: Path, named: NamedRoles) -> Roles | None:
+    """The roles of its features; None where info.json cannot be understood."""
+    from demorec.datasets.lerobot.layout import DatasetInfo
+    from demorec.datasets.lerobot.modality import dataset_roles
+
+    try:
+        return dataset_roles(path, DatasetInfo.load(path), named)
+    except ExportError:
+        return None
+
+
+def roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
+    """The roles in an external run, whose recordings all have the same features; None without a readable one."""
+    from demorec.episode.roles import roles_of_recording
+    from demorec.mcap import open_recording
+
+    for attempt in run.attempts:
+        try:
+            with open_recording(path / attempt.file) as recording:
+                return roles_of_recording(recording.info, named)
+        except RecordingError:
+            continue
+    return None
+
+
+def feature_rows(path: Path, info: Mapping[str, Any], roles: Roles | None) -> list[tuple[str, ...]]:
+    """A row for each feature of a dataset below a head: those without a role first, counters last.
+
+    Args:
+        path: Its folder.
+        info: What info.json says, as it is.
+        roles: The role of each feature; None where info.json cannot be understood.
+    """
+    types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
+    if roles is None:
+        return [("feature", "dtype", "shape"), *((name, *kind) for name, kind in types.items())]
+    from demorec.datasets.lerobot.inspect import known_units
+    from demorec.episode.roles import ROLES
+
+    units: Mapping[str, tuple[str, ...]] = {}
+    with suppress(ExportError):  # demorec check reports it
+        units = known_units(path)
+    order: list[Role | None] = [None, *(role for role in ROLES if role is not None)]
+    rows = [("role", "feature", "dtype", "shape", "elements", "units")]
+    for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):
+        column, role = roles.columns[name], roles.of[name]
+        unit = ", ".join(dict.fromkeys(units.get(name, ()))) or (
+            "unknown" if column.is_vector and role != "label" else ""
+        )
+        rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements), unit))
+    return rows + [("", name, *kind, "", "") for name, kind in types.items() if name not in roles.of]
+
+
+def recording_features(features: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """What is known of each feature; those without a role come first."""
+    roles = {feature["role"] for feature in features}
+    facts = [(role, _not_found(role)) for role in ("state", "action") if role not in roles]
+    for feature in sorted(features, key=lambda feature: feature["role"] is not None):
+        facts.append((f"feature {feature['name']}", ", ".join(_feature(feature))))
+    return facts
+
+
+def _feature(feature: Mapping[str, Any]) -> Iterator[str]:
+    names = _elements_in_words(feature["elements"])
+    yield feature["role"] or "no role"
+    yield f"{len(feature['elements'])} {feature['dtype']}{f' ({names})' if names else ''}"
+    yield ", ".join(dict.fromkeys(filter(None, feature["units"]))) or "units unknown"
+    yield f"at most {1000 * feature['oldest']:.3g} ms old"
+    if feature["source"]:
+        yield feature["source"]
+
+
+def _elements_in_words(names: Sequence[str]) -> str:
+    """Names of the elements of a vector in a line; the first and the last one of many."""
+    if is_numbered(names):
+        return "unnamed" if len(names) > 1 else ""
+    return ", ".join(names) if len(names) <= _MAX_NAMES else f"{names[0]} .. {names[-1]}"

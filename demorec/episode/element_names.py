@@ -1,0 +1,55 @@
+"""Names of the elements of a vector, in every form in which they are written."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+
+_SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
+"""Ending of an element's name that is not part of its joint's name."""
+_GRIPPER = re.compile("gripper|finger", re.IGNORECASE)
+
+
+def read_names(names: object, count: int) -> tuple[str, ...] | None:
+    """Read the names of `count` elements; None where they are missing or of another number.
+
+    Known forms: a list; lists within lists, as Unitree writes them; lists in an object by a common word, as
+    `{"motors": [...]}` of LeRobot 2 or `{"axes": [...]}`; an object from each name to its place.
+    """
+    if isinstance(names, dict) and (places := list(names.values())) and all(type(place) is int for place in places):
+        names = sorted(names, key=names.__getitem__) if sorted(places) == list(range(count)) else None
+    found = tuple(_flat(names))
+    return found if len(found) == count and all(name and name.isprintable() for name in found) else None
+
+
+def _flat(names: object) -> Iterator[str]:
+    """Yield the names in lists and objects within each other, in order; "" for what is no name."""
+    waiting = [names]
+    while waiting:
+        item = waiting.pop()
+        if isinstance(item, dict):
+            waiting += [part if isinstance(part, dict | list | tuple) else None for part in reversed(item.values())]
+        elif isinstance(item, list | tuple):
+            waiting += reversed(item)
+        else:
+            yield str(item) if isinstance(item, str) or type(item) is int else ""
+
+
+def numbers(count: int) -> tuple[str, ...]:
+    """Names of elements whose names are unknown: "0", "1", ..."""
+    return tuple(map(str, range(count)))
+
+
+def is_numbered(names: Sequence[str]) -> bool:
+    """Whether elements have numbers instead of names."""
+    return tuple(names) == numbers(len(names))
+
+
+def joint_of(name: str) -> str:
+    """The name of an element without what says position, velocity or effort."""
+    return _SUFFIX.sub("", name)
+
+
+def is_gripper(name: str) -> bool:
+    """Whether an element is named after a gripper or a finger."""
+    return _GRIPPER.search(name) is not None

@@ -1,0 +1,178 @@
+"""LeRobot datasets under the names that other people use, by PyArrow and JSON alone: a moving arm, no images."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+
+FPS, LENGTH, EPISODES, LATE = 30, 120, 4, 3
+JOINTS = ("shoulder", "elbow", "wrist", "gripper")
+_COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
+
+
+@dataclass(frozen=True)
+class Convention:
+    """Names under which somebody writes the same motion.
+
+    Attributes:
+        state, action: Feature -> (names in info.json, columns of `arm_motion` that it holds), in order.
+        modality: GR00T's modality.json.
+        others: Feature -> number of elements of noise.
+        version: Of the format.
+    """
+
+    state: Mapping[str, tuple[Any, tuple[int, ...]]]
+    action: Mapping[str, tuple[Any, tuple[int, ...]]]
+    modality: Mapping[str, Any] | None = None
+    others: Mapping[str, int] = field(default_factory=dict)
+    version: str = "v3.0"
+
+
+def _whole(state: str, action: str, names: Any = JOINTS, **more: Any) -> Convention:
+    columns = tuple(range(len(JOINTS)))
+    return Convention({state: (names, columns)}, {action: (names, columns)}, **more)
+
+
+ARM, HAND = (0, 1, 2), (3,)
+CONVENTIONS = {
+    "lerobot": _whole("observation.state", "action", list(JOINTS)),
+    "lerobot 2.0": _whole("observation.state", "action", {"motors": list(JOINTS)}, version="v2.0"),
+    "axes": _whole("observation.state", "action", {"axes": list(JOINTS)}),
+    "places": _whole("observation.state", "action", {name: place for place, name in enumerate(JOINTS)}),
+    "unitree": _whole("observation.state", "action", [list(JOINTS)]),
+    "unnamed": _whole("observation.state", "action", None),
+    "openpi": _whole("state", "actions", ["state"]),
+    "openpi droid": Convention(
+        {"joint_position": (["joint_position"], ARM), "gripper_position": (["gripper_position"], HAND)},
+        {"actions": (["actions"], (*ARM, *HAND))},
+    ),
+    "agibot": Convention(
+        {"observation.states.effector.position": (None, HAND), "observation.states.joint.position": (None, ARM)},
+        {"actions.effector.position": (None, HAND), "actions.joint.position": (None, ARM)},
+        others={
+            "observation.states.end.position": 6,
+            "observation.states.joint.velocity": 3,
+            "observation.states.joint.current_value": 3,
+            "observation.states.robot.orientation": 4,
+            "actions.robot.velocity": 2,
+        },
+    ),
+    "genie": Convention(
+        {"states.left_joint.position": (None, ARM), "states.left_gripper.position": (None, HAND)},
+        {"actions.left_joint.position": (None, ARM), "actions.left_gripper.position": (None, HAND)},
+    ),
+    "robot_state": _whole("robot_state", "action", None),
+    "gr00t": _whole(
+        "observation.state",
+        "action",
+        None,
+        modality={
+            "state": {"arm": {"start": 0, "end": 3}, "gripper": {"start": 3, "end": 4}},
+            "action": {"arm": {"start": 0, "end": 3}, "gripper": {"start": 3, "end": 4}},
+            "annotation": {"human.validity": {}, "human.task": {"original_key": "task_index"}},
+        },
+    ),
+    "gr00t, other features": _whole(
+        "robot.measured",
+        "robot.wanted",
+        None,
+        modality={
+            "state": {"arm": {"start": 0, "end": 4, "original_key": "robot.measured"}},
+            "action": {"arm": {"start": 0, "end": 4, "original_key": "robot.wanted"}},
+        },
+    ),
+}
+"""Whose names -> how a dataset of theirs is called."""
+
+
+def arm_motion(episode: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """(T, 4) state and action of an arm and a gripper that follow their targets three frames late."""
+    rng = np.random.default_rng(episode)
+    frames = np.arange(LENGTH + LATE)[:, None]
+    phases, rates = rng.uniform(0, 6, (2, len(JOINTS)))
+    course = np.sin(frames / FPS * (1.5 + rates / 6) + phases)
+    noise = rng.normal(0, 1e-3, (2, LENGTH, len(JOINTS)))
+    return (course[:LENGTH] + noise[0]).astype(np.float32), (course[LATE:] + noise[1]).astype(np.float32)
+
+
+def write_convention(root: Path, convention: Convention, *, frozen: bool = False) -> Path:
+    """A dataset of four episodes; `frozen`: the elbow of episode 2 stands still from frame 30 on."""
+    episodes = [arm_motion(number) for number in range(EPISODES)]
+    if frozen:
+        episodes[2][0][30:, 1] = episodes[2][0][30, 1]
+    rng = np.random.default_rng(9)
+    vectors: dict[str, tuple[Any, NDArray[np.float32]]] = {}
+    for side, parts in enumerate((convention.state, convention.action)):
+        values = np.concatenate([episode[side] for episode in episodes])
+        vectors |= {name: (names, values[:, list(columns)]) for name, (names, columns) in parts.items()}
+    for name, count in convention.others.items():
+        vectors[name] = (None, rng.normal(size=(EPISODES * LENGTH, count)).astype(np.float32))
+    features: dict[str, Any] = {
+        name: {"dtype": "float32", "shape": [values.shape[1]], "names": names}
+        for name, (names, values) in vectors.items()
+    }
+    features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()}
+    _write(root, features, vectors, convention.version)
+    if convention.modality is not None:
+        (root / "meta/modality.json").write_text(json.dumps(convention.modality))
+    return root
+
+
+def _write(root: Path, features: dict[str, Any], vectors: Mapping[str, Any], version: str) -> None:
+    is_old = version != "v3.0"
+    data = (
+        "chunk-{episode_chunk:03d}/episode_{episode_index:06d}"
+        if is_old
+        else "chunk-{chunk_index:03d}/file-{file_index:03d}"
+    )
+    info = {
+        "codebase_version": version, "fps": FPS, "features": features, "robot_type": "arm", "chunks_size": 1000,
+        "total_episodes": EPISODES, "total_frames": EPISODES * LENGTH, "total_tasks": 1, "video_path": None,
+        "data_path": f"data/{data}.parquet", "splits": {"train": f"0:{EPISODES}"}, "data_files_size_in_mb": 100,
+        "video_files_size_in_mb": 200,
+    }  # fmt: skip
+    for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
+        (root / folder).mkdir(parents=True)
+    (root / "meta/info.json").write_text(json.dumps(info, indent=1))
+    tables = [_rows(vectors, episode) for episode in range(EPISODES)]
+    begins = LENGTH * np.arange(EPISODES)
+    if is_old:
+        for episode, table in enumerate(tables):
+            pq.write_table(table, root / f"data/chunk-000/episode_{episode:06d}.parquet")
+        lines = [json.dumps({"episode_index": n, "tasks": ["wave"], "length": LENGTH}) for n in range(EPISODES)]
+        (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
+        (root / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "wave"}) + "\n")
+        return
+    pq.write_table(pa.concat_tables(tables), root / "data/chunk-000/file-000.parquet")
+    pq.write_table(pa.table({"task": ["wave"], "task_index": [0]}), root / "meta/tasks.parquet")
+    places = {
+        "episode_index": np.arange(EPISODES), "length": [LENGTH] * EPISODES, "tasks": [["wave"]] * EPISODES,
+        "data/chunk_index": [0] * EPISODES, "data/file_index": [0] * EPISODES,
+        "dataset_from_index": begins, "dataset_to_index": begins + LENGTH,
+    }  # fmt: skip
+    pq.write_table(pa.table(places), root / "meta/episodes/chunk-000/file-000.parquet")
+    (root / "meta/stats.json").write_text("{}")
+
+
+def _rows(vectors: Mapping[str, tuple[Any, NDArray[np.float32]]], episode: int) -> pa.Table:
+    rows = slice(episode * LENGTH, (episode + 1) * LENGTH)
+    columns: dict[str, Any] = {
+        name: pa.FixedSizeListArray.from_arrays(pa.array(values[rows].reshape(-1)), values.shape[1])
+        if values.shape[1] > 1
+        else pa.array(values[rows, 0])
+        for name, (_, values) in vectors.items()
+    }
+    columns["timestamp"] = (np.arange(LENGTH) / FPS).astype(np.float32)
+    columns["frame_index"] = np.arange(LENGTH)
+    columns["episode_index"] = np.full(LENGTH, episode)
+    columns["index"] = np.arange(rows.start, rows.stop)
+    columns["task_index"] = np.zeros(LENGTH, np.int64)
+    return pa.table(columns)

@@ -1,0 +1,344 @@
+"""Roles and names: the same motion under anybody's names is read alike, and written back as it was named."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from support.check import edit_json
+from support.commands import exit_code
+from support.conventions import CONVENTIONS, EPISODES, Convention, write_convention
+from support.hdf5 import write_aloha, write_robomimic
+
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.episode.element_names import read_names
+from demorec.episode.roles import Column, NamedRoles, find_roles, matching_elements
+from demorec.view.sources import find_episodes
+
+Capture = pytest.CaptureFixture[str]
+UNKNOWN = Convention({"measured": (None, (0, 1, 2, 3))}, {"wanted": (None, (0, 1, 2, 3))})
+"""Names that nobody uses: state and action must be named by the user."""
+NAMED = ("--state", "measured", "--action", "wanted")
+
+
+def results(capsys: Capture, *words: object) -> dict[str, Any]:
+    """Check -> its result, and "notes", of `demorec check`."""
+    capsys.readouterr()
+    exit_code("check", *words, "--no-images", "--json")
+    (report,) = json.loads(capsys.readouterr().out)
+    return {result["check"]: result for result in report["results"]} | {"notes": report["notes"]}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_motion_is_checked_whatever_the_features_are_called(name: str, tmp_path: Path, capsys: Capture) -> None:
+    good = results(capsys, write_convention(tmp_path / "good", CONVENTIONS[name]))
+    assert good["notes"] == []
+    assert (good["action_lag"]["level"], good["action_lag"]["detail"][:27]) == ("pass", "the state follows by +3.00 ")
+    assert good["frozen_sensors"]["level"] == "pass"
+    bad = results(capsys, write_convention(tmp_path / "bad", CONVENTIONS[name], frozen=True))
+    assert bad["frozen_sensors"]["level"] == "fail"
+    assert "episode 2" in bad["frozen_sensors"]["detail"]
+    is_named = CONVENTIONS[name].state.get("observation.state", (None,))[0] is not None
+    assert not is_named or bad["frozen_sensors"]["detail"].startswith("elbow")
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_the_spoilt_episode_has_the_lowest_score(name: str, tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", CONVENTIONS[name], frozen=True)
+    assert exit_code("dataset", "score", root, "--json") == 0
+    scores = [episode["score"] for episode in json.loads(capsys.readouterr().out)["episodes"]]
+    assert int(np.argmin(scores)) == 2
+    assert scores[2] < 0.96
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+def test_an_import_keeps_what_is_found(name: str, tmp_path: Path, capsys: Capture) -> None:
+    root, run = write_convention(tmp_path / "d", CONVENTIONS[name]), tmp_path / "run"
+    assert exit_code("info", root, "--json") == 0
+    there = json.loads(capsys.readouterr().out)["roles"]
+    assert exit_code("import", "lerobot", root, "--out", run) == 0
+    capsys.readouterr()
+    assert exit_code("info", run, "--json") == 0
+    roles = json.loads(capsys.readouterr().out)["roles"]
+    assert {*roles["state"]} == {*CONVENTIONS[name].state}
+    assert {*roles["action"]} == {*CONVENTIONS[name].action}
+    assert roles["grippers"] == there["grippers"]
+
+
+def test_without_state_and_action_the_verdict_says_what_was_not_looked_at(tmp_path: Path, capsys: Capture) -> None:
+    source, root = write_convention(tmp_path / "all", UNKNOWN, frozen=True), tmp_path / "d"
+    assert exit_code("dataset", "drop", source, "--episodes", "0", "--out", root) == 0  # it writes statistics
+    capsys.readouterr()
+    assert exit_code("check", root, "--no-images") == 0
+    verdict, first, second, *_ = capsys.readouterr().out.splitlines()
+    assert verdict.startswith("pass")
+    assert first.strip() == (
+        "No state and no action found, so nothing was judged by it; name it: --state FEATURE, --action FEATURE."
+    )
+    assert second.strip() == "Without a role, so not looked at: measured, wanted."
+    assert results(capsys, root)["action_lag"]["level"] == "skip"
+    named = results(capsys, root, *NAMED)
+    assert (named["notes"], named["action_lag"]["level"], named["frozen_sensors"]["level"]) == ([], "pass", "fail")
+
+
+def test_info_shows_what_has_no_role_first_and_what_the_user_names(tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", CONVENTIONS["agibot"])
+    edit_json(root / "meta/info.json", lambda info: info["features"].update(odd={"dtype": "int64", "shape": [1]}))
+    assert exit_code("info", root) == 0
+    text = capsys.readouterr().out
+    facts, table = text.split("\n\n")
+    assert "observation.states.joint.position, observation.states.effector.position (4 elements)" in facts
+    assert "gripper   effector" in facts
+    rows = [line.split()[:2] for line in table.splitlines()[1:]]
+    assert rows[0] == ["no", "role"]
+    assert ["pose", "observation.states.end.position"] in rows
+    assert ["velocity", "observation.states.joint.velocity"] in rows
+    assert exit_code("info", root, "--json", "--state", "observation.states.end.position") == 0
+    roles = json.loads(capsys.readouterr().out)["roles"]
+    assert roles["state"] == ["observation.states.end.position"]
+    assert roles["of"]["odd"] is None
+
+
+@pytest.mark.parametrize(
+    "call",
+    [
+        "info {d}",
+        "check {d} --no-images",
+        "view {d} --save {new}.rrd",
+        "report {d} --out {new}.html",
+        "import lerobot {d} --out {new}",
+        "dataset score {d}",
+        "replay {d} --robot panda",
+    ],
+)
+@pytest.mark.parametrize("flag", ["--state", "--action", "--gripper"])
+def test_a_feature_that_does_not_exist_is_refused(call: str, flag: str, tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", UNKNOWN)
+    words = call.format(d=root, new=tmp_path / "new").split()
+    given = ("--state", "measured") if flag == "--gripper" else ()
+    assert exit_code(*words, *given, flag, "mesured") == 2
+    error = capsys.readouterr().err
+    assert f"{flag}: there is no feature" in error
+    assert "Did you mean 'measured'?" in error
+    assert not list(tmp_path.glob("new*"))
+
+
+def test_other_ways_to_name_a_role_wrongly(tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", UNKNOWN)
+    assert exit_code("info", root, "--state", "measured", "--action", "measured") == 2
+    assert "--action names 'measured', which --state names already" in capsys.readouterr().err
+    assert exit_code("replay", root, *NAMED) == 2
+    assert "add --robot" in capsys.readouterr().err
+    assert exit_code("import", "bag.mcap", "--out", tmp_path / "run", *NAMED) == 2
+    assert "belong to datasets" in capsys.readouterr().err
+    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run", *NAMED, "--gripper", "3") == 2
+    assert "An import takes whole features" in capsys.readouterr().err
+
+
+def test_an_import_records_what_the_user_names(tmp_path: Path, capsys: Capture) -> None:
+    root, run = write_convention(tmp_path / "d", UNKNOWN, frozen=True), tmp_path / "run"
+    assert exit_code("import", "lerobot", root, "--out", run, *NAMED) == 0
+    recording = run / "episodes/episode_000002.mcap"
+    named = results(capsys, recording)
+    assert (named["notes"], named["frozen_sensors"]["level"]) == ([], "fail")
+    assert exit_code("info", recording) == 0
+    assert "feature measured  state, 4 float32 (unnamed), units unknown" in capsys.readouterr().out
+    assert exit_code("info", run) == 0
+    assert "action    wanted (4 elements)" in capsys.readouterr().out
+    assert exit_code("import", "lerobot", root, "--out", run) == 2  # another import, since the roles differ
+    assert "Another recording is there already" in capsys.readouterr().err
+
+
+def test_what_the_user_names_counts_more_than_what_an_import_recorded(tmp_path: Path, capsys: Capture) -> None:
+    root, run = write_convention(tmp_path / "d", UNKNOWN), tmp_path / "run"
+    assert exit_code("import", "lerobot", root, "--out", run, *NAMED) == 0
+    capsys.readouterr()
+    assert exit_code("info", run, "--json", "--state", "wanted", "--action", "measured") == 0
+    roles = json.loads(capsys.readouterr().out)["roles"]
+    assert (roles["state"], roles["action"]) == (["wanted"], ["measured"])
+
+
+def test_the_gripper_may_be_an_element_of_the_state(tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", CONVENTIONS["openpi"])
+    assert exit_code("info", root, "--json", "--gripper", "3") == 0
+    assert json.loads(capsys.readouterr().out)["roles"]["grippers"] == ["3"]
+    assert exit_code("info", root, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["roles"]["grippers"] == []
+
+
+def test_playback_shows_the_state_first(tmp_path: Path) -> None:
+    convention = Convention(CONVENTIONS["openpi"].state, CONVENTIONS["openpi"].action, others={"a_sensor": 2, "zoo": 1})
+    root = write_convention(tmp_path / "d", convention)
+    with find_episodes([root])[0].open() as episode:
+        assert [*episode.curves] == ["state", "actions", "a_sensor", "zoo"]
+        assert episode.roles == {"state": "state", "actions": "action"}
+    with find_episodes([root], named=NamedRoles(state=("zoo",), action=("state",)))[0].open() as episode:
+        assert [*episode.curves][:2] == ["zoo", "state"]
+
+
+def test_a_report_draws_state_and_action(tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", CONVENTIONS["agibot"])
+    assert exit_code("report", root, "--out", tmp_path / "a.html") == 0
+    assert "joint.0" in (tmp_path / "a.html").read_text()
+    root = write_convention(tmp_path / "u", UNKNOWN)
+    assert exit_code("report", root, "--out", tmp_path / "b.html") == 0
+    assert "No state and no action found" in (tmp_path / "b.html").read_text()
+    assert exit_code("report", root, "--out", tmp_path / "c.html", *NAMED) == 0
+    text = (tmp_path / "c.html").read_text()
+    assert "No state and no action found" not in text
+    assert "component 3" in text
+
+
+def test_nothing_to_score_by_is_no_perfect_score(tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", UNKNOWN)
+    assert exit_code("dataset", "score", root) == 1
+    assert "No state was found to score episodes by" in capsys.readouterr().err
+    assert exit_code("dataset", "score", root, *NAMED) == 0
+
+
+def test_idle_frames_are_found_in_anybodys_state(tmp_path: Path, capsys: Capture) -> None:
+    root = write_convention(tmp_path / "d", CONVENTIONS["openpi droid"])
+    assert exit_code("dataset", "trim", root, "--idle", "--dry-run") == 0
+    assert exit_code("dataset", "trim", write_convention(tmp_path / "u", UNKNOWN), "--idle", "--dry-run") == 2
+    assert "name a feature by --idle-feature" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("write", [write_robomimic, write_aloha])
+def test_hdf5_of_other_people_has_a_state_and_an_action(write: Any, tmp_path: Path, capsys: Capture) -> None:
+    path = write(tmp_path / "demo.hdf5")
+    exit_code("import", "hdf5", path, "--suggest")
+    mapping = tmp_path / "mapping.toml"
+    mapping.write_text(capsys.readouterr().out)
+    assert exit_code("info", path, "--mapping", mapping, "--json") == 0
+    roles = json.loads(capsys.readouterr().out)["roles"]
+    assert (roles["state"], roles["action"]) == (["observation.state"], ["action"])
+    assert None not in roles["of"].values()
+
+
+EDITS = {"drop": "--episodes 0", "trim": "--head 2", "set-task": "--task wave"}
+
+
+@pytest.mark.parametrize("name", CONVENTIONS)
+@pytest.mark.parametrize("edit", EDITS)
+def test_edits_write_names_back_in_the_form_they_had(name: str, edit: str, tmp_path: Path) -> None:
+    root = write_convention(tmp_path / "d", CONVENTIONS[name])
+    edit_json(root / "meta/info.json", lambda info: next(iter(info["features"].values())).update(fps=30))
+    assert exit_code("dataset", edit, root, *EDITS[edit].split(), "--out", tmp_path / "new") == 0
+    before, after = (json.loads((path / "meta/info.json").read_text())["features"] for path in (root, tmp_path / "new"))
+    assert json.dumps(before, sort_keys=True) == json.dumps(after, sort_keys=True)
+
+
+def test_merged_datasets_keep_the_first_ones_names(tmp_path: Path) -> None:
+    a = write_convention(tmp_path / "a", CONVENTIONS["unitree"])
+    b = write_convention(tmp_path / "b", CONVENTIONS["axes"])  # the same elements in another form
+    assert exit_code("dataset", "merge", a, b, "--out", tmp_path / "new") == 0
+    info = json.loads((tmp_path / "new/meta/info.json").read_text())
+    assert info["features"]["action"]["names"] == [["shoulder", "elbow", "wrist", "gripper"]]
+    assert info["total_episodes"] == 2 * EPISODES
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers(-3, 9) | st.floats(allow_nan=False) | st.text(max_size=4),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
+    max_leaves=12,
+)
+
+
+@given(json_values, st.integers(1, 6))
+def test_any_names_are_read_and_written_back_as_they_were(names: Any, count: int) -> None:
+    found = read_names(names, count)
+    assert found is None or (len(found) == count and all(isinstance(name, str) for name in found))
+    feature = DatasetFeature.from_json({"dtype": "float32", "shape": [count], "names": names})
+    assert json.dumps(feature.to_json()["names"]) == json.dumps(names)
+    assert len(feature.elements) == count
+
+
+words = st.sampled_from(
+    ["observation", "state", "states", "action", "actions", "joint", "position", "effector", "x", ""]
+)
+names_of_features = st.lists(words, max_size=4).map(".".join) | st.text(max_size=6)
+columns_of_any_kind = st.builds(
+    lambda dtype, count: Column(dtype, tuple(map(str, range(count)))),
+    st.sampled_from(["float32", "float64", "int64", "bool", "string", "video"]),
+    st.integers(0, 3),
+)
+
+
+@given(st.dictionaries(names_of_features, columns_of_any_kind, max_size=6))
+def test_any_features_get_roles(columns: dict[str, Column]) -> None:
+    roles = find_roles(columns, NamedRoles())
+    parts = [*roles.state, *roles.action]
+    assert len(set(parts)) == len(parts)
+    assert all(columns[part].is_vector for part in parts)
+    assert (
+        len(roles.elements(roles.state)) == len(roles.grippers()) == sum(len(columns[p].elements) for p in roles.state)
+    )
+    assert len(roles.in_state(roles.action)) == len(roles.grippers())
+
+
+@given(st.lists(st.text("abc_", min_size=1, max_size=5), min_size=1, max_size=6, unique=True))
+def test_every_known_form_gives_the_same_names(names: list[str]) -> None:
+    forms: list[Any] = [names, [names], {"motors": names}, {"axes": names}, {"a": names[:1], "b": [names[1:]]}]
+    forms += [{name: place for place, name in enumerate(names)}, tuple(names)]
+    assert {read_names(form, len(names)) for form in forms} == {tuple(names)}
+    assert {read_names(form, len(names) + 1) for form in forms} == {None}
+
+
+@pytest.mark.parametrize(
+    ("state", "action", "expected"),
+    [
+        (("a.pos", "b.pos"), ("b", "a"), [1, 0]),
+        (("0", "1"), ("x", "y"), [0, 1]),
+        (("x", "y"), ("0", "1", "2"), [None, None]),
+        (("a", "a"), ("a", "a"), [0, 1]),
+        (("a", "b"), ("c", "b.vel"), [None, 1]),
+    ],
+)
+def test_elements_match_by_name_else_by_place(
+    state: tuple[str, ...], action: tuple[str, ...], expected: list[int | None]
+) -> None:
+    assert matching_elements(state, action) == expected
+
+
+def vector(count: int) -> Column:
+    """A vector of floats without names."""
+    return Column("float32", tuple(map(str, range(count))))
+
+
+def test_a_whole_state_wins_over_its_parts() -> None:
+    columns = {
+        "observation.state.joint_position": vector(7), "observation.state.gripper_position": vector(1),
+        "observation.state": vector(8), "action.original": vector(7), "action": vector(7),
+        "observation.state.cartesian_position": vector(6), "is_first": Column("bool"), "reward": vector(1),
+        "language_instruction": Column("string"), "exterior_image_1_left": Column("image"), "scores": vector(2),
+    }  # fmt: skip
+    roles = find_roles(columns, NamedRoles())
+    assert (roles.state, roles.action) == (("observation.state",), ("action",))
+    assert dict(roles.of) == {
+        "observation.state.joint_position": "sensor", "observation.state.gripper_position": "gripper",
+        "observation.state": "state", "action.original": "command", "action": "action",
+        "observation.state.cartesian_position": "pose", "is_first": "label", "reward": "label",
+        "language_instruction": "label", "exterior_image_1_left": "camera", "scores": None,
+    }  # fmt: skip
+
+
+def test_the_simulators_truth_is_no_state() -> None:
+    roles = find_roles({"observation.environment_state": vector(9), "action": vector(4)}, NamedRoles())
+    assert roles.state == ()
+    assert [*roles.notes()] == ["No state found, so nothing was judged by it; name it: --state FEATURE."]
+
+
+def test_the_users_gripper_joins_the_state() -> None:
+    columns = {"observation.state": vector(3), "jaw": vector(1), "action": vector(4)}
+    roles = find_roles(columns, NamedRoles(gripper=("jaw",)))
+    assert roles.state == ("observation.state", "jaw")
+    assert roles.grippers().tolist() == [False, False, False, True]
+    assert roles.in_state(roles.action) == [0, 1, 2, 3]
+    with pytest.raises(ConfigError, match="is int64 and no vector"):
+        find_roles({**columns, "counts": Column("int64", ("0",))}, NamedRoles(state=("counts",)))
