@@ -1,9 +1,9 @@
-"""A LeRobot dataset, opened for its checks."""
+"""A LeRobot dataset as its checks see it."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -17,12 +17,11 @@ from demorec.check.evidence import Motions, motion_vector, motions_of_dataset
 from demorec.check.films import CameraFilms, films_of_dataset
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import open_table, read_table, tables_in
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
-from demorec.datasets.lerobot.modality import dataset_roles
-from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places, read_tasks
-from demorec.datasets.lerobot.robots import DatasetRobot, read_robot, robot_of_motors
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.layout import DatasetInfo
+from demorec.datasets.lerobot.robots import DatasetRobot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.features import ACTION, ActionKind, action_names
 from demorec.episode.info import EpisodeInfo
@@ -31,9 +30,6 @@ from demorec.episode.validity import read_episode_info
 from demorec.robots.motors import Motors
 
 Rows = Mapping[str, NDArray[Any]]
-
-_NEEDED = ("episode_index", "success", "content_digest", "episode_info")
-"""Columns that every sidecar has."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,8 +51,8 @@ class DescribedEpisode:
     info: EpisodeInfo
 
 
-class Dataset:
-    """A LeRobot dataset, read without LeRobot; properties raise ExportError where the files do not give them.
+class CheckedDataset:
+    """A LeRobot dataset, opened for its checks; properties raise ExportError where the files do not give them.
 
     Args:
         path: Its folder.
@@ -74,46 +70,49 @@ class Dataset:
         self.urdf = urdf
         self.motors = motors
         self.named = named
-        self._rows: list[Rows] | ExportError | None = None
 
     @cached_property
-    def info(self) -> DatasetInfo:
-        """meta/info.json."""
-        return DatasetInfo.load(self.path)
-
-    @cached_property
-    def roles(self) -> Roles:
-        """The role of each feature."""
-        return dataset_roles(self.path, self.info, self.named)
-
-    @cached_property
-    def places(self) -> list[EpisodePlace]:
-        """The episodes' table."""
-        return list(episode_places(self.path, self.info))
-
-    @cached_property
-    def tasks(self) -> list[str]:
-        """Instructions."""
-        return read_tasks(self.path)
+    def folder(self) -> LeRobotFolder:
+        """The open dataset."""
+        return LeRobotFolder(self.path, named=self.named)
 
     @property
-    def rows(self) -> list[Rows]:
-        """Feature -> (T, D) of every episode: all counters are there, no episode is empty. Read once, failures too."""
-        if self._rows is None:
-            try:
-                self._rows = self._read_rows()
-            except ExportError as error:
-                self._rows = error
-        if isinstance(self._rows, ExportError):
-            raise self._rows
-        return self._rows
+    def roles(self) -> Roles:
+        """The role of each feature."""
+        return self.folder.roles
 
-    def _read_rows(self) -> list[Rows]:
-        missing = [name for name in AUTOMATIC_FEATURES if name not in self.info.features]
-        if missing:
-            raise ExportError(f"info.json has no feature {', '.join(missing)}: {self.path}")
-        reader = RowStream(self.info)
-        return [self._usable(place, reader.numbers(place)) for place in self.places]
+    @property
+    def info(self) -> DatasetInfo:
+        """meta/info.json."""
+        return self.folder.info
+
+    @property
+    def places(self) -> tuple[EpisodePlace, ...]:
+        """The episodes' table, whatever info.json counts."""
+        return self.folder.listed
+
+    @property
+    def rows(self) -> Mapping[int, Rows]:
+        """Number of an episode -> feature -> (T, D), of the episodes whose rows can be read."""
+        return self._rows_and_errors[0]
+
+    @property
+    def unreadable(self) -> Mapping[int, str]:
+        """Number of an episode -> why its rows cannot be read."""
+        return self._rows_and_errors[1]
+
+    @cached_property
+    def _rows_and_errors(self) -> tuple[dict[int, Rows], dict[int, str]]:
+        reader = self.folder.rows(self.folder.columns)
+        rows: dict[int, Rows] = {}
+        errors: dict[int, str] = {}
+        for number, place in enumerate(self.places):
+            problems: list[str] = []
+            with noted(problems, self.path):
+                rows[number] = self._usable(place, reader.numbers(place))
+            if problems:
+                errors[number] = problems[0]
+        return rows, errors
 
     def _usable(self, place: EpisodePlace, rows: Rows) -> Rows:
         if place.length == 0:
@@ -125,27 +124,35 @@ class Dataset:
 
     @cached_property
     def motions(self) -> Motions:
-        """Those of its episodes."""
-        return Motions(list(motions_of_dataset(self.info, self.roles, self.rows, self._arms, self.urdf)))
+        """The motions of its episodes."""
+        arms = self._arms
+        found = motions_of_dataset(
+            self.info,
+            self.roles,
+            list(self.rows.values()),
+            {position: arms[number] for position, number in enumerate(self.rows) if number in arms},
+            self.urdf,
+        )
+        numbered = zip(self.rows, found, strict=False)
+        return Motions([replace(motion, where=f"episode {number}") for number, motion in numbered])
 
     @property
     def _arms(self) -> dict[int, DatasetRobot]:
         """Episode -> its arm, where the sidecar has it or the user has named its servos."""
         if self.motors is not None and self.roles.elements(self.roles.state) == self.motors.names:
             return dict.fromkeys(range(len(self.places)), robot_of_motors(self.motors))
-        named = {row["episode_index"]: row["robot_digest"] for row in self.sidecar if row.get("robot_digest")}
-        robots = {name: read_robot(self.path, name) for name in sorted(set(named.values()))}
-        return {number: robots[name] for number, name in named.items()}
+        named = {row["episode_index"]: row["robot_digest"] for row in self.sidecar if row["robot_digest"]}
+        return {number: self.folder.robot(digest) for number, digest in named.items()}
 
     def numbers(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """(name, (T, D) table) of all floating-point numbers."""
-        for number, rows in enumerate(self.rows):
+        for number, rows in self.rows.items():
             yield from ((f"{name}, episode {number}", table) for name, table in rows.items() if table.dtype.kind == "f")
 
     @cached_property
     def films(self) -> dict[str, CameraFilms]:
         """Camera feature -> its images."""
-        return {key: films_of_dataset(self.info, self.places, key) for key in self.info.video_keys}
+        return {key: films_of_dataset(self.folder, key) for key in self.info.video_keys}
 
     def undecoded(self) -> Iterator[tuple[str, str]]:
         """(camera, problem) of every camera whose images do not all decode."""
@@ -154,19 +161,14 @@ class Dataset:
     @cached_property
     def sidecar(self) -> list[dict[str, Any]]:
         """The rows that demorec keeps of each episode; empty for a dataset of another writer."""
-        found = []
-        for path in tables_in(self.path, f"{SIDECAR_DIR}/episodes"):
-            there = set(open_table(path).schema_arrow.names)
-            others = [name for name in EPISODE_SCHEMA.names if name in there and name not in _NEEDED]
-            rows = read_table(path, _NEEDED, schema=EPISODE_SCHEMA).to_pylist()
-            found += [row | more for row, more in zip(rows, read_table(path, others).to_pylist(), strict=True)]
-        return found
+        return self.folder.sidecar([name for name in EPISODE_SCHEMA.names if name != "episode_index"])
 
     def courses(self) -> tuple[list[str], list[Array]]:
         """Names of the episodes and their motions."""
         state = self.roles.state
-        motions = [motion_vector(np.hstack([rows[part] for part in state])) for rows in self.rows] if state else []
-        return [f"episode {number}" for number in range(len(motions))], motions
+        rows = self.rows if state else {}
+        motions = [motion_vector(np.hstack([each[part] for part in state])) for each in rows.values()]
+        return [f"episode {number}" for number in rows], motions
 
     def check_simulated(self) -> None:
         """Raise ConfigError for a dataset of external episodes, which no simulator can make or replay."""
@@ -186,7 +188,7 @@ class Dataset:
                 info=self._info_of(row),
             )
             for row in self.sidecar
-            if row["episode_info"] is not None and (number := row["episode_index"]) in range(len(self.rows))
+            if row["episode_info"] is not None and (number := row["episode_index"]) in self.rows
         ]
 
     def _info_of(self, row: Mapping[str, Any]) -> EpisodeInfo:
@@ -204,5 +206,5 @@ class Dataset:
         return next((kind for kind in kinds if action_names(info.simulated.robot, kind) == names), None)
 
 
-Episodes = CheckedEpisode | Dataset
+Episodes = CheckedEpisode | CheckedDataset
 """One episode or several, with motions and images, whoever recorded them."""

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import reprlib
 from collections.abc import Iterator
-from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -13,17 +12,16 @@ import numpy as np
 import pyarrow as pa
 
 from demorec.check.base import Measurement, NotMeasured, counted, dataset_check
-from demorec.check.dataset import Dataset
-from demorec.core.errors import ExportError
+from demorec.check.dataset import CheckedDataset
 from demorec.datasets.episode import SUCCESS
 from demorec.datasets.lerobot.files import open_table, read_table, tables_in
-from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.inspect import episode_digests, noted
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     TASKS_PATH,
     DatasetFeature,
 )
-from demorec.datasets.lerobot.videos import PacketReader, opened_video
+from demorec.datasets.lerobot.videos import opened_video
 
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
@@ -32,25 +30,33 @@ _RATE_TOLERANCE = 0.01
 """Files that were put together have rates that are a little off."""
 
 
-@dataset_check(measures="tables that cannot be read")
-def dataset_readable(dataset: Dataset) -> Measurement:
+@dataset_check(measures="reasons why rows cannot be read or are not those of their episode")
+def dataset_readable(dataset: CheckedDataset) -> Measurement:
     """Read info.json, the tables and every row."""
-    frames = sum(len(rows["index"]) for rows in dataset.rows)
-    return Measurement(value=0, detail=f"{len(dataset.rows)} episodes, {frames} frames, {len(dataset.tasks)} tasks")
+    tasks = dataset.folder.tasks
+    frames = sum(dataset.places[number].length for number in dataset.rows)
+    good = f"{len(dataset.rows)} episodes, {frames} frames, {len(tasks)} tasks"
+    return counted(list(dict.fromkeys(dataset.unreadable.values())), good)
 
 
 @dataset_check(measures="wrong counters, indices and timestamps")
-def dataset_counts(dataset: Dataset) -> Measurement:
+def dataset_counts(dataset: CheckedDataset) -> Measurement:
     """Compare totals with the tables; indices count up without a gap, timestamps are frame_index / fps."""
-    info, wrong = dataset.info, []
+    info, tasks, wrong = dataset.info, dataset.folder.tasks, []
     totals = {
         "total_episodes": (info.total_episodes, len(dataset.places)),
         "total_frames": (info.total_frames, sum(place.length for place in dataset.places)),
-        "total_tasks": (info.total_tasks, len(dataset.tasks)),
+        "total_tasks": (info.total_tasks, len(tasks)),
     }
     wrong += [f"{name} is {said}, found {found}" for name, (said, found) in totals.items() if said != found]
     start = 0
-    for number, (place, rows) in enumerate(zip(dataset.places, dataset.rows, strict=True)):
+    for number, place in enumerate(dataset.places):
+        rows = dataset.rows.get(number)
+        if place.episode_index != number or place.from_index != start:
+            wrong.append(f"the place of episode {number}")
+        if rows is None:
+            start += place.length
+            continue
         count = np.arange(place.length)
         expected = {
             "index": start + count,
@@ -59,12 +65,10 @@ def dataset_counts(dataset: Dataset) -> Measurement:
             "timestamp": (count / info.fps).astype(np.float32),
         }
         for name, values in expected.items():
-            if not np.array_equal(rows[name].reshape(-1), values):
+            if name not in rows or not np.array_equal(rows[name].reshape(-1), values):
                 wrong.append(f"{name} of episode {number}")
-        if place.episode_index != number or place.from_index != start:
-            wrong.append(f"the place of episode {number}")
         used = {int(index) for index in rows["task_index"].reshape(-1)}
-        names = {dataset.tasks[index] if 0 <= index < len(dataset.tasks) else "" for index in used}
+        names = {tasks[index] if 0 <= index < len(tasks) else "" for index in used}
         if names != set(place.tasks):
             wrong.append(f"the task of episode {number}")
         start += place.length
@@ -76,7 +80,7 @@ def dataset_counts(dataset: Dataset) -> Measurement:
     return counted(wrong, f"{start} frames at {info.fps} fps")
 
 
-def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
+def _wrong_ranges(dataset: CheckedDataset) -> Iterator[str]:
     """Where the episodes' table says that things are: rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in dataset.info.video_keys]
     for path in tables_in(dataset.path, "meta/episodes"):
@@ -90,22 +94,19 @@ def _wrong_ranges(dataset: Dataset) -> Iterator[str]:
                     yield f"{end} of episode {row['episode_index']}"
 
 
-def _stray_rows(dataset: Dataset) -> Iterator[str]:
+def _stray_rows(dataset: CheckedDataset) -> Iterator[str]:
     """Rows of the data files that belong to no episode."""
-    used: dict[Path, int] = {}
-    for place in dataset.places:
-        used[place.data] = used.get(place.data, 0) + place.length
     for file in tables_in(dataset.path, "data"):
-        found = open_table(file).metadata.num_rows
-        if (count := used.get(file, 0)) != found:
-            yield f"{file.name} has {found} rows, {count} of them of episodes"
+        found, listed = open_table(file).metadata.num_rows, dataset.folder.num_rows.get(file, 0)
+        if listed != found:
+            yield f"{file.name} has {found} rows, {listed} of them of episodes"
 
 
 @dataset_check(
     measures="video files without an episode",
     fail=math.inf,
 )
-def dataset_strays(dataset: Dataset) -> Measurement | None:
+def dataset_strays(dataset: CheckedDataset) -> Measurement | None:
     """Find mp4 files without an episode, as merges, deleted episodes and renamed cameras leave them."""
     if dataset.info.is_old:
         return None
@@ -115,32 +116,28 @@ def dataset_strays(dataset: Dataset) -> Measurement | None:
 
 
 @dataset_check(measures="episodes without a coded image for every frame")
-def dataset_videos(dataset: Dataset) -> Measurement | None:
+def dataset_videos(dataset: CheckedDataset) -> Measurement | None:
     """Find the encoded images of every episode in every camera's file, one after the other.
 
     In front of an episode there may be images from the keyframe on that its first one needs.
     """
     if not dataset.info.video_keys:
         return None
-    wrong = []
+    wrong: list[str] = []
     for key in dataset.info.video_keys:
         ends: dict[Path, int] = {}
-        try:
-            with closing(PacketReader(key)) as reader:
-                for place in dataset.places:
-                    path, first = place.videos[key]
-                    end, ends[path] = ends.get(path, 0), first + place.length
-                    for number, _ in enumerate(reader.read(place)):
-                        # Between two episodes there is nothing but what the second one is decoded from.
-                        if number == 0 and first != end and reader.keyframe != end:
-                            wrong.append(f"{key}, episode {place.episode_index}: starts at image {first}")
-        except ExportError as error:
-            wrong.append(str(error))
+        for place in dataset.places:
+            path, first = place.videos[key]
+            end, ends[path] = ends.get(path, 0), first + place.length
+            with noted(wrong, dataset.path):
+                # Between two episodes there is nothing but what the second one is decoded from.
+                if first not in (end, end + dataset.folder.video(key, place).lead):
+                    wrong.append(f"{key}, episode {place.episode_index}: starts at image {first}")
     return Measurement(value=len(wrong), detail="; ".join(wrong[:2]) or f"{len(dataset.info.video_keys)} cameras")
 
 
 @dataset_check(measures="episodes on which dataset and sidecar disagree", needs="the sidecar that demorec keeps")
-def dataset_sidecar(dataset: Dataset) -> Measurement | NotMeasured:
+def dataset_sidecar(dataset: CheckedDataset) -> Measurement | NotMeasured:
     """Compare instruction, outcome and content digest of each episode with the sidecar."""
     if not dataset.sidecar:
         return NotMeasured(why="it needs the sidecar that demorec keeps")
@@ -151,10 +148,11 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | NotMeasured:
     missing = sorted(set(range(count)) - set(known))
     wrong = [f"episode {number} is unknown, as one that LeRobot recorded with resume" for number in missing]
     infos = {each.number: each.info for each in dataset.described()}
-    digests = episode_digests(dataset.path, dataset.info)
+    digests = dict(zip(dataset.rows, episode_digests(dataset.folder, list(dataset.rows)), strict=True))
     for row in dataset.sidecar:
         number = row["episode_index"]
-        rows = dataset.rows[number]
+        if (rows := dataset.rows.get(number)) is None:
+            continue
         if number in infos and dataset.places[number].tasks != (infos[number].instruction,):
             wrong.append(f"episode {number} has another instruction")
         elif SUCCESS in rows and bool(rows[SUCCESS][-1, 0]) != row["success"]:
@@ -165,14 +163,14 @@ def dataset_sidecar(dataset: Dataset) -> Measurement | NotMeasured:
 
 
 @dataset_check(measures="statements of info.json that its tables and videos contradict")
-def dataset_schema(dataset: Dataset) -> Measurement:
+def dataset_schema(dataset: CheckedDataset) -> Measurement:
     """Compare columns, types and shapes; codec, size and rate of each video file."""
     wrong = [*_columns(dataset), *_videos(dataset)]
     found = f"{len(dataset.info.features)} features"
     return counted(wrong, found)
 
 
-def _columns(dataset: Dataset) -> Iterator[str]:
+def _columns(dataset: CheckedDataset) -> Iterator[str]:
     """Of the data files, against the features; and of the counters, against what they always are."""
     features = {name: feature for name, feature in dataset.info.features.items() if not feature.is_video}
     for name, fixed in AUTOMATIC_FEATURES.items():
@@ -202,7 +200,7 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> bool:
     return bool(found == _TYPES[feature.dtype] or (feature.dtype == "string" and pa.types.is_large_string(found)))
 
 
-def _videos(dataset: Dataset) -> Iterator[str]:
+def _videos(dataset: CheckedDataset) -> Iterator[str]:
     for key in dataset.info.video_keys:
         feature = dataset.info.features[key]
         height, width = feature.shape[:2]
@@ -211,7 +209,10 @@ def _videos(dataset: Dataset) -> Iterator[str]:
         said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
         said |= {"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {}
         for path in dict.fromkeys(place.videos[key][0] for place in dataset.places):
-            with opened_video(path) as (container, stream):
+            found: dict[str, Any] = {}
+            rate = float(dataset.info.fps)
+            # A video that cannot be read is a finding of `dataset_videos`.
+            with noted([], dataset.path), opened_video(path) as (container, stream):
                 context, rate = stream.codec_context, float(stream.average_rate or 0)
                 codec = {"libdav1d": "av1"}.get(context.name, context.name)
                 found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}

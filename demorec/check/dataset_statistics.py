@@ -8,12 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, dataset_check
-from demorec.check.dataset import Dataset
-from demorec.core.errors import ExportError, describe_error
+from demorec.check.base import Found, Measurement, NotMeasured, dataset_check
+from demorec.check.dataset import CheckedDataset
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
-from demorec.datasets.lerobot.layout import STATS_PATH
+from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 
 _NUMBERING = ("index", "episode_index", "task_index")
@@ -32,7 +30,7 @@ Ranges = Mapping[str, Array]
     warn=0.01,
     fail=0.05,
 )
-def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
+def dataset_statistics(dataset: CheckedDataset) -> Iterator[Found]:
     """Recompute minimum, maximum, mean, deviation, count and quantiles of every feature, and of each episode.
 
     A quantile may also be the mean of the episodes' quantiles, as LeRobot computes it. LeRobot's merge averages those
@@ -40,27 +38,28 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
     """
     if dataset.info.is_old:
         return
-    stats = read_statistics(dataset)
+    stats = dataset.folder.statistics
     features = dataset.info.features
     names = [name for name, feature in features.items() if feature.is_numeric and name not in _NUMBERING]
     num_rows = sum(place.length for place in dataset.places)
-    for name in names:
-        episodes = [_vectors(dataset, name, rows[name]) for rows in dataset.rows]
+    if dataset.unreadable:
+        yield NotMeasured(why=f"the whole dataset, since {len(dataset.unreadable)} of its episodes cannot be read")
+    for name in names if not dataset.unreadable else ():
+        episodes = [_vectors(dataset, name, rows[name]) for rows in dataset.rows.values()]
         ranges = [_quantile_ranges(values) for values in episodes]
         weights = [len(values) for values in episodes]
         averaged = {q: np.average([each[q] for each in ranges], axis=0, weights=weights) for q in QUANTILES}
         between = {} if dataset.sidecar else _hull(ranges)
-        count = sum(len(rows[name]) for rows in dataset.rows)
+        count = sum(len(rows[name]) for rows in dataset.rows.values())
         yield from _errors(stats.get(name), np.concatenate(episodes), count, name, averaged, between)
     for name in [name for name in features if name in stats and name not in names]:
         yield from _form_errors(stats[name], name, num_rows if name in _NUMBERING else None)
     columns = [f"stats/{name}/{quantity}" for name in names for quantity in NAMES]
     counts = _numbering_counts(dataset)
     columns += counts.values()
-    for number, (row, rows) in enumerate(
-        zip(rows_in(dataset.path, "meta/episodes", columns), dataset.rows, strict=False)
-    ):
-        for name in names:
+    for number, row in enumerate(rows_in(dataset.path, "meta/episodes", columns)):
+        rows = dataset.rows.get(number, {})
+        for name in names if rows else ():
             stored = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
             values = _vectors(dataset, name, rows[name])
             yield from _errors(stored, values, len(rows[name]), f"{name}, episode {number}", {}, {})
@@ -70,7 +69,7 @@ def dataset_statistics(dataset: Dataset) -> Iterator[Found]:
         yield Measurement(value=MERGED_ERROR, detail=f"{', '.join(unknown[:3])}: not a feature")
 
 
-def _numbering_counts(dataset: Dataset) -> dict[str, str]:
+def _numbering_counts(dataset: CheckedDataset) -> dict[str, str]:
     """Name -> column of the episodes' counts of each numbering, where the dataset has it."""
     tables = tables_in(dataset.path, "meta/episodes")
     known = set(open_table(tables[0]).schema_arrow.names) if tables else set()
@@ -78,19 +77,7 @@ def _numbering_counts(dataset: Dataset) -> dict[str, str]:
     return {name: column for name, column in columns.items() if column in known}
 
 
-def read_statistics(dataset: Dataset) -> dict[str, Any]:
-    """meta/stats.json; ExportError when it cannot be read."""
-    path = dataset.path / STATS_PATH
-    try:
-        found = read_json(path)
-        if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
-            raise ValueError("it is not an object of objects")
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({describe_error(error)}): {path}") from error
-    return found
-
-
-def _vectors(dataset: Dataset, name: str, rows: Any) -> Array:
+def _vectors(dataset: CheckedDataset, name: str, rows: Any) -> Array:
     """(N, D) rows; of arrays of several dimensions their last one, as LeRobot's statistics."""
     return np.asarray(rows, dtype=np.float64).reshape(-1, dataset.info.features[name].shape[-1])
 
@@ -172,19 +159,21 @@ def numbers_of(value: Any) -> Array:
     needs="images",
     needs_images=True,
 )
-def dataset_image_statistics(dataset: Dataset) -> Iterator[Found]:
+def dataset_image_statistics(dataset: CheckedDataset) -> Iterator[Found]:
     """Recompute the mean colour of each camera, of the whole dataset and of each episode."""
     if dataset.info.is_old:
         return
-    stats = read_statistics(dataset)
+    stats = dataset.folder.statistics
     for key, (films, _) in dataset.films.items():
         if not films or dataset.info.features[key].is_depth:
             continue
         mean = np.average([film.mean for film in films], axis=0, weights=[len(film.cells) for film in films])
         yield _colour_error(stats.get(key, {}).get("mean"), mean, key)
         column = f"stats/{key}/mean"
-        for row, film in zip(rows_in(dataset.path, "meta/episodes", [column]), films, strict=False):
-            yield _colour_error(row[column], film.mean, film.where)
+        filmed = {film.episode: film for film in films}
+        for number, row in enumerate(rows_in(dataset.path, "meta/episodes", [column])):
+            if (film := filmed.get(f"episode {number}")) is not None:
+                yield _colour_error(row[column], film.mean, film.where)
 
 
 def _colour_error(stored: Any, true: Array, detail: str) -> Measurement:

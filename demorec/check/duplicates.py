@@ -8,7 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from demorec.check.base import Found, Measurement, NotMeasured, check
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 from demorec.check.run import CheckedRun
 from demorec.core.geometry import Array
 
@@ -22,7 +22,7 @@ MAX_DISTANCE = 1e-4
     measures="episodes that have the motion of an earlier one",
     needs="two episodes",
 )
-def duplicates(subject: CheckedRun | Dataset) -> Found:
+def duplicates(subject: CheckedRun | CheckedDataset) -> Found:
     """Compare the states of all episodes at 32 moments each."""
     names, motions = subject.courses()
     if len(names) < 2:

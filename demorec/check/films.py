@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
-from pathlib import Path
+from itertools import groupby
 from typing import NamedTuple, cast
 
 import av
@@ -14,10 +13,10 @@ import numpy as np
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, RecordingError
+from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.reader import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.episode.episode import NO_IMAGE, Table
 from demorec.mcap import Recording
@@ -32,16 +31,23 @@ class Film:
     """N images of one camera in one episode.
 
     Attributes:
-        where: Camera and episode, for people.
+        camera: Name, for people.
+        episode: "episode 3", or "" where there is only one.
         fps: Frames per second.
         cells: (N, 16, 16, 3) mean colours of the parts of each image, 0 to 255.
         frames: (N,) frame that each image belongs to.
     """
 
-    where: str
+    camera: str
+    episode: str = ""
     fps: float
     cells: NDArray[np.uint8]
     frames: NDArray[np.intp]
+
+    @property
+    def where(self) -> str:
+        """Camera and episode, for people."""
+        return f"{self.camera}, {self.episode}" if self.episode else self.camera
 
     @cached_property
     def steps(self) -> Array:
@@ -75,7 +81,7 @@ def film_of_recording(recording: Recording, table: Table, camera: str) -> Camera
     held, frames = np.unique(table.images[camera], return_index=True)
     shown = (held != NO_IMAGE) & (held < len(cells))
     film = Film(
-        where=f"camera {camera}",
+        camera=f"camera {camera}",
         fps=recording.info.fps,
         cells=np.stack(cells)[held[shown]] if cells else np.zeros((0, 1, 1, 3), dtype=np.uint8),
         frames=frames[shown],
@@ -83,37 +89,24 @@ def film_of_recording(recording: Recording, table: Table, camera: str) -> Camera
     return CameraFilms([film], error)
 
 
-def films_of_dataset(info: DatasetInfo, places: Iterable[EpisodePlace], key: str) -> CameraFilms:
-    """The images of a camera of a dataset in every episode, in order."""
-    files: dict[Path, Iterator[NDArray[np.uint8]]] = {}
-    ends: dict[Path, int] = {}
+def films_of_dataset(folder: LeRobotFolder, key: str) -> CameraFilms:
+    """The images of a camera of a dataset in every episode in which they decode, in order."""
     found: list[Film] = []
-    try:
-        for place in places:
-            path, first = place.videos[key]
-            if path not in files:
-                files[path] = _decoded(path)
-            lead = max(0, first - ends.get(path, 0))
-            ends[path] = first + place.length
-            images = list(islice(files[path], lead, lead + place.length))
-            if len(images) < place.length or not images:
-                raise ExportError(
-                    f"Episode {place.episode_index} has {place.length} frames, {len(images)} images decode: {path}"
-                )
-            where = f"{key}, episode {place.episode_index}"
-            found.append(Film(where=where, fps=info.fps, cells=np.stack(images), frames=np.arange(place.length)))
-    except ExportError as error:
-        return CameraFilms(found, str(error))
-    return CameraFilms(found, "")
-
-
-def _decoded(path: Path) -> Iterator[NDArray[np.uint8]]:
-    """The parts of every image."""
+    errors: list[str] = []
     reformatter = VideoReformatter()  # a frame's own would be set up again for each
-    with opened_video(path) as (container, stream):
-        stream.thread_type = "SLICE"
-        for frame in container.decode(stream):
-            yield _parts(frame, reformatter)
+    for path, group in groupby(enumerate(folder.listed), key=lambda item: item[1].videos[key][0]):
+        with noted(errors, folder.root), opened_video(path) as opened:
+            for number, place in group:
+                cells: list[NDArray[np.uint8]] = []
+                with noted(errors, folder.root):
+                    cells = [_parts(image, reformatter) for image in folder.video(key, place).decoded(opened=opened)]
+                if cells:
+                    name, frames = f"episode {number}", np.arange(place.length)
+                    found.append(
+                        Film(camera=key, episode=name, fps=folder.info.fps, cells=np.stack(cells), frames=frames)
+                    )
+    more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
+    return CameraFilms(found, errors[0] + more if errors else "")
 
 
 def _parts(image: av.VideoFrame, reformatter: VideoReformatter) -> NDArray[np.uint8]:

@@ -49,11 +49,13 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
 
     Cameras that show the same in many other moving frames do not see the robot, and are not judged.
     """
+    motions = {motion.where: motion for motion in subject.motions.all}
     for camera, (films, _) in subject.films.items():
         found: list[Found] = []
         blind = others = 0
-        for film, motion in zip(films, subject.motions.all, strict=False):
-            if len(film.cells) < 2:
+        for film in films:
+            motion = motions.get(film.episode)
+            if motion is None or len(film.cells) < 2:
                 continue
             same, moves = film.steps <= MAX_SAME_STEP, moves_of(_state_at(film, motion))
             rest = longest_rest(same, moves, np.diff(film.frames))

@@ -11,7 +11,7 @@ import sys
 import tempfile
 
 from demorec.check.base import Measurement, dataset_check
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 from demorec.core.errors import MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
@@ -40,7 +40,7 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
     measures="errors when the installed LeRobot opens it",
     needs_images=True,
 )
-def dataset_opens(dataset: Dataset) -> Measurement | None:
+def dataset_opens(dataset: CheckedDataset) -> Measurement | None:
     """Let LeRobot open the dataset and read the first, middle and last frame, images included."""
     if dataset.info.is_old:  # LeRobot 0.6 reads v3.0 alone
         return None
@@ -69,7 +69,7 @@ def dataset_opens(dataset: Dataset) -> Measurement | None:
                 f"raise the limit (ulimit -v); whether the dataset is sound is not known: {dataset.path}"
             )
         # It asks the Hub for files that are missing here, and complains that it may not.
-        problems = dataset_problems(dataset.path, dataset.info)
+        problems = dataset_problems(dataset.folder)
         return Measurement(value=1, detail=f"LeRobot cannot open it ({problems[0] if problems else said})")
     found = json.loads(done.stdout.splitlines()[-1])
     same = (found["episodes"], found["frames"]) == (dataset.info.total_episodes, dataset.info.total_frames)

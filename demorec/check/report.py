@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.check.base import Check, Form, Level, Result
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ExportError, RecordingError, check_option
@@ -162,14 +162,14 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
         notes = ()
         found = _run(options, CheckedRun(subject.path, options.named))
     else:
-        dataset = Dataset(subject.path, options.urdf, options.motors, options.named)
+        dataset = CheckedDataset(subject.path, options.urdf, options.motors, options.named)
         notes = _notes(dataset)
         found = _run(options, dataset)
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
     return SubjectReport(**vars(subject), results=results, notes=notes)
 
 
-def _notes(subject: CheckedEpisode | Dataset) -> tuple[str, ...]:
+def _notes(subject: CheckedEpisode | CheckedDataset) -> tuple[str, ...]:
     """What has no role; nothing of what cannot be read, which the checks report."""
     try:
         return tuple(subject.roles.notes())
@@ -177,7 +177,7 @@ def _notes(subject: CheckedEpisode | Dataset) -> tuple[str, ...]:
         return ()
 
 
-Checked = CheckedEpisode | Dataset | CheckedRun
+Checked = CheckedEpisode | CheckedDataset | CheckedRun
 
 
 def _within(path: Path, detail: str) -> str:

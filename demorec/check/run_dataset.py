@@ -2,24 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterable, Iterator, Mapping
-from contextlib import ExitStack, closing
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 
 from demorec.check.base import Measurement, counted, run_check
-from demorec.check.dataset import Dataset, DescribedEpisode
+from demorec.check.dataset import CheckedDataset, DescribedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.inspect import video_digests
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import is_dataset
 from demorec.datasets.lerobot.prepare import reasons_to_transcode, recorded_videos
 from demorec.datasets.lerobot.sidecar import EXPORT_PATH, EpisodeRecord
-from demorec.datasets.lerobot.videos import PacketReader
 from demorec.mcap import open_recording
 from demorec.runs.run_file import DATASET
 
@@ -33,12 +31,12 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
     path = run.path / DATASET
     if not is_dataset(path):
         return None
-    dataset = Dataset(path)
-    if not all("source" in row for row in dataset.sidecar) or not dataset.sidecar:
+    dataset = CheckedDataset(path)
+    if not dataset.sidecar or any(row["source"] is None for row in dataset.sidecar):
         return Measurement(value=1, detail="the dataset does not state which recordings it comes from")
     dataset.check_simulated()
     options = export_options(path)
-    wrong: list[str] = []
+    wrong = list(dict.fromkeys(dataset.unreadable.values()))
     successes = len(run.run.successes)
     found = sum(bool(row["success"]) for row in dataset.sidecar)
     if found != successes:
@@ -51,21 +49,11 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
     return counted(wrong, f"{len(dataset.sidecar)} episodes")
 
 
-def with_videos(dataset: Dataset) -> Iterator[tuple[DescribedEpisode, Mapping[str, str]]]:
+def with_videos(dataset: CheckedDataset) -> Iterator[tuple[DescribedEpisode, Mapping[str, str]]]:
     """Every simulated episode that the sidecar knows, in order, and of each camera feature SHA-256 (hex) of its coded
     images; ExportError when a file cannot be read."""
-    with ExitStack() as stack:
-        readers = {key: stack.enter_context(closing(PacketReader(key))) for key in dataset.info.video_keys}
-        for each in sorted(dataset.described(), key=lambda each: each.number):
-            place = dataset.places[each.number]
-            yield each, {key: _digest(reader.read(place)) for key, reader in readers.items()}
-
-
-def _digest(samples: Iterable[bytes]) -> str:
-    digest = hashlib.sha256()
-    for sample in samples:
-        digest.update(sample)
-    return digest.hexdigest()
+    for each in sorted(dataset.described(), key=lambda each: each.number):
+        yield each, video_digests(dataset.folder, dataset.places[each.number])
 
 
 def export_options(dataset: Path) -> ExportOptions:

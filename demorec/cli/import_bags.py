@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -58,8 +58,8 @@ class Import:
     out: OptionalTarget = None
     """Folder of the run, new or to be continued; required unless --suggest is given."""
     skip_bad: bool = False
-    """Leave out bags that cannot be read, or do not fit the mapping or the other bags, list them at the end and exit
-    with 1. Else the first of them ends the import, before anything of it is written."""
+    """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and episodes of a dataset that
+    cannot be read; list them at the end and exit with 1. Else the first of them ends the import."""
     workers: int = 1
     """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
@@ -114,9 +114,10 @@ class Import:
         return self._import_bags(self.bags, self.mapping, self.out)
 
     def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path], motors: Motors | None) -> int:
-        if self.skip_bad or self.workers > 1:
+        if (self.skip_bad and not form.can_skip) or self.workers > 1:
             raise ConfigError(
-                "Only bags can be skipped or imported by several workers: leave --skip-bad, --workers out."
+                "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
+                "--workers, --skip-bad out."
             )
         example, name = f"demorec import {word} {form.example}", name_of(form.kind)
         if not paths:
@@ -133,12 +134,13 @@ class Import:
         if self.out is None:
             raise ConfigError(f"An import needs --out: {example}.")
         self.video.validate()
-        result = form.read(paths, self.mapping, self.out, self.video, motors, self.roles.named)
+        named = self.roles.named
+        result = form.read(paths, self.mapping, self.out, self.video, motors, named, skip_bad=self.skip_bad)
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
         say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {self.out}")
-        return 0
+        return _list_skipped(result.skipped, result.num_episodes + len(result.skipped), "episode")
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
         from demorec.sources.import_file import report_lines
@@ -169,11 +171,16 @@ class Import:
         else:
             above = f"No findings; {counted(notes, 'note')} above."
             say(above if notes else "Nothing odd was found.")
-        if not result.skipped:
-            return 0
-        say(f"Skipped {len(result.skipped)} of {counted(len(result.reports) + len(result.skipped), 'bag')}:")
-        say(*(f"  {path}: {reason}" for path, reason in result.skipped.items()))
-        return 1
+        return _list_skipped(result.skipped, len(result.reports) + len(result.skipped), "bag")
+
+
+def _list_skipped(skipped: Mapping[Any, str], total: int, word: str) -> int:
+    """Print what was skipped; return the exit code."""
+    if not skipped:
+        return 0
+    say(f"Skipped {len(skipped)} of {counted(total, word)}:")
+    say(*(f"  {name}: {reason}" for name, reason in skipped.items()))
+    return 1
 
 
 def _incomplete(suggest: str) -> ConfigError:

@@ -342,26 +342,25 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
 
 def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """What the tables say beyond info.json, where demorec understands them, and what is wrong with the dataset."""
-    from demorec.datasets.lerobot import dataset_digest
-    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_problems, has_digest
-    from demorec.datasets.lerobot.layout import DatasetInfo
+    from demorec.datasets.lerobot.folder import LeRobotFolder
+    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_problems, folder_digest, has_digest
 
     facts: list[tuple[str, str]] = []
     problems: list[str] = []
     try:
-        info = DatasetInfo.load(path)
-        problems += dataset_problems(path, info)
-        if problems:
-            return facts, problems
-        if (counts := attempt_counts(path)) is not None:
-            facts.append(("successes", f"{counts[0]}, of {counts[1]} attempts"))
-        for name, item in info.features.items():
+        folder = LeRobotFolder(path)
+        problems += dataset_problems(folder)
+        for name, item in folder.info.features.items():
             if item.is_video:
                 codec = (item.info or {}).get("video.codec", "")
                 camera = f"{name.removeprefix(IMAGE_PREFIX)} {item.shape[1]}x{item.shape[0]} {codec}"
                 facts.append(("camera", camera))
-        if has_digest(info):
-            facts.append(("digest", dataset_digest(path)))
+        if problems:
+            return facts, problems
+        if (counts := attempt_counts(folder)) is not None:
+            facts.insert(0, ("successes", f"{counts[0]}, of {counts[1]} attempts"))
+        if has_digest(folder.info):
+            facts.append(("digest", folder_digest(folder)))
     except ExportError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error

@@ -152,6 +152,7 @@ class View:
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
+        from demorec.datasets.lerobot.folder import LeRobotFolder
         from demorec.datasets.scoring.score import score_dataset
         from demorec.runs.find import find
 
@@ -160,7 +161,7 @@ class View:
         found = {
             f"{path}: episode {episode.episode_index}": episode
             for path in self.paths
-            for episode in score_dataset(path, self.roles.named)
+            for episode in score_dataset(LeRobotFolder(path, named=self.roles.named))
         }
         ranked = sorted(sources, key=lambda source: found[source.name].score)
         for episode in [found[source.name] for source in ranked[:_MOST_REASONS]]:

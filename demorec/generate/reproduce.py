@@ -17,8 +17,8 @@ from demorec.core.config import GenerateConfig, parse_config
 from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
 from demorec.datasets.lerobot.files import read_json, read_table
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
-from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
@@ -188,7 +188,7 @@ def _dataset_digests(dataset: Path) -> dict[Key, str]:
 
 def _digests(dataset: Path, rows: list[dict[str, Any]]) -> dict[Key, str]:
     """Of what the tables and videos hold."""
-    digests = episode_digests(dataset, DatasetInfo.load(dataset))
+    digests = episode_digests(LeRobotFolder(dataset))
     if len(digests) != len(rows):
         raise ConfigError(f"The dataset has {len(digests)} episodes, its sidecar tells of {len(rows)}: {dataset}")
     return {(row["run_episode_index"], row["attempt"]): found for row, found in zip(rows, digests, strict=True)}

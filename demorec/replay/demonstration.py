@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from demorec.core.config import MAX_PHYSICS_HZ, deciding_versions
-from demorec.core.errors import ConfigError, OptionError, RecordingError, check_option, check_seed
+from demorec.core.errors import ConfigError, ExportError, OptionError, RecordingError, check_option, check_seed
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind
@@ -224,13 +224,17 @@ def dataset_demonstrations(
             robot, as `demonstration_of`.
         ExportError: It is damaged.
     """
-    from demorec.check.dataset import Dataset
+    from demorec.check.dataset import CheckedDataset
 
     if options.states or options.export_hz:
         raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
-    dataset = Dataset(path, motors=options.motors, named=options.named)
+    dataset = CheckedDataset(path, motors=options.motors, named=options.named)
+    if missing := dataset.folder.missing:
+        raise ExportError(missing)
+    if bad := [problem for number, problem in dataset.unreadable.items() if wanted(number)]:
+        raise ExportError(f"{bad[0]}, in {path}")
     if options.robot is not None:
-        for number, motion in enumerate(dataset.motions.all):
+        for number, motion in zip(dataset.rows, dataset.motions.all, strict=False):
             if not wanted(number):
                 continue
             name = f"{path.name}_episode_{number:06d}"

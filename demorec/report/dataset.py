@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -14,13 +14,11 @@ from numpy.typing import NDArray
 from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError, ExportError, describe_error, without_path
-from demorec.datasets.lerobot.files import read_table
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.modality import dataset_roles
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, episode_places
-from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, EPISODE_SCHEMA
-from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
 from demorec.datasets.scoring.score import MIN_EPISODES, MIN_SOUND, score_dataset
 from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome, SuccessCheck
@@ -34,10 +32,9 @@ _NUMBERS = ("float32", "float64", "int64", "bool")
 _MAX_COMPONENTS = 64
 """Of one feature that are drawn."""
 _EPISODE_COLUMNS = (
-    "episode_index", "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
+    "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
     "failure_reason", "num_retries", "checks", "phases", "episode_info",
 )  # fmt: skip
-_ATTEMPT_COLUMNS = ("run_episode_index", "attempt", "success", "failure_phase", "failure_reason", "episode_index")
 _Row = Mapping[str, Any]
 
 
@@ -45,31 +42,33 @@ def dataset_report(
     root: Path, camera: str, checks: CheckOptions | None, named: NamedRoles, advance: Callable[[int, int], None]
 ) -> Report:
     """The content of a page about a dataset; arguments and errors as of `demorec.report.gather.gather`."""
-    info = DatasetInfo.load(root)
-    roles = dataset_roles(root, info, named)
-    rows, left_out = _read_sidecar(root)
+    folder = LeRobotFolder(root, named=named)
+    info, roles = folder.info, folder.roles
+    rows = {row["episode_index"]: row for row in folder.sidecar(_EPISODE_COLUMNS)}
+    left_out = folder.attempts.failures()
     missing = list(_missing(info, roles, has_sidecar=bool(rows)))
     key = _camera_key(info, camera, root)
-    stored = None if key is None or info.features[key].is_video else StoredImages(info, key)
     wanted = dict.fromkeys((*roles.state, *roles.action))
     if _SUCCESS in info.features and info.features[_SUCCESS].column.elements:
         wanted[_SUCCESS] = None
-    reader = RowStream(info, list(wanted)) if wanted else None
-    total = info.total_episodes + len(left_out) + (checks is not None)
-    stride = max(1, -(-info.total_episodes // MAX_SHOWN))
+    reader = folder.rows(list(wanted)) if wanted else None
+    total = len(folder.places) + len(left_out) + (checks is not None)
+    stride = max(1, -(-len(folder.places) // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    flags = {} if checks is None else _flags(root, info, named, missing)
-    for number, place in enumerate(episode_places(root, info)):
-        columns = {} if reader is None else reader.numbers(place)
-        _count_components(components, roles, columns)
-        strip, problem = None, ""
+    flags = {} if checks is None else _flags(folder, missing)
+    for number, place in enumerate(folder.places):
+        columns: Mapping[str, NDArray[Any]] = {}
+        strip: Filmstrip | None = None
+        problems: list[str] = []
         odd = flags.get(place.episode_index, ())
-        if key is not None and (odd or number % stride == 0):
-            images_at = partial(stored.read, place) if stored else EpisodeVideo(info, key, place).images_at
-            strip, problem = _strip(root, info, key, place, images_at)
+        with noted(problems, root):
+            columns = {} if reader is None else reader.numbers(place)
+            _count_components(components, roles, columns)
+            if key is not None and (odd or number % stride == 0):
+                strip = _strip(folder, key, place)
         episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
-        episodes.append(replace(episode, filmstrip=strip, problem=problem, flags=odd))
+        episodes.append(replace(episode, filmstrip=strip, problem="; ".join(problems), flags=odd))
         advance(len(episodes), total)
     episodes += [_left_out(row) for row in left_out]
     summaries = CheckSummaries()
@@ -90,14 +89,14 @@ def dataset_report(
     )
 
 
-def _flags(root: Path, info: DatasetInfo, named: NamedRoles, missing: list[str]) -> dict[int, tuple[Result]]:
+def _flags(folder: LeRobotFolder, missing: list[str]) -> dict[int, tuple[Result]]:
     """Return episode_index -> its score, of the worst below `MIN_SOUND`; why there are none goes into `missing`."""
-    if info.total_episodes < MIN_EPISODES:
+    if len(folder.places) < MIN_EPISODES:
         return {}
     try:
-        found = sorted(score_dataset(root, named), key=lambda episode: episode.score)
+        found = sorted(score_dataset(folder), key=lambda episode: episode.score)
     except ExportError as error:
-        missing.append(f"Its episodes have no scores: {without_path(error, root)}")
+        missing.append(f"Its episodes have no scores: {without_path(error, folder.root)}")
         return {}
     return {
         episode.episode_index: (
@@ -116,27 +115,6 @@ def _flags(root: Path, info: DatasetInfo, named: NamedRoles, missing: list[str])
         for episode in found[:MAX_SHOWN]
         if episode.score < MIN_SOUND
     }
-
-
-def _read_sidecar(root: Path) -> tuple[dict[int, _Row], list[_Row]]:
-    """Return episode index -> its row, and the rows of attempts outside of the dataset; empty without a sidecar.
-
-    Raises:
-        ExportError: It is damaged.
-    """
-    episodes, attempts = (
-        [
-            row
-            for file in sorted((root / SIDECAR_DIR / name).glob("*/*.parquet"))
-            for row in read_table(file, columns, schema=schema).to_pylist()
-        ]
-        for name, columns, schema in (
-            ("episodes", _EPISODE_COLUMNS, EPISODE_SCHEMA),
-            ("attempts", _ATTEMPT_COLUMNS, ATTEMPT_SCHEMA),
-        )
-    )
-    rows = {row["episode_index"]: row for row in episodes}
-    return rows, [row for row in attempts if row["episode_index"] is None]
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
@@ -159,20 +137,12 @@ def _cameras(info: DatasetInfo) -> list[str]:
     return [key for key, feature in info.features.items() if feature.is_camera]
 
 
-def _strip(
-    root: Path,
-    info: DatasetInfo,
-    key: str,
-    place: EpisodePlace,
-    images_at: Callable[[Sequence[int]], Iterable[NDArray[np.uint8]]],
-) -> tuple[Filmstrip | None, str]:
-    """The filmstrip, or why there is none."""
-    try:
-        name, max_bytes = key.removeprefix(IMAGE_PREFIX), strip_budget(info.total_episodes)
-        strip = filmstrip(name, place.length, images_at, max_bytes=max_bytes)
-    except ExportError as error:
-        return None, without_path(error, root)
-    return strip, ""
+def _strip(folder: LeRobotFolder, key: str, place: EpisodePlace) -> Filmstrip | None:
+    """The filmstrip of an episode; ExportError where its images cannot be read."""
+    is_video = folder.info.features[key].is_video
+    images_at = folder.video(key, place).images_at if is_video else partial(folder.stored_images[key].read, place)
+    max_bytes = strip_budget(len(folder.places))
+    return filmstrip(key.removeprefix(IMAGE_PREFIX), place.length, images_at, max_bytes=max_bytes)
 
 
 def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]], row: _Row | None) -> ReportedEpisode:
@@ -252,7 +222,7 @@ def _missing(info: DatasetInfo, roles: Roles, *, has_sidecar: bool) -> Iterator[
 def _facts(
     root: Path, info: DatasetInfo, episodes: list[ReportedEpisode], num_left_out: int
 ) -> Iterator[tuple[str, str]]:
-    yield "episodes", str(info.total_episodes)
+    yield "episodes", str(len(episodes) - num_left_out)
     if num_left_out:
         yield "attempts", f"{len(episodes)}, of which {num_left_out} are not in the dataset"
     yield from common_facts(episodes, (file for file in root.rglob("*") if file.is_file()))

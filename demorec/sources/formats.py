@@ -39,6 +39,7 @@ class SourceFormat:
         mapping: Whose keys its mappings have; None where it needs none.
         has_motor_units: Whether its numbers may be those of an arm's servos.
         has_roles: Whether the user may name the roles of its features; a mapping says them otherwise.
+        can_skip: Whether episodes that cannot be read may be left out.
         suggester: "module:function", path -> the lines of a mapping, where it needs one.
     """
 
@@ -49,6 +50,7 @@ class SourceFormat:
     mapping: SourceKind | None = None
     has_motor_units: bool = False
     has_roles: bool = False
+    can_skip: bool = False
     suggester: str = ""
 
     def read(
@@ -59,14 +61,20 @@ class SourceFormat:
         video: VideoConfig,
         motors: Motors | None = None,
         named: NamedRoles = NO_NAMES,
+        *,
+        skip_bad: bool = False,
     ) -> FramesImport:
         """Make or continue the run `out`; pixels are encoded as `video` says, numbers those of `motors`.
+
+        With `skip_bad`, episodes that cannot be read are left out, where the format can.
 
         Raises:
             DemorecError: As the importer.
         """
         importer = pkgutil.resolve_name(self.importer)
-        return cast("FramesImport", importer(paths, mapping, out, video=video, motors=motors, named=named))
+        skipping = {"skip_bad": skip_bad} if self.can_skip else {}
+        found = importer(paths, mapping, out, video=video, motors=motors, named=named, **skipping)
+        return cast("FramesImport", found)
 
     def suggest(self, path: Path) -> list[str]:
         """The lines of a mapping of a format that needs one."""
@@ -81,6 +89,7 @@ _ROWS = (
         importer="demorec.sources.dataset_import:import_lerobot",
         has_motor_units=True,
         has_roles=True,
+        can_skip=True,
     ),
     SourceFormat(
         kind="hdf5",

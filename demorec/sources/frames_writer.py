@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib.metadata import version
 from pathlib import Path
@@ -37,6 +37,7 @@ class FramesImport:
         num_new: Episodes that were written now; the others were there.
         cameras: Camera -> what became of its images, in words.
         left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
+        skipped: Episode that cannot be read -> why.
     """
 
     num_episodes: int
@@ -44,6 +45,7 @@ class FramesImport:
     num_new: int
     cameras: Mapping[str, str]
     left_out: Mapping[str, str]
+    skipped: Mapping[str, str] = field(default_factory=dict)
 
     def left_out_lines(self) -> Iterator[str]:
         """What the run does not have, for people."""

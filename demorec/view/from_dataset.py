@@ -13,7 +13,6 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,17 +20,15 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
-from demorec.datasets.lerobot.episodes import LeRobotDataset
 from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.reader import episode_places
 from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
 from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.scene import Scene
 from demorec.episode.sensed import SENSED
 from demorec.episode.validity import read_episode_info
@@ -42,37 +39,25 @@ from demorec.view.episode import Box, PlayedEpisode, millimetres, simulated_curv
 from demorec.view.from_recording import played_episode
 
 
-def dataset_episodes(root: Path) -> list[int]:
-    """Numbers of the episodes in a dataset.
-
-    Raises:
-        RecordingError: It is damaged.
-    """
-    return [place.episode_index for place in episode_places(root, DatasetInfo.load(root))]
-
-
 @contextmanager
-def open_dataset_episode(root: Path, episode_index: int, named: NamedRoles = NO_NAMES) -> Iterator[PlayedEpisode]:
-    """One episode of a dataset, and features whose role the user names.
+def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[PlayedEpisode]:
+    """One episode of a dataset, by its place in it from 0.
 
     Raises:
         ConfigError: It lacks a feature that the user names.
         RecordingError: It cannot be read.
     """
     try:
-        episode = _read_episode(LeRobotDataset(root, named=named), episode_index)
+        episode = _read_episode(dataset, number)
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
-        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {root}")
+        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
         raise resource_error(error) or unreadable from error
     yield episode
 
 
-def _read_episode(dataset: LeRobotDataset, episode_index: int) -> PlayedEpisode:
-    root = dataset.root
-    numbers = [number for number, place in enumerate(dataset.places) if place.episode_index == episode_index]
-    if not numbers:
-        raise RecordingError(f"The dataset has no episode {episode_index}: {root}")
-    recording = DatasetRecording(dataset, numbers[0])
+def _read_episode(dataset: LeRobotFolder, number: int) -> PlayedEpisode:
+    root, episode_index = dataset.root, dataset.places[number].episode_index
+    recording = DatasetRecording(dataset, number)
     group = root.resolve().name
     last, fps, times = recording.num_frames - 1, dataset.info.fps, recording.table().time_ns
     known = {

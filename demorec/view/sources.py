@@ -9,10 +9,11 @@ from functools import partial
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, OptionError
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.view.episode import PlayedEpisode
-from demorec.view.from_dataset import dataset_episodes, open_dataset_episode
+from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.from_recording import open_recorded
 
 
@@ -51,9 +52,12 @@ def find_episodes(
 def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[PlaybackSource]:
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
+        dataset = LeRobotFolder(path, named=named)
         return [
-            PlaybackSource(name=f"{path}: episode {index}", open=partial(open_dataset_episode, path, index, named))
-            for index in dataset_episodes(path)
+            PlaybackSource(
+                name=f"{path}: episode {place.episode_index}", open=partial(open_dataset_episode, dataset, number)
+            )
+            for number, place in enumerate(dataset.places)
         ]
     shows_failures = include_failures or found.kind == "evaluation"  # whose failed rollouts are results like others
     files = [*found.recordings, *(found.failed if shows_failures else ())]

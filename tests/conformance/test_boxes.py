@@ -13,6 +13,7 @@ from support.language import NOUNS, language_of
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot import dataset_digest
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.mcap import Recording
 
 PREFIX = "observation.images."
@@ -84,7 +85,7 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
 
     (frames,) = language_of(dataset)
     subtasks = {row["timestamp"]: row["content"] for row in frames[0][0] if row["style"] == "subtask"}
-    with open_dataset_episode(dataset, 0) as episode:
+    with open_dataset_episode(LeRobotFolder(dataset), 0) as episode:
         assert episode.info.simulation is not None
         shown = {time_ns: text for time_ns, kind, text in episode.statements if kind == "subtask"}
         assert [round(time_ns / 1e9, 3) for time_ns in shown] == [round(time, 3) for time in subtasks]

@@ -13,6 +13,7 @@ from support.commands import exit_code
 from demorec.cli import generate_dataset_main
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult
@@ -110,7 +111,7 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
     assert dataset_digest(tmp_path / "copy" / "dataset") == dataset_digest(tmp_path / "few")
     with (
         Recording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
-        open_dataset_episode(tmp_path / "few", 1) as shown,
+        open_dataset_episode(LeRobotFolder(tmp_path / "few"), 1) as shown,
     ):
         assert shown.base_from_tcp is not None
         recorded = recording.trajectory().base_from_tcp

@@ -15,6 +15,7 @@ import pytest
 from numpy.typing import NDArray
 from support.commands import exit_code
 
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.mcap import Recording
 from demorec.view.from_dataset import open_dataset_episode
 
@@ -125,7 +126,7 @@ def test_every_tool_reads_it(version: str, tmp_path: Path, capsys: pytest.Captur
     assert "2 episodes" in capsys.readouterr().out
     assert exit_code("view", root, "--save", tmp_path / "cups.rrd", "--episodes", "1") == 0
     assert exit_code("report", root, "--out", tmp_path / "cups.html", "--no-checks") == 0
-    with open_dataset_episode(root, 1) as episode:
+    with open_dataset_episode(LeRobotFolder(root), 1) as episode:
         assert episode.info.simulation is None
         np.testing.assert_array_equal(episode.curves["observation.state"].values, state(1))
         assert len(list(episode.videos["top"].packets())) == LENGTHS[1]
@@ -163,7 +164,7 @@ def test_an_export_that_would_append_names_the_command_that_converts_it(
     [
         ("info.json", '"v2.1"|"v9.0"', "format v9.0, those that are read are v2.0, v2.1 and v3.0"),
         ("episodes.jsonl", '"length": 5|"length": -5', "has -5 as length"),
-        ("episodes.jsonl", '"length": 5|"length": 9', "has 9 frames, its data file ends before"),
+        ("episodes.jsonl", '"length": 5|"length": 9', "its table of episodes has 2 of 15"),
         ("episodes.jsonl", '{"episode_index": 1|[{"episode_index": 1', "The table cannot be read"),
         ("tasks.jsonl", '"task_index": 0|"task_index": null', "no task_index"),
         ("tasks.jsonl", '"task_index": 0|"task_index": 0}{', "The table cannot be read"),

@@ -21,7 +21,7 @@ from support.check import level_of
 from support.export import episode_rows, export
 
 from demorec.datasets.lerobot import dataset_digest
-from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
@@ -107,7 +107,7 @@ def test_whole_episodes_between_keyframes(expected: list[Images], dataset: Path)
 
 
 def test_single_images(expected: list[Images], dataset: Path) -> None:
-    found_in = LeRobotDataset(dataset)
+    found_in = LeRobotFolder(dataset)
     for number, images in enumerate(expected):
         frames = [0, 1, GOP, len(images) - 1]
         for frame, found in zip(frames, DatasetRecording(found_in, number).images_at("high", frames), strict=True):
@@ -168,7 +168,7 @@ def test_imported_again_packets_and_digest_are_the_same(dataset: Path, run: Path
 
 
 def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Images], dataset: Path) -> None:
-    found = LeRobotDataset(dataset)
+    found = LeRobotFolder(dataset)
     for number, (place, images) in enumerate(zip(found.places, expected, strict=True)):
         packets = list(DatasetRecording(found, number).packets("high"))
         assert packets[0].is_keyframe
@@ -176,7 +176,7 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Imag
         with av.open(io.BytesIO(b"".join(packet.data for packet in packets)), "r", format="h264") as container:
             shown = [_pixels(frame) for frame in container.decode(video=0)]
         assert_equal([shown[len(packets) - place.length :]], [images])
-        with open_dataset_episode(dataset, place.episode_index) as episode:
+        with open_dataset_episode(LeRobotFolder(dataset), place.episode_index) as episode:
             times = np.array([time_ns for time_ns, _, _ in episode.videos["high"].packets()])
         assert len(times) == len(packets)
         lead = len(packets) - place.length

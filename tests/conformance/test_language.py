@@ -21,8 +21,8 @@ from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
 from demorec.datasets.lerobot import dataset_digest
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
-from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.episode.words import nouns_of
@@ -348,9 +348,9 @@ def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None
     chosen = [[runs[0], runs[2]], [runs[3]]]
     for run, part in zip(chosen, parts, strict=True):
         export(run, part, language=(), progress=True)
-    known = [digest for part in parts for digest in episode_digests(part, DatasetInfo.load(part))]
+    known = [digest for part in parts for digest in episode_digests(LeRobotFolder(part))]
     aggregate_datasets(["local/1", "local/2"], "local/all", roots=parts, aggr_root=tmp_path / "merged")
-    assert episode_digests(tmp_path / "merged", DatasetInfo.load(tmp_path / "merged")) == known
+    assert episode_digests(LeRobotFolder(tmp_path / "merged")) == known
     facts = [row["task_name"] for row in episode_rows(tmp_path / "merged")]
     assert facts == [run.name for part in chosen for run in part]
 
@@ -358,7 +358,7 @@ def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None
     delete_episodes(first, [0], output_dir=tmp_path / "left", repo_id="local/left")
     split_dataset(first, {"one": [0], "other": [1]}, output_dir=tmp_path / "split")
     for out, digest in (("left", known[1]), ("split/one", known[0]), ("split/other", known[1])):
-        assert episode_digests(tmp_path / out, DatasetInfo.load(tmp_path / out)) == [digest]
+        assert episode_digests(LeRobotFolder(tmp_path / out)) == [digest]
         assert "task_name" not in episode_rows(tmp_path / out)[0]  # LeRobot leaves out what it does not know
         assert not (tmp_path / out / "sarm_progress.parquet").exists()
 

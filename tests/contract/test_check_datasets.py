@@ -16,7 +16,7 @@ from support.export import rewrite_video
 from support.external import make_external, write_external
 from support.mcap import rewritten
 
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 from demorec.check.run_dataset import with_videos
 from demorec.cli import main
 from demorec.core.errors import ExportError
@@ -113,9 +113,9 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "another height": (of_video(height=128), "dataset_schema"),
     "another shape of the images": (of_feature(CAMERA, shape=[32, 32, 3]), "dataset_schema"),
     "another rate": (of_info(lambda data: data.update(fps=20)), "dataset_schema"),
-    "rows in another order": (of_table("data", rows_exchanged), "dataset_counts"),
+    "rows in another order": (of_table("data", rows_exchanged), "dataset_readable"),
     "a wrong index": (of_rows("index"), "dataset_counts"),
-    "a wrong frame_index": (of_rows("frame_index"), "dataset_counts"),
+    "a wrong frame_index": (of_rows("frame_index"), "dataset_readable"),
     "a wrong timestamp": (of_rows("timestamp"), "dataset_counts"),
     "an unknown task": (value_of("task_index", 20, 7), "dataset_counts"),
     "a video's range that ends early": (
@@ -237,7 +237,7 @@ def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> N
     spoilt = copy(run, tmp_path / "run")
     path = next((spoilt / "dataset/demorec/episodes").glob("*/*.parquet"))
     pq.write_table(pq.read_table(path).slice(1), path)
-    assert [episode.number for episode, _ in with_videos(Dataset(spoilt / "dataset"))] == [1, 2]
+    assert [episode.number for episode, _ in with_videos(CheckedDataset(spoilt / "dataset"))] == [1, 2]
     (result,) = checked(spoilt / "dataset", "dataset", only=["dataset_sidecar"]).results
     assert (result.level, result.detail) == ("fail", "episode 0 is unknown, as one that LeRobot recorded with resume")
     assert level_of(spoilt / "dataset", "forward_kinematics", "dataset") == "pass"

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from support.check import checked, copy, edit_column, edit_json, simulate_run
 from support.export import rewrite_video
 
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 from demorec.cli import main
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
@@ -219,7 +219,7 @@ def test_a_description_that_the_user_names(foreign: Path, tmp_path: Path, capsys
 
 def test_frames_without_a_number_do_not_stop_a_law(foreign: Path, tmp_path: Path) -> None:
     spoilt = copy(foreign, tmp_path / "ds")
-    count = Dataset(spoilt).places[0].length
+    count = CheckedDataset(spoilt).places[0].length
 
     def gap(rows: Rows) -> Rows:
         rows[20:25] = np.nan

@@ -15,8 +15,8 @@ from support.commands import exit_code
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
 from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
-from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 
 
@@ -153,7 +153,7 @@ def test_a_fixed_layout_is_no_duplicate(tmp_path: Path) -> None:
 def with_its_digest(dataset: Path) -> None:
     """A number that an exporter with a fault changed: only the recording has the right one."""
     edit_column(dataset, "observation.velocity", lambda rows: rows * (1 + 1e-5))
-    digests = episode_digests(dataset, DatasetInfo.load(dataset))
+    digests = episode_digests(LeRobotFolder(dataset))
     edit_parquet(next(dataset.glob("demorec/episodes/*/*.parquet")), "content_digest", lambda _: digests)
     assert level_of(dataset, "dataset_sidecar", "dataset") == "pass"
 

@@ -173,8 +173,6 @@ def state(name: str) -> Callable[[dict[str, Any]], Any]:
 INJECTED: dict[str, tuple[str, Callable[[Path], None], Found]] = {
     "robot": ("video", edit_json(INFO, lambda d: d.update(robot_type="so101")), ("info", "robot_type", None, None)),
     "rate": ("images", edit_json(INFO, lambda d: d.update(fps=20)), ("info", "fps", None, None)),
-    "claimed frames": ("video", edit_json(INFO, lambda d: d.update(total_frames=7)),
-                       ("info", "total_frames", None, None)),
     "a field of somebody's": ("video", edit_json(INFO, lambda d: d.update(operator="me")),
                               ("info", "operator", None, None)),
     "names": ("video", edit_json(INFO, lambda d: state("action")(d).update(names=["x", "y", "w"])),
@@ -199,8 +197,6 @@ INJECTED: dict[str, tuple[str, Callable[[Path], None], Found]] = {
     "one value": ("video", edit_column(DATA, "action", put(1, 5, 0.25, 2)), ("rows", "action", 1, 1)),
     "no number": ("images", edit_column(DATA, "observation.state", put(0, 0, float("nan"), 0)),
                   ("rows", "observation.state", 0, 0)),
-    "frame number": ("video", edit_column(DATA, "frame_index", put(1, 6, 7)), ("rows", "frame_index", 1, 1)),
-    "episode number": ("video", edit_column(DATA, "episode_index", put(2, 13, 3)), ("rows", "episode_index", 2, 2)),
     "mean": ("video", edit_json(STATS, lambda d: d["action"]["mean"].__setitem__(1, 0.7)),
              ("statistics", "action", None, None)),
     "statistics missing": ("video", edit_json(STATS, lambda d: d.pop("action")), ("statistics", "action", None, None)),

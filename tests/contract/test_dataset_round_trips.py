@@ -14,8 +14,9 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.editing.diff import diff
 from demorec.datasets.editing.merge import merge
 from demorec.datasets.editing.operations import rename, reorder, shuffle, split, trim
-from demorec.datasets.editing.plan import Plan, Source
+from demorec.datasets.editing.plan import Plan
 from demorec.datasets.editing.write import write_plan
+from demorec.datasets.lerobot.folder import LeRobotFolder
 
 pytestmark = pytest.mark.slow
 
@@ -32,15 +33,15 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("made")
     run = make_run(folder / "run", LENGTHS, failures=(1, 3), segmentation=True)
     export(run, folder / "d", boxes=True, progress=True, language=("subtask",))
-    copy = written(trim(Source(folder / "d"), 0, 0), folder / "copy").root
+    copy = written(trim(LeRobotFolder(folder / "d"), 0, 0), folder / "copy").root
     assert {item.level for item in diff(folder / "d", copy).differences} == {"statistics"}
     assert all("images" in item.name for item in diff(folder / "d", copy).differences)
     return copy
 
 
-def written(plan: Plan, out: Path) -> Source:
+def written(plan: Plan, out: Path) -> LeRobotFolder:
     write_plan(plan, out)
-    return Source(out)
+    return LeRobotFolder(out)
 
 
 def found(a: Path, b: Path) -> list[str]:
@@ -48,7 +49,7 @@ def found(a: Path, b: Path) -> list[str]:
 
 
 def round_trips(dataset: Path, at: Path, order: list[int], seed: int, share: float) -> None:
-    source = Source(dataset)
+    source = LeRobotFolder(dataset)
     assert found(dataset, written(trim(source, 0, 0), at / "trimmed").root) == []
     moved = written(reorder(source, order=order), at / "moved")
     back = written(reorder(moved, order=[order.index(number) for number in range(len(order))]), at / "back")
@@ -61,7 +62,7 @@ def round_trips(dataset: Path, at: Path, order: list[int], seed: int, share: flo
     again = written(rename(named, {"a": "action", "w": "observation.images.wrist"}), at / "again")
     assert found(dataset, again.root) == []
     try:
-        plans = split(source, {"a": share, "b": 1 - share}, seed)
+        plans = split(source, [{} for _ in source.places], {"a": share, "b": 1 - share}, seed)
     except ConfigError:  # one part would be empty
         return
     parts = [written(plan, at / name) for name, plan in plans.items()]
@@ -75,7 +76,7 @@ def test_one_round_trip(dataset: Path, tmp_path: Path) -> None:
 
 
 def test_differences_of_boxes_are_named(dataset: Path, tmp_path: Path) -> None:
-    other = written(reorder(Source(dataset), order=[1, 0, 2, 3, 4]), tmp_path / "d").root
+    other = written(reorder(LeRobotFolder(dataset), order=[1, 0, 2, 3, 4]), tmp_path / "d").root
     told: dict[str, Any] = json.loads((other / BOXES).read_text())
     # Episode 1 of the other one is episode 0; its frame 4 stands behind the 7 frames of the first.
     index = LENGTHS[1] + 4

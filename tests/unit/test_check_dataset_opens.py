@@ -12,7 +12,7 @@ from support.export import export
 
 from demorec.check import lerobot_opens
 from demorec.check.base import Measurement
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_HUB_OFFLINE` environment variable."
@@ -29,7 +29,7 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(lerobot_opens, "lerobot_is_installed", lambda: True)
     monkeypatch.setattr(subprocess, "run", run)
-    found = lerobot_opens.dataset_opens.measure(Dataset(tmp_path / "d"))
+    found = lerobot_opens.dataset_opens.measure(CheckedDataset(tmp_path / "d"))
     assert isinstance(found, Measurement)
     assert found.value == 1
     assert str(video.relative_to(tmp_path / "d")) in found.detail
@@ -73,7 +73,7 @@ def test_a_dataset_that_lerobot_refuses_fails(tmp_path: Path, monkeypatch: pytes
         "class LeRobotDataset:\n    def __init__(self, **_): raise ValueError('no')"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
-    found = lerobot_opens.dataset_opens.measure(Dataset(tmp_path / "d"))
+    found = lerobot_opens.dataset_opens.measure(CheckedDataset(tmp_path / "d"))
     assert isinstance(found, Measurement)
     assert found.value == 1
 

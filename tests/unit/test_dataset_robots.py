@@ -19,6 +19,7 @@ from support.export import data_table, export
 from support.external import TOP, URDF, Episode, make_external, write_external
 
 from demorec.core.errors import MissingDependencyError
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.robots import portable_urdf, read_robot
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot
@@ -190,7 +191,7 @@ def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
     given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))
     export(write_external(tmp_path / "a.mcap", given), tmp_path / "d")
-    with open_dataset_episode(tmp_path / "d", 0) as episode:
+    with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
         assert episode.info.simulation is None
         state = np.array([frame.samples["observation.state"].vector for frame in given.frames])
         np.testing.assert_allclose(episode.joint_position["shoulder"], np.deg2rad(state[:, 0]), atol=1e-7)
@@ -203,11 +204,11 @@ def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(e
     """Without anything of ours beside it: numbers, outcome and instruction from LeRobot's own tables."""
     strange = tmp_path / "strange"
     shutil.copytree(exported, strange)
-    with open_dataset_episode(exported, 0) as known:
+    with open_dataset_episode(LeRobotFolder(exported), 0) as known:
         assert known.info.simulation is not None
         arm_joints = known.info.simulated.robot.arm_joints
     shutil.rmtree(strange / "demorec")
-    with open_dataset_episode(strange, 0) as episode:
+    with open_dataset_episode(LeRobotFolder(strange), 0) as episode:
         assert episode.info.simulation is None
         for name in arm_joints:
             np.testing.assert_array_equal(episode.joint_position[name], known.joint_position[name])
@@ -236,6 +237,6 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     assert 'xyz="0.4 0 0"' in read_robot(tmp_path / "d", names[1]).urdf
     imported = import_lerobot([tmp_path / "d"], None, tmp_path / "run")
     assert (imported.num_new, "demorec/robots" in imported.left_out) == (4, True)
-    with open_dataset_episode(tmp_path / "d", 1) as played:
+    with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1) as played:
         assert played.info.simulation is None
         assert 'xyz="0.4 0 0"' in str(played.robot_description)

@@ -18,6 +18,7 @@ from support.recording import make_episode, write_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.lerobot import dataset_digest
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import attempt_counts
 from demorec.datasets.options import parse_episodes
 from demorec.mcap import Recording
@@ -162,7 +163,7 @@ def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> Non
         assert a[name]["count"] == b[name]["count"]
         if not name.startswith("observation.images"):  # of images LeRobot's own rule is used, an average
             assert all(a[name][q] == b[name][q] for q in ("q01", "q10", "q50", "q90", "q99"))
-    assert attempt_counts(grown) == attempt_counts(whole) == (4, 5)
+    assert attempt_counts(LeRobotFolder(grown)) == attempt_counts(LeRobotFolder(whole)) == (4, 5)
     rows = episode_rows(grown)
     assert [row["data/file_index"] for row in rows] == [0, 0, 1, 1]
     assert [row["meta/episodes/file_index"] for row in rows] == [0, 0, 1, 1]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from support.export import make_run
 
-from demorec.check.dataset import Dataset
+from demorec.check.dataset import CheckedDataset
 from demorec.cli import COMMANDS, main
 from demorec.core.errors import ExportError, MissingDependencyError
 from demorec.core.tables import CHECKS
@@ -64,7 +64,7 @@ def test_an_export_says_that_nothing_was_verified(
 def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tmp_path / "d"
     export_lerobot([run], dataset, ExportOptions(verify=False))
-    result = CHECKS.load("dataset_opens").run(Dataset(dataset))
+    result = CHECKS.load("dataset_opens").run(CheckedDataset(dataset))
     assert (result.level, "needs the package 'lerobot'" in result.detail) == ("skip", True)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingDependencyError, match="train"):

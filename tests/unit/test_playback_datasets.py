@@ -15,7 +15,8 @@ from support.recording import write_episode
 
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.episodes import LeRobotDataset
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.recorded_features import why_not_recorded
 from demorec.mcap import Recording
 from demorec.view.from_dataset import held, open_dataset_episode
 from demorec.view.save import save
@@ -39,7 +40,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> None:
-    with open_dataset_episode(dataset, 0) as episode:
+    with open_dataset_episode(LeRobotFolder(dataset), 0) as episode:
         assert episode.info.simulation is not None
         drawn = episode.object_poses["red_cube"]
     assert np.ptp(recorded[:, 2]) > 0.1  # lifted
@@ -52,7 +53,7 @@ def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> No
 
 def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path, recorded: Array) -> None:
     export(SAMPLE, tmp_path / "cubes", privileged=True)
-    with open_dataset_episode(tmp_path / "cubes", 0) as episode:
+    with open_dataset_episode(LeRobotFolder(tmp_path / "cubes"), 0) as episode:
         assert episode.info.simulation is not None
         np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
 
@@ -75,7 +76,7 @@ def test_closing_fingers_that_stop_hold_something(opening: list[int], target: li
 def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (3, 4), depth=True, cameras=("front",))
     export(run, tmp_path / "d", depth=True)
-    with open_dataset_episode(tmp_path / "d", 1) as episode:  # the second in its file
+    with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1) as episode:  # the second in its file
         assert episode.info.simulation is not None
         times, images = zip(*episode.depth["front"](), strict=True)
         shown = np.array(images)
@@ -105,7 +106,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     scale = written["features"]["observation.images.front_depth"]["info"]
     scale |= {"video.use_log": False, "video.depth_min": 0.5, "video.depth_max": 4.595}
     info.write_text(json.dumps(written))
-    with open_dataset_episode(tmp_path / "d", 0) as episode:
+    with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
         assert episode.info.simulation is not None
         _, shown = list(episode.depth["front"]())[2]
     with Recording(tmp_path / "e.mcap") as recording:
@@ -116,10 +117,11 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     for spoilt in (scale | {"video.depth_max": 0.1}, scale | {"video.shift": "far"}):
         written["features"]["observation.images.front_depth"]["info"] = spoilt
         info.write_text(json.dumps(written))
-        with open_dataset_episode(tmp_path / "d", 0) as episode:
+        with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
             assert episode.info.simulation is not None
             assert (list(episode.videos), list(episode.depth)) == (["front"], [])
-            assert "depth is" in LeRobotDataset(tmp_path / "d").left_out["observation.images.front_depth"]
+            name = "observation.images.front_depth"
+            assert "depth is" in why_not_recorded(name, LeRobotFolder(tmp_path / "d").info.features[name])
 
 
 def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
@@ -133,7 +135,7 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
     assert colour["info"]["video.codec"] == "h264"
     colour["info"]["video.codec"] = "av1"
     info.write_text(json.dumps(written))
-    with open_dataset_episode(tmp_path / "d", 0) as episode:
+    with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
         assert episode.info.simulation is not None
         with pytest.raises(ExportError, match=f"it has {width}x{height} pixels, and meta/info.json says 9x8"):
             list(episode.depth["front"]())
@@ -144,8 +146,8 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("lengths", "words"),
     [
-        ([8, 13], "Episode 1 has 13 frames, its data file ends before"),
-        ([5, 8], "rows of episode 1 are those of others"),
+        ([8, 13], "its table of episodes has 2 of 21"),
+        ([9, 7], "rows of episode 1 are not its own"),
     ],
 )
 def test_an_episode_of_another_length_than_its_rows_is_one_sentence(
@@ -156,5 +158,5 @@ def test_an_episode_of_another_length_than_its_rows_is_one_sentence(
     table = pq.read_table(path)
     column = pa.array(lengths, table.schema.field("length").type)
     pq.write_table(table.set_column(table.schema.get_field_index("length"), "length", column), path)
-    with pytest.raises(ExportError, match=words), open_dataset_episode(tmp_path / "d", 1):
+    with pytest.raises(ExportError, match=words), open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1):
         pass

@@ -17,7 +17,8 @@ from demorec.core.targets import OptionalTarget
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 MAX_SHOWN = 20
 """Ranges of episodes, or differences of one level, that are printed."""
@@ -41,11 +42,11 @@ class Edit:
     dry_run: bool = False
     """Print what would come out, and write nothing."""
 
-    def sources(self) -> Sequence[Source]:
+    def sources(self) -> Sequence[LeRobotFolder]:
         """The datasets to read."""
         raise NotImplementedError
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """The new dataset."""
         raise NotImplementedError
 
@@ -53,7 +54,7 @@ class Edit:
         """Names of the new datasets within --out; "" for --out itself."""
         return [""]
 
-    def plans(self, sources: Sequence[Source]) -> Mapping[str, Plan]:
+    def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """Name within --out -> new dataset."""
         return {"": self.plan(sources)}
 
@@ -78,7 +79,7 @@ class Edit:
             self._print_result("Would be ", name, plan, "Would not be taken over")
         return 0
 
-    def _write(self, sources: Sequence[Source], outs: Sequence[Path]) -> None:
+    def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
         """Write the new datasets, which appear together, and print what came out."""
         from demorec.datasets.editing.write import new_datasets, write_plan
 
@@ -115,11 +116,11 @@ class EditOne(Edit):
 
     dataset: DatasetPath
 
-    def sources(self) -> Sequence[Source]:
+    def sources(self) -> Sequence[LeRobotFolder]:
         """The dataset."""
-        from demorec.datasets.editing.plan import Source
+        from demorec.datasets.lerobot.folder import LeRobotFolder
 
-        return [Source(dataset_at(self.dataset))]
+        return [LeRobotFolder(dataset_at(self.dataset))]
 
 
 def _changes(plan: Plan) -> list[str]:

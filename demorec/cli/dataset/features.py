@@ -11,7 +11,8 @@ from tyro.conf import Positional, arg
 from demorec.cli.dataset.edit import EditOne, pairs
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -25,7 +26,7 @@ class Rename(EditOne):
 
     names: Annotated[Positional[tuple[str, ...]], arg(metavar="OLD=NEW", help="Old and new name of each feature.")]
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes with features under other names."""
         from demorec.datasets.editing.operations import rename
 
@@ -42,7 +43,7 @@ class DropFeatures(EditOne):
 
     names: Annotated[Positional[tuple[str, ...]], arg(metavar="NAME", help="Features to leave out.")]
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes without these features."""
         from demorec.datasets.editing.operations import drop_features
 

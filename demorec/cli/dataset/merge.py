@@ -14,7 +14,8 @@ from demorec.cli.shared.output import say
 from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +37,13 @@ class Merge(Edit):
     mapping: Path | None = None
     """Mapping file (TOML) for datasets that differ."""
 
-    def sources(self) -> Sequence[Source]:
+    def sources(self) -> Sequence[LeRobotFolder]:
         """The datasets in their order."""
-        from demorec.datasets.editing.plan import Source
+        from demorec.datasets.lerobot.folder import LeRobotFolder
 
-        return [Source(dataset_at(path)) for path in self.datasets]
+        return [LeRobotFolder(dataset_at(path)) for path in self.datasets]
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes, dataset after dataset."""
         from demorec.datasets.editing.merge import DatasetsDifferError, merge
 

@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING
 from demorec.cli.dataset.edit import EditOne, episode_numbers
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,13 +32,13 @@ class Reorder(EditOne):
     scores: Path | None = None
     """With --by score: file of demorec dataset score --out (auto: the dataset is scored)."""
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes in the new order."""
-        from demorec.cli.dataset.score import add_scores
+        from demorec.cli.dataset.score import scored_columns
         from demorec.datasets.editing.operations import reorder
 
-        add_scores(sources[0], {self.by}, self.scores)
-        return reorder(sources[0], self.by, episode_numbers(self.order), descending=self.descending)
+        rows = scored_columns(sources[0], {self.by}, self.scores) if self.by else ()
+        return reorder(sources[0], rows, self.by, episode_numbers(self.order), descending=self.descending)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +52,7 @@ class Shuffle(EditOne):
     seed: int = 0
     """Seed of the order."""
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes in an order that the seed decides."""
         from demorec.datasets.editing.operations import shuffle
 

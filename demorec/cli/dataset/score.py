@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from demorec.cli.dataset.edit import DatasetPath, dataset_at
 from demorec.cli.shared.output import counted, say, say_json, tell
@@ -16,7 +16,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.targets import OptionalTarget
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Source
+    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.datasets.scoring.score import EpisodeScore
 
 
@@ -42,14 +42,13 @@ class Score:
     def run(self) -> int:
         """Score, print, and write."""
         from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.datasets.lerobot.layout import DatasetInfo
-        from demorec.datasets.lerobot.modality import dataset_roles
+        from demorec.datasets.lerobot.folder import LeRobotFolder
         from demorec.datasets.scoring.score import score_dataset, to_json
 
         leave_pandas_out()
-        root = dataset_at(self.dataset)
-        tell(*dataset_roles(root, DatasetInfo.load(root), self.roles.named).notes())
-        found = score_dataset(root, self.roles.named) if self.out is None else self._written(root, self.out)
+        folder = LeRobotFolder(dataset_at(self.dataset), named=self.roles.named)
+        tell(*folder.roles.notes())
+        found = score_dataset(folder) if self.out is None else self._written(folder, self.out)
         if self.json:
             say_json(to_json(found))
         for episode in () if self.json else sorted(found, key=lambda episode: episode.score):
@@ -61,26 +60,29 @@ class Score:
             tell(f"Scores of {counted(len(found), 'episode')}: {self.out}")
         return 0
 
-    def _written(self, root: Path, out: Path) -> Sequence[EpisodeScore]:
+    def _written(self, folder: LeRobotFolder, out: Path) -> Sequence[EpisodeScore]:
         """Score, and write the scores to a file."""
         from demorec.datasets.scoring.score import SCORES, score_dataset, write_scores
 
         refuse_inside([out])
         if not out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {out.parent}.")
-        with atomic_write(out, SCORES, overwrite=self.overwrite, sources=[root]) as part:
-            found = score_dataset(root, self.roles.named)
+        with atomic_write(out, SCORES, overwrite=self.overwrite, sources=[folder.root]) as part:
+            found = score_dataset(folder)
             write_scores(part, found)
         return found
 
 
-def add_scores(source: Source, names: Collection[str], file: Path | None) -> None:
-    """Let a dataset have scores if `score` is among the names of columns, and no column of its own is called so."""
+def scored_columns(folder: LeRobotFolder, names: Collection[str], file: Path | None) -> list[dict[str, Any]]:
+    """Read the columns of a dataset's episodes, with `score` if that is among the names and no column of its own."""
+    from demorec.datasets.editing.episode_records import episode_columns
     from demorec.datasets.scoring.score import read_scores, score_dataset
 
-    if "score" not in names or any("score" in row for row in source.columns()):
-        return
+    columns = episode_columns(folder)
+    if "score" not in names or any("score" in row for row in columns):
+        return columns
     if file is None:
-        source.scores = {episode.episode_index: episode.score for episode in score_dataset(source.root)}
-        return
-    source.scores = read_scores(file, {place.episode_index: place.length for place in source.places})
+        scores = {episode.episode_index: episode.score for episode in score_dataset(folder)}
+    else:
+        scores = read_scores(file, {place.episode_index: place.length for place in folder.places})
+    return [row | {"score": scores.get(row["episode_index"])} for row in columns]

@@ -13,7 +13,8 @@ from demorec.cli.dataset.edit import CONDITION_HELP, EditOne, episode_numbers
 from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -26,13 +27,13 @@ class Chosen(EditOne):
     scores: Path | None = None
     """File of demorec dataset score --out, for conditions on the score (auto: the dataset is scored)."""
 
-    def chosen(self, source: Source) -> list[int]:
+    def chosen(self, source: LeRobotFolder) -> list[int]:
         """Numbers of the chosen episodes."""
-        from demorec.cli.dataset.score import add_scores
+        from demorec.cli.dataset.score import scored_columns
         from demorec.datasets.editing.operations import chosen, names_in
 
-        add_scores(source, names_in(self.where), self.scores)
-        return chosen(source, self.where, episode_numbers(self.episodes) if self.episodes else None)
+        rows = scored_columns(source, names_in(self.where), self.scores)
+        return chosen(source, rows, self.where, episode_numbers(self.episodes) if self.episodes else None)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,11 +46,11 @@ class Select(Chosen):
       demorec dataset select cups --episodes 0:50 --out first
     """
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """The chosen episodes."""
         return self._select(sources[0], drop=False)
 
-    def _select(self, source: Source, *, drop: bool) -> Plan:
+    def _select(self, source: LeRobotFolder, *, drop: bool) -> Plan:
         from demorec.datasets.editing.operations import select
 
         if not self.where and not self.episodes:
@@ -66,6 +67,6 @@ class Drop(Select):
       demorec dataset drop cups --where 'not success' --out successes
     """
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes but the chosen ones."""
         return self._select(sources[0], drop=True)

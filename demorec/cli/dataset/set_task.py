@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from demorec.cli.dataset.select import Chosen
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -24,7 +25,7 @@ class SetTask(Chosen):
     task: str = ""
     """The new instruction."""
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes, the chosen ones with the new instruction."""
         from demorec.datasets.editing.operations import set_task
 

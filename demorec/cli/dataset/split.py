@@ -11,7 +11,8 @@ from demorec.cli.dataset.edit import EditOne, pairs
 from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -36,13 +37,13 @@ class Split(EditOne):
         """Names of the parts."""
         return list(self._shares())
 
-    def plans(self, sources: Sequence[Source]) -> Mapping[str, Plan]:
+    def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """Name of each part -> its episodes."""
-        from demorec.cli.dataset.score import add_scores
+        from demorec.cli.dataset.score import scored_columns
         from demorec.datasets.editing.operations import split
 
-        add_scores(sources[0], {self.by}, self.scores)
-        return split(sources[0], self._shares(), self.seed, by=self.by)
+        rows = scored_columns(sources[0], {self.by}, self.scores)
+        return split(sources[0], rows, self._shares(), self.seed, by=self.by)
 
     def _shares(self) -> Mapping[str, float]:
         example = "--shares train=0.8 val=0.2"

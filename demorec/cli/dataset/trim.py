@@ -10,7 +10,8 @@ from demorec.cli.dataset.edit import EditOne
 from demorec.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan, Source
+    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -35,7 +36,7 @@ class Trim(EditOne):
     idle_margin: int = 3
     """With --idle: still frames to keep at either end."""
 
-    def plan(self, sources: Sequence[Source]) -> Plan:
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes, trimmed."""
         from demorec.datasets.editing import operations
 
@@ -46,12 +47,9 @@ class Trim(EditOne):
             return operations.trim_idle(sources[0], features, self.idle_threshold, self.idle_margin)
         return operations.trim(sources[0], self.head, self.tail)
 
-    def _state(self, source: Source) -> tuple[str, ...]:
+    def _state(self, source: LeRobotFolder) -> tuple[str, ...]:
         """The features that are the state; ConfigError if none is found."""
-        from demorec.datasets.lerobot.modality import dataset_roles
-        from demorec.episode.roles import NO_NAMES
-
-        found = dataset_roles(source.root, source.info, NO_NAMES).state
+        found = source.roles.state
         if not found:
             raise ConfigError(f"No state was found: name a feature by --idle-feature: {source.root}")
         return found

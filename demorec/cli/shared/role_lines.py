@@ -51,11 +51,10 @@ def _grippers(roles: Roles) -> list[str]:
 
 def roles_of_dataset(path: Path, named: NamedRoles) -> Roles | None:
     """The roles of its features; None where info.json cannot be understood."""
-    from demorec.datasets.lerobot.layout import DatasetInfo
-    from demorec.datasets.lerobot.modality import dataset_roles
+    from demorec.datasets.lerobot.folder import LeRobotFolder
 
     try:
-        return dataset_roles(path, DatasetInfo.load(path), named)
+        return LeRobotFolder(path, named=named).roles
     except ExportError:
         return None
 
@@ -85,12 +84,13 @@ def feature_rows(path: Path, info: Mapping[str, Any], roles: Roles | None) -> li
     types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
     if roles is None:
         return [("feature", "dtype", "shape"), *((name, *kind) for name, kind in types.items())]
+    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.datasets.lerobot.inspect import known_units
     from demorec.episode.roles import ROLES
 
     units: Mapping[str, tuple[str, ...]] = {}
     with suppress(ExportError):  # demorec check reports it
-        units = known_units(path)
+        units = known_units(LeRobotFolder(path))
     order: list[Role | None] = [None, *(role for role in ROLES if role is not None)]
     rows = [("role", "feature", "dtype", "shape", "elements", "units")]
     for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):

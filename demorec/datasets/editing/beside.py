@@ -18,13 +18,13 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing, sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
-from demorec.datasets.editing.plan import EpisodeSlice, Plan, Source
+from demorec.datasets.editing.plan import EpisodeSlice, Plan
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
-from demorec.datasets.lerobot.reader import EpisodeRows
-from demorec.datasets.lerobot.robots import read_robot
+from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.sidecar import (
     ATTEMPT_SCHEMA,
     CONFIGS_PATH,
@@ -43,16 +43,12 @@ ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes")
 _NAMED = 5
 
 
-def _moving_cameras(source: Source) -> tuple[str, ...] | None:
+def _moving_cameras(source: LeRobotFolder) -> tuple[str, ...] | None:
     """Cameras of whose every frame the pose is kept; None where the files do not agree."""
-    names = [open_table(path).schema_arrow.names for path in _pose_files(source)]
+    names = [open_table(path).schema_arrow.names for path in source.sidecar_tables("camera_poses")]
     if any(each != names[0] for each in names):
         return None
     return tuple(name for name in (names[0] if names else ()) if name not in _COUNTERS)
-
-
-def _pose_files(source: Source) -> list[Path]:
-    return tables_in(source.root, f"{SIDECAR_DIR}/camera_poses")
 
 
 def _poses_are_kept(plan: Plan) -> bool:
@@ -64,7 +60,7 @@ def _poses_are_kept(plan: Plan) -> bool:
 def _has_stages(plan: Plan) -> bool:
     """Whether progress is computed anew, from the stages that demorec wrote."""
     needed = {*STAGE_COLUMNS, "num_goals"}
-    return all(source.sidecar_tables and needed <= set(source.fact_types) for source in plan.sources)
+    return all(source.sidecar_tables("episodes") and needed <= set(source.fact_types) for source in plan.sources)
 
 
 def _progress_is_kept(plan: Plan) -> bool:
@@ -83,7 +79,7 @@ def _write_kept_progress(plan: Plan, folder: Path) -> None:
     if _has_stages(plan):
         write_progress(folder)
         return
-    sources = [EpisodeRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
+    sources = [IndexedRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
     schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
     tables = [schema.empty_table()]
     total = 0
@@ -116,12 +112,12 @@ class Beside(Closing):
         for source in plan.sources:
             if (source.root / CONFIGS_PATH).exists():
                 configs |= read_json(source.root / CONFIGS_PATH)
-        has_any = any(source.sidecar_tables for source in plan.sources)
+        has_any = any(source.sidecar_tables("episodes") for source in plan.sources)
         self._sidecar = SidecarWriter(folder, plan.info, configs) if has_any else None
         sources = plan.sources if has_any else ()
-        self._rows = [EpisodeRows(source.sidecar_tables, EPISODE_SCHEMA, rows=64) for source in sources]
+        self._rows = [IndexedRows(source.sidecar_tables("episodes"), EPISODE_SCHEMA, rows=64) for source in sources]
         with_poses = sources if _poses_are_kept(plan) else ()
-        self._poses = [EpisodeRows(_pose_files(source), rows=_ROWS_AT_ONCE) for source in with_poses]
+        self._poses = [IndexedRows(source.sidecar_tables("camera_poses"), rows=_ROWS_AT_ONCE) for source in with_poses]
         self._boxes = BoxWriter(folder, fps=plan.info.fps)
         self._stored_boxes = [
             {
@@ -166,7 +162,7 @@ class Beside(Closing):
         record = EpisodeRecord(
             row=row,
             moving_cameras=self._camera_poses(cut, index) if self._poses else {},
-            robot=None if robot is None else read_robot(source.root, str(robot)),
+            robot=None if robot is None else source.robot(str(robot)),
         )
         self._sidecar.add(episode_index, digest, record, attempt)
 
@@ -253,10 +249,11 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
 
 
 def _scenes(plan: Plan) -> Iterator[str]:
+    changed = [cut for cut in plan.cuts if not plan.keeps_scene(cut)]
     lost = 0
-    for cut in plan.cuts:
-        source = plan.sources[cut.source]
-        lost += source.has_scene(source.places[cut.episode].episode_index) and not plan.keeps_scene(cut)
+    for number, source in enumerate(plan.sources if changed else ()):
+        scenes = {row["episode_index"] for row in source.sidecar(["root_seed"]) if row["root_seed"] is not None}
+        lost += sum(source.places[cut.episode].episode_index in scenes for cut in changed if cut.source == number)
     if lost:
         yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
 

@@ -11,18 +11,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.datasets.editing.content import TASK, ContentReader, Shared, moving_columns, row_hashes
-from demorec.datasets.editing.plan import Source
 from demorec.datasets.lerobot.depth import LARGEST_CODE
-from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
+from demorec.datasets.lerobot.folder import LeRobotFolder
 
 Level = Literal["info", "features", "tasks", "episodes", "rows", "images", "statistics"]
 LEVELS: tuple[Level, ...] = ("info", "features", "tasks", "episodes", "rows", "images", "statistics")
+Folders = tuple[LeRobotFolder, LeRobotFolder]
+"""Datasets A and B."""
 _WORST = 3
 """Images that are named."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class Difference:
+class DiffEntry:
     """One thing in which dataset B differs from dataset A.
 
     Attributes:
@@ -57,16 +58,10 @@ class Difference:
 class EpisodeComparer:
     """Compares pairs of episodes of two datasets, A and B."""
 
-    def __init__(
-        self, sources: tuple[Source, Source], readers: tuple[ContentReader, ContentReader], shared: Shared
-    ) -> None:
+    def __init__(self, sources: Folders, readers: tuple[ContentReader, ContentReader], shared: Shared) -> None:
         self._sources, self._readers, self._shared = sources, readers, shared
-        self._stored = [
-            {name: StoredImages(source.info, own) for name in shared.cameras
-             if not source.info.features[own := shared.own(side, name)].is_video} for side, source in enumerate(sources)
-        ]  # fmt: skip
 
-    def differences(self, a: int, b: int, images_equal: Mapping[str, bool]) -> Iterator[Difference]:
+    def differences(self, a: int, b: int, images_equal: Mapping[str, bool]) -> Iterator[DiffEntry]:
         """Between episode `a` of A and `b` of B; ExportError when something cannot be read.
 
         `images_equal` says of each camera feature whether its encoded images are known to be the same.
@@ -77,7 +72,7 @@ class EpisodeComparer:
         starts, count = (0, 0), lengths[0]
         if lengths[0] != lengths[1]:
             difference, starts, count = _lengths(one, other, lengths)
-            yield Difference(level="episodes", name="length", text=difference, episodes=(a, b),
+            yield DiffEntry(level="episodes", name="length", text=difference, episodes=(a, b),
                              details={"frames_a": lengths[0], "frames_b": lengths[1]})  # fmt: skip
         else:
             for name in one:
@@ -89,7 +84,7 @@ class EpisodeComparer:
             if found := self._images(name, (a, b), starts, count):
                 yield found
 
-    def _rows(self, name: str, a: NDArray[Any], b: NDArray[Any], episodes: tuple[int, int]) -> Difference | None:
+    def _rows(self, name: str, a: NDArray[Any], b: NDArray[Any], episodes: tuple[int, int]) -> DiffEntry | None:
         is_number = a.dtype.kind in "fiub" and b.dtype.kind in "fiub"
         unequal = a != b
         if is_number:
@@ -102,7 +97,7 @@ class EpisodeComparer:
         text = f"{name} differs in {len(frames)} of {len(a)} frames, first in frame {first}"
         if name == TASK:
             pairs = sorted({(str(x), str(y)) for x, y in zip(a.ravel(), b.ravel(), strict=True) if x != y})
-            return Difference(level="rows", name=name, episodes=episodes, details={**details, "texts": pairs},
+            return DiffEntry(level="rows", name=name, episodes=episodes, details={**details, "texts": pairs},
                               text=f"{text}: {pairs[0][0]!r} and {pairs[0][1]!r}")  # fmt: skip
         if is_number:
             size = np.abs(a.astype(np.float64) - b.astype(np.float64))
@@ -115,9 +110,9 @@ class EpisodeComparer:
             text += (
                 f", most in frame {frame}{f' ({called})' if a.shape[1] > 1 else ''}: {values[0]!r} and {values[1]!r}"
             )
-        return Difference(level="rows", name=name, text=text, episodes=episodes, details=details)
+        return DiffEntry(level="rows", name=name, text=text, episodes=episodes, details=details)
 
-    def _images(self, name: str, episodes: tuple[int, int], starts: tuple[int, int], count: int) -> Difference | None:
+    def _images(self, name: str, episodes: tuple[int, int], starts: tuple[int, int], count: int) -> DiffEntry | None:
         """Between images, decoded; those of a cut episode are aligned by `starts`."""
         is_depth = [
             source.info.features[self._shared.own(side, name)].is_depth for side, source in enumerate(self._sources)
@@ -129,7 +124,7 @@ class EpisodeComparer:
         for frame, (a, b) in enumerate(islice(zip(one, other, strict=False), count), start=starts[0]):
             if a.shape != b.shape:
                 text = f"{name} has {a.shape[1]}x{a.shape[0]} pixels, {b.shape[1]}x{b.shape[0]} in B"
-                return Difference(level="images", name=name, text=text, episodes=episodes)
+                return DiffEntry(level="images", name=name, text=text, episodes=episodes)
             if not np.array_equal(a, b):
                 found.append((_psnr(a, b, LARGEST_CODE if is_depth[0] else 255), frame))
         if not found:
@@ -137,7 +132,7 @@ class EpisodeComparer:
         first = found[0][1]
         worst = sorted(found)[:_WORST]
         named = ", ".join(f"frame {frame} ({psnr:.1f} dB)" for psnr, frame in worst)
-        return Difference(
+        return DiffEntry(
             level="images",
             name=name,
             text=f"{name} differs in {len(found)} of {count} images, first in frame {first}, worst by PSNR: {named}",
@@ -153,8 +148,8 @@ class EpisodeComparer:
         source, own = self._sources[side], self._shared.own(side, name)
         place, feature = source.places[number], source.info.features[own]
         if not feature.is_video:
-            return islice(self._stored[side][name].read(place), start, None)
-        video = EpisodeVideo(source.info, own, place)
+            return islice(source.stored_images[own].read(place), start, None)
+        video = source.video(own, place)
         return video.codes(start) if feature.is_depth else video.images(start)
 
 

@@ -10,19 +10,15 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.editing.packets import video_files
-from demorec.datasets.editing.plan import Source
-from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
-from demorec.datasets.lerobot.reader import EpisodePlace, RowStream, column_values
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 
 TASK = "task"
 """Column of the instructions, in place of `task_index`."""
@@ -54,7 +50,7 @@ class Shared:
         return self.names.get(name, name) if side else name
 
     @classmethod
-    def of(cls, a: Source, b: Source, names: Mapping[str, str]) -> Shared:
+    def of(cls, a: LeRobotFolder, b: LeRobotFolder, names: Mapping[str, str]) -> Shared:
         """Of two datasets."""
         pairs = {name: (item, b.info.features[own]) for name, item in a.info.features.items()
                  if (own := names.get(name, name)) in b.info.features}  # fmt: skip
@@ -101,14 +97,13 @@ class ContentReader:
         side: Whether it is the first (0) or the second (1) dataset.
     """
 
-    def __init__(self, source: Source, shared: Shared, *, side: int) -> None:
+    def __init__(self, source: LeRobotFolder, shared: Shared, *, side: int) -> None:
         self._source, self._shared = source, shared
         self._own = {name: shared.own(side, name) for name in (*shared.columns, *shared.cameras)}
         features = source.info.features
         self._stored = [name for name in shared.cameras if not features[self._own[name]].is_video]
         columns = [self._own[name] for name in (*shared.columns, *self._stored)]
-        self._rows = RowStream(source.info, columns)
-        self._open_video = video_files()
+        self._rows = source.rows(columns)
 
     def __len__(self) -> int:
         return len(self._source.places)
@@ -116,10 +111,9 @@ class ContentReader:
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
         """Column -> (T, D) numbers, or (T, 1) texts; of language and stored images digests of each row."""
         place = self._source.places[number]
-        table, features, found = self._rows.read(place), self._source.info.features, {}
+        rows, found = self._rows.numbers(place), {}
         for name in (*self._shared.columns, *self._stored):
-            own = self._own[name]
-            values = _values(table.column(own).combine_chunks(), features[own], self._source.root)
+            values = rows[self._own[name]]
             if name == "index":
                 values = values - place.from_index
             elif name == "episode_index":
@@ -153,8 +147,7 @@ class ContentReader:
 
     def _packets(self, name: str, place: EpisodePlace) -> bytes | None:
         try:
-            path, _ = place.videos[self._own[name]]
-            video = self._open_video(path, self._source.info.fps).cut(place, self._own[name], 0, place.length)
+            video = self._source.video(self._own[name], place).cut()
             sets = video.parameter_sets()
         except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
             return None
@@ -162,21 +155,6 @@ class ContentReader:
             f"{video.codec} {video.width} {video.height} {video.lead} {video.tail} {video.sizes.tolist()} {len(sets)}"
         )
         return hashlib.sha256(b"".join((head.encode(), sets, video.read()))).digest()
-
-
-def _values(array: Any, feature: DatasetFeature, root: Path) -> NDArray[Any]:
-    array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
-    try:
-        if feature.dtype == "language":
-            return column_digests(array)
-        if feature.dtype == "image":
-            digests = [hashlib.sha256(data or b"").hexdigest() for data in array.field("bytes").to_pylist()]
-            return np.array(digests, dtype=np.str_).reshape(-1, 1)
-        return column_values(array)
-    except (ValueError, TypeError, KeyError, pa.ArrowException) as error:
-        raise ExportError(
-            f"A column holds something else than info.json says ({describe_error(error)}): {root}"
-        ) from error
 
 
 def _digest(values: NDArray[Any]) -> bytes:

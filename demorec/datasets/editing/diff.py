@@ -11,11 +11,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.datasets.editing.compare import LEVELS, Difference, EpisodeComparer
+from demorec.datasets.editing.compare import LEVELS, DiffEntry, EpisodeComparer, Folders
 from demorec.datasets.editing.content import TASK, ContentReader, EpisodeContent, Shared, matched
-from demorec.datasets.editing.plan import Source
+from demorec.datasets.editing.episode_records import episode_columns, episode_facts
 from demorec.datasets.editing.statistics import episode_statistics_differences, renamed, statistics_differences
 from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera, StoredBoxes
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.options import ProgressCallback
 
@@ -40,7 +41,7 @@ class DatasetDiff:
     pairs: Mapping[int, int]
     num_episodes: tuple[int, int]
     num_same: int
-    differences: tuple[Difference, ...]
+    differences: tuple[DiffEntry, ...]
     notes: tuple[str, ...]
 
     @property
@@ -74,13 +75,13 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
     Raises:
         ExportError: One is damaged.
     """
-    sources = (Source(a), Source(b))
+    sources = (LeRobotFolder(a), LeRobotFolder(b))
     shared = Shared.of(*sources, renamed(*sources))
     readers = (ContentReader(sources[0], shared, side=0), ContentReader(sources[1], shared, side=1))
     contents = _contents(readers, progress)
     pairs = matched(*contents)
     changed = {n: m for n, m in pairs.items() if not contents[0][n].equals(contents[1][m])}
-    found: list[Difference] = []
+    found: list[DiffEntry] = []
     comparer = EpisodeComparer(sources, readers, shared)
     for n, m in changed.items():
         one, other = contents[0][n].images, contents[1][m].images
@@ -121,25 +122,25 @@ def _contents(
     return found
 
 
-def _one_sided(sources: tuple[Source, Source], episode: tuple[int | None, int | None]) -> Difference:
+def _one_sided(sources: Folders, episode: tuple[int | None, int | None]) -> DiffEntry:
     side = 0 if episode[1] is None else 1
     number = episode[side]
     assert number is not None
     length = sources[side].places[number].length
     name = "missing" if side == 0 else "extra"
-    return Difference(level="episodes", name=name, episodes=episode, details={"frames": length},
+    return DiffEntry(level="episodes", name=name, episodes=episode, details={"frames": length},
                       text=f"episode {number} of {'AB'[side]}, {length} frames, is not in {'BA'[side]}")  # fmt: skip
 
 
 def _tasks(
-    sources: tuple[Source, Source],
-    found: Sequence[Difference],
+    sources: Folders,
+    found: Sequence[DiffEntry],
     unmatched: Sequence[tuple[int | None, int | None]],
-) -> list[Difference]:
+) -> list[DiffEntry]:
     """The differences so far, less those that a reworded task explains, and what differs in the tables of tasks."""
     tables = tuple(set(source.tasks) for source in sources)
     only = (tables[0] - tables[1], tables[1] - tables[0])
-    kept: list[Difference] = []
+    kept: list[DiffEntry] = []
     reworded: dict[tuple[str, str], list[int]] = {}
     for item in found:
         pairs = item.details.get("texts", ()) if item.name == TASK and item.level == "rows" else ()
@@ -149,7 +150,7 @@ def _tasks(
         else:
             kept.append(item)
     for (x, y), episodes in sorted(reworded.items()):
-        kept.append(Difference(level="tasks", name=x, text=f"{x!r} is {y!r} in B", details={"b": y, "of": episodes}))
+        kept.append(DiffEntry(level="tasks", name=x, text=f"{x!r} is {y!r} in B", details={"b": y, "of": episodes}))
     for side in (0, 1):
         explained = {pair[side] for pair in reworded}
         for item in kept:
@@ -158,31 +159,24 @@ def _tasks(
             if (number := episode[side]) is not None:
                 explained |= set(sources[side].places[number].tasks)
         for task in sorted(only[side] - explained):
-            kept.append(Difference(level="tasks", name=task, text=f"{task!r} is not in {'BA'[side]}"))
+            kept.append(DiffEntry(level="tasks", name=task, text=f"{task!r} is not in {'BA'[side]}"))
     return kept
 
 
-def _info(sources: tuple[Source, Source]) -> Iterator[Difference]:
+def _info(sources: Folders) -> Iterator[DiffEntry]:
     a, b = (source.info for source in sources)
     others = [{name: value for name, value in info.other.items() if name not in _OLD_TOTALS} for info in (a, b)]
     values = [{"fps": info.fps, "robot_type": info.robot_type, **other}
               for info, other in zip((a, b), others, strict=True)]  # fmt: skip
     yield from _fields("info", "", values)
-    for name in ("total_episodes", "total_frames", "total_tasks"):
-        claims = [getattr(info, name) for info in (a, b)]
-        counts = [_count(source, name) for source in sources]
-        if claims[0] - counts[0] != claims[1] - counts[1]:
-            text = f"{name} is {claims[0]} for {counts[0]} that are there, in B {claims[1]} for {counts[1]}"
-            yield Difference(level="info", name=name, text=text, details={"a": claims[0], "b": claims[1]})
+    claims = [info.total_tasks for info in (a, b)]
+    counts = [len(source.tasks) for source in sources]
+    if claims[0] - counts[0] != claims[1] - counts[1]:
+        text = f"total_tasks is {claims[0]} for {counts[0]} that are there, in B {claims[1]} for {counts[1]}"
+        yield DiffEntry(level="info", name="total_tasks", text=text, details={"a": claims[0], "b": claims[1]})
 
 
-def _count(source: Source, total: str) -> int:
-    if total == "total_frames":
-        return sum(place.length for place in source.places)
-    return len(source.tasks if total == "total_tasks" else source.places)
-
-
-def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterator[Difference]:
+def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterator[DiffEntry]:
     """What two objects have under the same names."""
     a, b = values
     for name in dict.fromkeys((*a, *b)):
@@ -191,21 +185,21 @@ def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterato
         shown = [repr(side[name]) if name in side else "not there" for side in (a, b)]
         shown = [text if len(text) <= 120 else f"{text[:120]}..." for text in shown]
         text = f"{of}{name} is {shown[0]}, in B {shown[1]}"
-        yield Difference(level=level, name=f"{of}{name}", text=text)
+        yield DiffEntry(level=level, name=f"{of}{name}", text=text)
 
 
 def _is_equal(a: Any, b: Any) -> bool:
     return bool(a == b) or (a != a and b != b)
 
 
-def _features(sources: tuple[Source, Source], shared: Shared) -> Iterator[Difference]:
+def _features(sources: Folders, shared: Shared) -> Iterator[DiffEntry]:
     a, b = (source.info.features for source in sources)
     for name, other in shared.names.items():
-        yield Difference(level="features", name=name, text=f"{name} is called {other} in B", details={"b": other})
+        yield DiffEntry(level="features", name=name, text=f"{name} is called {other} in B", details={"b": other})
     for name in dict.fromkeys((*a, *(other for other in b if other not in shared.names.values()))):
         own = shared.own(1, name)
         if name not in a or own not in b:
-            yield Difference(level="features", name=name, text=f"{name} is not in {'A' if name not in a else 'B'}")
+            yield DiffEntry(level="features", name=name, text=f"{name} is not in {'A' if name not in a else 'B'}")
             continue
         is_same_type = a[name].dtype == b[own].dtype
         yield from _fields("features", f"{name}: ", [_described(item, is_same_type) for item in (a[name], b[own])])
@@ -217,38 +211,39 @@ def _described(feature: DatasetFeature, with_encoding: bool) -> dict[str, Any]:
 
 
 def _facts(
-    sources: tuple[Source, Source], pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
-) -> Iterator[Difference]:
+    sources: Folders, pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
+) -> Iterator[DiffEntry]:
     """What the tables of episodes and demorec's sidecar state of the same episode."""
     rows = [
-        [{**row, **facts} for row, facts in zip(source.columns(), source.facts(), strict=True)] for source in sources
+        [{**row, **facts} for row, facts in zip(episode_columns(source), episode_facts(source), strict=True)]
+        for source in sources
     ]
     names = [{name for row in side for name in row} - _FOLLOWS for side in rows]
     for name in sorted(names[0] ^ names[1]):
         side = 0 if name in names[0] else 1
         if any(row.get(name) is not None for row in rows[side]):
-            yield Difference(level="episodes", name=name, text=f"the column {name} is not in {'BA'[side]}")
+            yield DiffEntry(level="episodes", name=name, text=f"the column {name} is not in {'BA'[side]}")
     is_same_rate = sources[0].info.fps == sources[1].info.fps
     for n, m in pairs.items():
         one, other = rows[0][n], rows[1][m]
         if one["tasks"] != other["tasks"] and contents[0][n].rows[TASK] == contents[1][m].rows[TASK]:
             text = f"its tasks are {one['tasks']} in the table of episodes, {other['tasks']} in B"
-            yield Difference(level="episodes", name="tasks", text=text, episodes=(n, m))
+            yield DiffEntry(level="episodes", name="tasks", text=text, episodes=(n, m))
         is_same_length = one["length"] == other["length"] and is_same_rate
         for name in sorted(names[0] & names[1] - (set() if is_same_length else {"duration_s"})):
             if not _is_equal(one.get(name), other.get(name)):
                 text = f"{name} is {one.get(name)!r}, in B {other.get(name)!r}"
-                yield Difference(level="episodes", name=name, text=text, episodes=(n, m))
+                yield DiffEntry(level="episodes", name=name, text=text, episodes=(n, m))
 
 
-def _boxes(sources: tuple[Source, Source], shared: Shared, pairs: Mapping[int, int]) -> Iterator[Difference]:
+def _boxes(sources: Folders, shared: Shared, pairs: Mapping[int, int]) -> Iterator[DiffEntry]:
     """What stands in the files of boxes about episodes of one length."""
     for name in shared.cameras:
         paths = [source.root / BOXES_DIR / f"{shared.own(side, name)}.json" for side, source in enumerate(sources)]
         there = [path.is_file() for path in paths]
         if there[0] != there[1]:
             text = f"boxes of {name} are not in {'BA'[there[1]]}"
-            yield Difference(level="features", name=f"boxes of {name}", text=text)
+            yield DiffEntry(level="features", name=f"boxes of {name}", text=text)
         if not all(there):
             continue
         files = [
@@ -261,7 +256,7 @@ def _boxes(sources: tuple[Source, Source], shared: Shared, pairs: Mapping[int, i
             if lengths[0] == lengths[1] and seen[0] != seen[1]:
                 frames = [frame for frame in range(lengths[0]) if _seen_at(seen[0], frame) != _seen_at(seen[1], frame)]
                 where = f" in {len(frames)} of {lengths[0]} frames, first in frame {frames[0]}" if frames else ""
-                yield Difference(level="rows", name=f"boxes of {name}", episodes=(n, m), details={"frames": frames},
+                yield DiffEntry(level="rows", name=f"boxes of {name}", episodes=(n, m), details={"frames": frames},
                                  text=f"boxes of {name} differ{where}")  # fmt: skip
 
 
@@ -269,7 +264,7 @@ def _seen_at(seen: SeenByCamera | None, frame: int) -> list[Any]:
     return [] if seen is None else [(noun, values) for row, noun, values in seen[2] if row == frame]
 
 
-def _notes(sources: tuple[Source, Source], result: DatasetDiff, found: Sequence[Difference]) -> Iterator[str]:
+def _notes(sources: Folders, result: DatasetDiff, found: Sequence[DiffEntry]) -> Iterator[str]:
     a, b = (source.info for source in sources)
     if result.is_reordered:
         moved = [f"{n} is {m}" for n, m in result.pairs.items() if n != m]

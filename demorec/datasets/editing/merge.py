@@ -27,7 +27,8 @@ from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.registry import check_choice, nearest_match
 from demorec.datasets.editing.operations import joined
-from demorec.datasets.editing.plan import FeatureMapping, Plan, Source
+from demorec.datasets.editing.plan import FeatureMapping, Plan
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 
 _UNITS = ("rad", "degree", "normalised")
@@ -52,7 +53,7 @@ class DatasetsDifferError(ConfigError):
         return str(self.args[0])
 
 
-def merge(sources: Sequence[Source], mapping: Path | None = None) -> Plan:
+def merge(sources: Sequence[LeRobotFolder], mapping: Path | None = None) -> Plan:
     """All episodes of all datasets, one after the other.
 
     Raises:

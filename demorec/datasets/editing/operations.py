@@ -12,10 +12,10 @@ import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
 from demorec.core.registry import check_choice, nearest_match
-from demorec.datasets.editing.plan import FeatureMapping, Plan, Source
+from demorec.datasets.editing.plan import FeatureMapping, Plan
 from demorec.datasets.lerobot.files import column_numbers
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
-from demorec.datasets.lerobot.reader import RowStream
 
 _SHARE_TOLERANCE = 1e-6
 _MAX = 2000
@@ -36,9 +36,12 @@ _Value = Callable[[Mapping[str, Any]], Any]
 """Value of a part of a condition, by an episode's columns."""
 
 
-def chosen(source: Source, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:
+Rows = Sequence[Mapping[str, Any]]
+"""Values of each episode in order, as `episode_columns` reads them."""
+
+
+def chosen(source: LeRobotFolder, rows: Rows, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:
     """Numbers of the episodes for which a condition holds, and that are among some; ConfigError for impossible ones."""
-    rows = source.columns()
     if episodes is not None and (wrong := [number for number in episodes if not 0 <= number < len(rows)]):
         raise ConfigError(f"There is no episode {wrong[0]}: the dataset has 0 to {len(rows) - 1}: {source.root}")
     found = list(range(len(rows))) if episodes is None else list(dict.fromkeys(episodes))
@@ -48,7 +51,7 @@ def chosen(source: Source, where: str = "", episodes: Sequence[int] | None = Non
     return found
 
 
-def _names(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+def _names(rows: Rows) -> list[str]:
     return list(dict.fromkeys(name for row in rows for name in row))
 
 
@@ -57,14 +60,16 @@ def _no_column(name: str, names: Sequence[str]) -> ConfigError:
     return ConfigError(f"There is no column {name!r}.{nearest_match(name, names)} There are: {listed}.")
 
 
-def select(source: Source, numbers: Sequence[int], *, drop: bool = False) -> Plan:
+def select(source: LeRobotFolder, numbers: Sequence[int], *, drop: bool = False) -> Plan:
     """Those episodes, in the dataset's order, or all others."""
     plan = Plan.whole(source)
     wanted = set(numbers)
     return plan.with_cuts([cut for cut in plan.cuts if (cut.episode in wanted) != drop])
 
 
-def reorder(source: Source, by: str = "", order: Sequence[int] = (), *, descending: bool = False) -> Plan:
+def reorder(
+    source: LeRobotFolder, rows: Rows = (), by: str = "", order: Sequence[int] = (), *, descending: bool = False
+) -> Plan:
     """All episodes, sorted by a column, those without a value last, or in a given order."""
     plan = Plan.whole(source)
     if bool(by) == bool(order):
@@ -73,7 +78,6 @@ def reorder(source: Source, by: str = "", order: Sequence[int] = (), *, descendi
         if sorted(order) != list(range(len(plan.cuts))):
             raise ConfigError(f"--order names each of the {len(plan.cuts)} episodes once, from 0 on.")
         return plan.with_cuts([plan.cuts[number] for number in order])
-    rows = source.columns()
     if by not in (names := _names(rows)):
         raise _no_column(by, names)
     known = [number for number, row in enumerate(rows) if row.get(by) is not None]
@@ -85,7 +89,7 @@ def reorder(source: Source, by: str = "", order: Sequence[int] = (), *, descendi
     return plan.with_cuts([plan.cuts[number] for number in (*known, *rest)])
 
 
-def shuffle(source: Source, seed: int) -> Plan:
+def shuffle(source: LeRobotFolder, seed: int) -> Plan:
     """All episodes in an order that the seed decides."""
     check_seed("seed", seed)
     plan = Plan.whole(source)
@@ -93,7 +97,7 @@ def shuffle(source: Source, seed: int) -> Plan:
     return plan.with_cuts([plan.cuts[number] for number in order])
 
 
-def trim(source: Source, head: int, tail: int) -> Plan:
+def trim(source: LeRobotFolder, head: int, tail: int) -> Plan:
     """Every episode without its first and last frames."""
     if min(head, tail) < 0:
         raise ConfigError("A number of frames is cut off, at least 0.")
@@ -104,7 +108,7 @@ def trim(source: Source, head: int, tail: int) -> Plan:
     return plan.with_cuts([replace(cut, first=head, last=cut.last - tail) for cut in plan.cuts])
 
 
-def trim_idle(source: Source, features: Sequence[str], threshold: float, margin: int) -> Plan:
+def trim_idle(source: LeRobotFolder, features: Sequence[str], threshold: float, margin: int) -> Plan:
     """Every episode without the frames in which nothing moves at its beginning and end.
 
     Args:
@@ -120,7 +124,7 @@ def trim_idle(source: Source, features: Sequence[str], threshold: float, margin:
         raise OptionError("idle_threshold", f"is {threshold}, allowed are shares above 0 and up to 1.")
     check_option("idle_margin", margin, 0, 2**63 - 1, "frames")
     plan = Plan.whole(source)
-    rows = RowStream(source.info, features)
+    rows = source.rows(features)
 
     def numbers() -> Any:
         for cut in plan.cuts:
@@ -146,7 +150,9 @@ def trim_idle(source: Source, features: Sequence[str], threshold: float, margin:
     return plan.with_cuts(cuts)
 
 
-def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "") -> dict[str, Plan]:
+def split(
+    source: LeRobotFolder, rows: Rows, shares: Mapping[str, float], seed: int, *, by: str = ""
+) -> dict[str, Plan]:
     """Name -> part of the dataset; each value of the column `by` is shared out alike, and every part has episodes.
 
     Episodes stay in the dataset's order. Raises ConfigError for impossible shares.
@@ -157,7 +163,7 @@ def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "
         raise ConfigError(
             f"Shares are two or more numbers above 0 whose sum is 1, not {total:g}, such as train=0.8 val=0.2."
         )
-    plan, rows = Plan.whole(source), source.columns()
+    plan = Plan.whole(source)
     if by and by not in (names := _names(rows)):
         raise _no_column(by, names)
     groups: dict[str, list[int]] = {}
@@ -176,7 +182,7 @@ def split(source: Source, shares: Mapping[str, float], seed: int, *, by: str = "
     return {name: plan.with_cuts([plan.cuts[number] for number in sorted(numbers)]) for name, numbers in found.items()}
 
 
-def set_task(source: Source, task: str, numbers: Sequence[int]) -> Plan:
+def set_task(source: LeRobotFolder, task: str, numbers: Sequence[int]) -> Plan:
     """All episodes, some with another instruction."""
     if not task.strip() or not task.isprintable():
         raise ConfigError("An instruction is a line of text, such as --task 'pick up the cup'.")
@@ -187,7 +193,7 @@ def set_task(source: Source, task: str, numbers: Sequence[int]) -> Plan:
     return plan.with_cuts([replace(cut, task=task) if cut.episode in wanted else cut for cut in plan.cuts])
 
 
-def rename(source: Source, names: Mapping[str, str]) -> Plan:
+def rename(source: LeRobotFolder, names: Mapping[str, str]) -> Plan:
     """All episodes with features under other names; ConfigError for names that are not there, fixed or taken."""
     plan = Plan.whole(source)
     _check_features(source, names)
@@ -202,7 +208,7 @@ def rename(source: Source, names: Mapping[str, str]) -> Plan:
     return plan.with_features(features, mappings)
 
 
-def drop_features(source: Source, names: Sequence[str]) -> Plan:
+def drop_features(source: LeRobotFolder, names: Sequence[str]) -> Plan:
     """All episodes without some features."""
     plan = Plan.whole(source)
     if not names:
@@ -215,12 +221,12 @@ def drop_features(source: Source, names: Sequence[str]) -> Plan:
     return plan.with_features(features, mappings)
 
 
-def _check_features(source: Source, names: Mapping[str, str] | Sequence[str]) -> None:
+def _check_features(source: LeRobotFolder, names: Mapping[str, str] | Sequence[str]) -> None:
     for name in names:
         check_choice("feature that can be changed", name, _own(source))
 
 
-def _own(source: Source) -> list[str]:
+def _own(source: LeRobotFolder) -> list[str]:
     """Its features but for those that each dataset has."""
     return [name for name in source.info.features if name not in AUTOMATIC_FEATURES]
 

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.editing.compare import Difference
+from demorec.datasets.editing.compare import DiffEntry, Folders
 from demorec.datasets.editing.content import TASK, Shared
-from demorec.datasets.editing.plan import Source
-from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.editing.episode_records import episode_statistics
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES
 
@@ -22,7 +21,7 @@ _TOLERANCE = 1e-6
 """Relative to the larger value or the feature's range: some writers sum in float32, and in the order of episodes."""
 
 
-def renamed(a: Source, b: Source) -> dict[str, str]:
+def renamed(a: LeRobotFolder, b: LeRobotFolder) -> dict[str, str]:
     """Features of A that B has under another name: of the same type, shape and elements, with the same statistics."""
     gone = [name for name in a.info.features if name not in b.info.features]
     new = [name for name in b.info.features if name not in a.info.features]
@@ -44,8 +43,8 @@ def renamed(a: Source, b: Source) -> dict[str, str]:
 
 
 def statistics_differences(
-    sources: tuple[Source, Source], shared: Shared, found: Sequence[Difference], *, is_reordered: bool
-) -> Iterator[Difference]:
+    sources: Folders, shared: Shared, found: Sequence[DiffEntry], *, is_reordered: bool
+) -> Iterator[DiffEntry]:
     """Of features whose rows and images are all the same: else statistics differ as they should."""
     tables = [_stats(source) for source in sources]
     if any(not table and source.info.is_old for table, source in zip(tables, sources, strict=True)):
@@ -68,13 +67,13 @@ def statistics_differences(
         a, b = (entry if isinstance(entry, dict) else {} for entry in entries)
         wrong = [key for key in dict.fromkeys((*a, *b)) if not _is_close(a, b, key)]
         if wrong:
-            yield Difference(level="statistics", name=name, details={"of": wrong},
+            yield DiffEntry(level="statistics", name=name, details={"of": wrong},
                              text=f"{name} differs in {', '.join(wrong)}: {_worst(a, b, wrong[0])}")  # fmt: skip
 
 
 def episode_statistics_differences(
-    sources: tuple[Source, Source], shared: Shared, found: Sequence[Difference], pairs: Mapping[int, int]
-) -> Iterator[Difference]:
+    sources: Folders, shared: Shared, found: Sequence[DiffEntry], pairs: Mapping[int, int]
+) -> Iterator[DiffEntry]:
     """Of each episode, as the table of episodes has them, where the rows or images of the feature are the same."""
     if any(source.info.is_old for source in sources):
         return
@@ -87,7 +86,7 @@ def episode_statistics_differences(
         if not tables[0] or not tables[1]:
             if tables[0] or tables[1]:
                 text = f"{name} has statistics of all its episodes only in {'B' if tables[1] else 'A'}"
-                yield Difference(level="statistics", name=name, text=text)
+                yield DiffEntry(level="statistics", name=name, text=text)
             continue
         wrong = [
             (n, m, keys)
@@ -100,27 +99,18 @@ def episode_statistics_differences(
             shown = _worst(tables[0][n], tables[1][m], keys[0])
             text = f"{name} of {len(wrong)} of {len(pairs)} episodes, in episode {n} {', '.join(keys)}: {shown}"
             of = [key for key in NAMES if any(key in keys for _, _, keys in wrong)]
-            yield Difference(level="statistics", name=name, text=text,
+            yield DiffEntry(level="statistics", name=name, text=text,
                              details={"of": of, "episodes": [[n, m] for n, m, _ in wrong]})  # fmt: skip
 
 
-def _of_episodes(source: Source, name: str) -> list[Mapping[str, Any]]:
+def _of_episodes(source: LeRobotFolder, name: str) -> list[Mapping[str, Any]]:
     """The statistics of a feature by episode in order; empty unless each episode has all ten."""
-    found = [entry for _, _, entry in source.statistics([name])]
+    found = [entry for _, _, entry in episode_statistics(source, [name])]
     return found if len(found) == len(source.places) else []
 
 
-def _stats(source: Source) -> dict[str, Any]:
-    path = source.root / STATS_PATH
-    if not path.exists():
-        return {}
-    try:
-        found = read_json(path)
-        if not isinstance(found, dict):
-            raise ValueError("it is no object")
-    except (OSError, ValueError) as error:
-        raise ExportError(f"The statistics cannot be read ({describe_error(error)}): {path}") from error
-    return found
+def _stats(source: LeRobotFolder) -> Mapping[str, Any]:
+    return source.statistics if (source.root / STATS_PATH).exists() else {}
 
 
 def _is_close(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:

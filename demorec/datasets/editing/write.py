@@ -19,17 +19,19 @@ from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
 from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
-from demorec.datasets.editing.packets import OpenVideo, video_files
-from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan, Source
+from demorec.datasets.editing.episode_records import episode_statistics
+from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan
+from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
-from demorec.datasets.lerobot.files import column_numbers
+from demorec.datasets.lerobot.files import column_numbers, tables_in
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.paths import DATASET
-from demorec.datasets.lerobot.reader import EpisodePlace, EpisodeRows, RowStream
+from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
-from demorec.datasets.lerobot.videos import EpisodeVideo, StoredImages
+from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
 
@@ -43,7 +45,7 @@ _OF_THE_END = ("next.done", "next.success", "next.reward")
 
 
 def new_datasets(
-    outs: Sequence[Path], sources: Sequence[Source], *, overwrite: bool
+    outs: Sequence[Path], sources: Sequence[LeRobotFolder], *, overwrite: bool
 ) -> AbstractContextManager[Sequence[Path]]:
     """Give a folder for each new dataset; all appear together when the block ends without an error.
 
@@ -59,7 +61,7 @@ def new_datasets(
     return atomic_write_all(outs, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
 
 
-def check_target(out: Path, sources: Sequence[Source], *, overwrite: bool) -> None:
+def check_target(out: Path, sources: Sequence[LeRobotFolder], *, overwrite: bool) -> None:
     """Raise ConfigError if `new_datasets` would, since something is in the way at `out`."""
     check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
 
@@ -84,8 +86,7 @@ def write_plan(
         OSError: The dataset cannot be written.
     """
     roots = [source.root for source in plan.sources]
-    open_video = video_files()
-    readers = [_Reader(plan, number, open_video, decode=decode) for number in range(len(plan.sources))]
+    readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
     with (
         DatasetWriter(folder, plan.info, _fact_types(plan)) as writer,
         Beside(plan, folder) as beside,
@@ -117,23 +118,20 @@ def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
 class _Reader:
     """The episodes of one source as the plan wants them."""
 
-    def __init__(self, plan: Plan, number: int, open_video: OpenVideo, *, decode: bool) -> None:
-        self.source: Source = plan.sources[number]
+    def __init__(self, plan: Plan, number: int, *, decode: bool) -> None:
+        self.source = plan.sources[number]
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
         self._mappings: Mapping[str, FeatureMapping] = plan.mappings[number]
         info = self.source.info
         names = {mapping.feature for mapping in self._mappings.values()}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
-        self._rows = RowStream(info, [*self._names, "task_index"])
-        self._open_video = open_video
-        stored = [name for name in self._names if info.features[name].dtype == "image"]
-        self._stored = {key: StoredImages(info, key) for key in stored}
+        self._rows = self.source.rows([*self._names, "task_index"])
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
-        tables = self.source.episode_tables if self.source.fact_types else ()
-        self._facts_beside = EpisodeRows(tables, schema, rows=_EPISODES_AT_ONCE)
+        tables = tables_in(self.source.root, "meta/episodes") if self.source.fact_types else ()
+        self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
         self._known = {} if decode else _kept_statistics(self.source)
-        self._has_digests = any(source.sidecar_tables for source in plan.sources)
+        self._has_digests = any(source.sidecar_tables("episodes") for source in plan.sources)
 
     def episode(self, cut: EpisodeSlice) -> EpisodeData:
         """Read an episode."""
@@ -153,10 +151,10 @@ class _Reader:
                 language = self._language(rows, cut)
                 continue
             if feature.is_video:
-                file = self._open_video(place.videos[mapping.feature][0], self.source.info.fps)
-                video = file.cut(place, mapping.feature, cut.first, cut.last)
+                stored = self.source.video(mapping.feature, place)
+                video = stored.cut(cut.first, cut.last)
                 videos[name] = video.with_digest() if self._has_digests else video
-                video_info[name] = feature.info or file.stream_info()
+                video_info[name] = feature.info or stored.file.stream_info()
             else:
                 columns[name] = self._column(rows, mapping, feature)
                 if mapping.feature in _OF_THE_END and cut.last != place.length:
@@ -189,9 +187,8 @@ class _Reader:
         """Every pixel of a camera in a cut, whose rows have been read."""
         place, feature = self.source.places[cut.episode], self.source.info.features[key]
         if feature.is_video:
-            video = EpisodeVideo(self.source.info, key, place)
-            return _video_histogram(video, feature, cut.first, cut.last)
-        return _histogram(self._stored[key].decode(place, rows.column(key).chunks))
+            return _video_histogram(self.source.video(key, place), feature, cut.first, cut.last)
+        return _histogram(self.source.stored_images[key].decode(place, rows.column(key).chunks))
 
     def _column(self, rows: pa.Table, mapping: FeatureMapping, feature: DatasetFeature) -> Any:
         array = rows.column(mapping.feature).combine_chunks()
@@ -233,7 +230,7 @@ class _Reader:
         return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
 
     def _facts(self, cut: EpisodeSlice, place: EpisodePlace) -> dict[str, Any]:
-        table = self._facts_beside.read(place.episode_index)
+        table = self._fact_rows.read(place.episode_index)
         facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
         if "duration_s" in facts:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
@@ -263,11 +260,11 @@ def _clipped_stages(facts: Mapping[str, Any], cut: EpisodeSlice) -> dict[str, An
     return found
 
 
-def _kept_statistics(source: Source) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:
+def _kept_statistics(source: LeRobotFolder) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:
     """(episode_index, camera) -> count and (9, C) numbers of the statistics that a dataset keeps of each episode."""
     keys = [name for name, feature in source.info.features.items() if feature.is_camera]
     found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
-    for number, key, entry in source.statistics(keys):
+    for number, key, entry in episode_statistics(source, keys):
         try:
             part = Statistics.from_json(entry)
             values = None if part is None else np.stack([part.values[name] for name in _NUMBERS])

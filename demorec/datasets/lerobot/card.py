@@ -13,12 +13,12 @@ from typing import Any
 
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
+from demorec.datasets.lerobot.episode_table import read_tasks
 from demorec.datasets.lerobot.files import rows_in
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.reader import read_tasks
 from demorec.datasets.lerobot.robots import ROBOTS_DIR
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
 from demorec.datasets.lerobot.writer import write_text

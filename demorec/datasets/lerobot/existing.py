@@ -16,8 +16,9 @@ from typing import Any
 import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, fact_columns
-from demorec.datasets.lerobot.files import open_table, read_json, rows_in, tables_in
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH
+from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     CODEBASE_VERSION,
@@ -26,7 +27,6 @@ from demorec.datasets.lerobot.layout import (
     DatasetInfo,
 )
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.reader import read_tasks
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import Statistics
 
@@ -58,35 +58,30 @@ def open_existing(root: Path) -> Existing:
     Raises:
         ExportError: No LeRobot dataset of this format, or one that is not whole.
     """
-    info = DatasetInfo.load(root)
+    folder = LeRobotFolder(root)
+    info = folder.info
     if info.is_old:
         raise ExportError(
             f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to. This writes it as "
             f"{CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
         )
+    episodes, frames = len(folder.places), sum(place.length for place in folder.places)
+    if (rows := folder.count_rows()) != frames:
+        raise ExportError(f"The dataset is not whole: its episodes have {frames} frames, its data files {rows}: {root}")
     try:
-        lengths = [row["length"] for row in rows_in(root, "meta/episodes", ["length"])]
-        episodes, frames = len(lengths), sum(lengths)
-        rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
-        tasks = tuple(read_tasks(root)) if info.total_tasks else ()
-        found = read_json(root / STATS_PATH) if (root / STATS_PATH).exists() else {}
-        facts = fact_columns(root)
+        tasks = tuple(folder.tasks) if info.total_tasks else ()
+        found = folder.statistics if (root / STATS_PATH).exists() else {}
         configs = read_json(root / CONFIGS_PATH) if (root / CONFIGS_PATH).exists() else {}
         statistics = {key: part for key in info.video_keys if (part := _statistics(found, key, info)) is not None}
         if not isinstance(configs, dict) or not all(isinstance(config, dict) for config in configs.values()):
             raise ValueError(f"{CONFIGS_PATH} holds no configurations")
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ExportError(f"The dataset cannot be read ({describe_error(error)}): {root}") from error
-    if (episodes, frames, rows) != (info.total_episodes, info.total_frames, info.total_frames):
-        raise ExportError(
-            f"The dataset is not whole: {INFO_PATH} counts {info.total_episodes} episodes of {info.total_frames} "
-            f"frames, its tables have {episodes} of {frames} and {rows} data rows: {root}"
-        )
     info = replace(info, total_episodes=episodes, total_frames=frames)  # other writers have some as 30.0
-    return Existing(root=root, info=info, tasks=tasks, statistics=statistics, configs=configs, facts=facts)
+    return Existing(root=root, info=info, tasks=tasks, statistics=statistics, configs=configs, facts=folder.fact_types)
 
 
-def _statistics(found: dict[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
+def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
     """Of a camera, as stats.json has them; ValueError and the like when it has something else."""
     part = Statistics.from_json(found.get(key, {}))
     if part is None:

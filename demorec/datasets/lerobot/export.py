@@ -22,6 +22,7 @@ from demorec.datasets.lerobot.boxes import BoxWriter
 from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
 from demorec.datasets.lerobot.facts import STAGE_COLUMNS, fact_types, write_progress
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
 from demorec.datasets.lerobot.motor_units import NO_PLACE, export_episode
@@ -97,7 +98,7 @@ class _Export:
         self._found = found
         self._options = options
         self._existing = existing
-        self._before = episode_digests(existing.root, existing.info) if existing is not None else []
+        self._before = episode_digests(LeRobotFolder(existing.root)) if existing is not None else []
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}

@@ -23,6 +23,7 @@ MAX_JSON_BYTES = 32 << 20
 _BATCH_BYTES = 32 << 20
 """Size of rows that are read at once, by the table's footer."""
 _ROWS_AT_ONCE = 64
+_MAX_OPEN_TABLES = 16
 
 
 def leave_pandas_out() -> None:
@@ -65,7 +66,7 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
-    """A Parquet file that has these columns, for what its footer says; its rows are read by `TableRows` alone.
+    """A Parquet file that has these columns, for what its footer says; its rows are read by `TableReader` alone.
 
     Raises:
         ExportError: It is missing, no regular file, no Parquet, or lacks a column.
@@ -99,39 +100,70 @@ def rows_in(
 def table_batches(
     path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE
 ) -> Iterator[pa.RecordBatch]:
-    """All rows of some columns of a table, some at a time; arguments and errors as of `TableRows`."""
-    yield from TableRows(path, columns, rows=rows).read()
+    """All rows of some columns of a table, some at a time; arguments and errors as of `TableReader`."""
+    yield from TableReader(columns, rows=rows).read(path)
 
 
-class TableRows:
-    """Rows of a table by number: the only way by which rows of a dataset are read. One batch is in memory.
+class TableReader:
+    """Rows of tables by number: the only way by which rows of a dataset are read. One batch of a table is in memory.
 
-    Stretches that are asked for in rising order are read in one pass; before another one, row groups are skipped.
+    Rows that are asked for in rising order are read in one pass; before others, row groups are skipped.
 
     Args:
-        path: The file.
-        columns: Names; None for all.
-        rows: How many at once, at most; fewer where they may be large.
+        columns: Names that every table has; None for all.
+        optional: Names that are read where a table has them.
+        rows: Maximum number of rows in a batch; fewer where they may be large.
 
-    Raises:
-        ExportError: As `open_table`.
+    Methods raise ExportError as `open_table`.
     """
 
-    def __init__(self, path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE) -> None:
-        self._path, self._names = path, None if columns is None else list(columns)
+    def __init__(
+        self, columns: Sequence[str] | None = None, *, optional: Sequence[str] = (), rows: int = _ROWS_AT_ONCE
+    ) -> None:
+        self._columns, self._optional, self._max_rows = columns, optional, rows
+        self._open: dict[Path, _OpenTable] = {}
+
+    def num_rows(self, path: Path) -> int:
+        """Number of rows of a table."""
+        return self._table(path).num_rows
+
+    def read(self, path: Path, first: int = 0, count: int | None = None) -> Iterator[pa.RecordBatch]:
+        """Yield `count` rows from `first` on, all by default; fewer where the table ends before."""
+        return self._table(path).read(first, count)
+
+    def _table(self, path: Path) -> _OpenTable:
+        found = self._open.pop(path, None)
+        if self._open and (found is None or len(self._open) >= _MAX_OPEN_TABLES):
+            self._open[next(reversed(self._open))].rest()
+        if found is None:
+            found = _OpenTable(path, self._columns, self._optional, self._max_rows)
+        self._open[path] = found
+        if len(self._open) > _MAX_OPEN_TABLES:
+            del self._open[next(iter(self._open))]
+        return found
+
+
+class _OpenTable:
+    """A table that `TableReader` reads."""
+
+    def __init__(self, path: Path, columns: Sequence[str] | None, optional: Sequence[str], rows: int) -> None:
+        self._path = path
         self._table = open_table(path, columns)
-        self._at_once = max(1, min(rows, _BATCH_BYTES // _row_bytes(self._table.metadata, columns)))
+        there = self._table.schema_arrow.names
+        added = [name for name in optional if name in there and name not in (columns or ())]
+        self._names = None if columns is None else [*columns, *added]
+        self._max_rows = max(1, min(rows, _BATCH_BYTES // _row_bytes(self._table.metadata, self._names)))
+        self.num_rows: int = self._table.metadata.num_rows
         self.rest()
 
     def rest(self) -> None:
         """Let go of the batch that is in memory."""
         self._batches: Iterator[pa.RecordBatch] = iter(())
         self._held: pa.RecordBatch | None = None
-        self._next = self._table.metadata.num_rows + 1
+        self._next = self.num_rows + 1
 
-    def read(self, first: int = 0, count: int | None = None) -> Iterator[pa.RecordBatch]:
-        """So many rows from one on, all by default; fewer where the table ends before."""
-        end = self._table.metadata.num_rows if count is None else first + count
+    def read(self, first: int, count: int | None) -> Iterator[pa.RecordBatch]:
+        end = self.num_rows if count is None else first + count
         if first < self._next:
             self._seek(first)
         while self._next < end:
@@ -153,7 +185,7 @@ class TableRows:
         group = max(0, int(np.searchsorted(begins, first, side="right")) - 1)
         groups = range(group, metadata.num_row_groups)
         self._held, self._next = None, int(begins[group])
-        self._batches = self._table.iter_batches(batch_size=self._at_once, row_groups=groups, columns=self._names)
+        self._batches = self._table.iter_batches(batch_size=self._max_rows, row_groups=groups, columns=self._names)
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:

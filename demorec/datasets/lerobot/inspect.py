@@ -2,85 +2,77 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.files import open_table, read_json, read_table, rows_in, tables_in
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.files import open_table, read_json
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.mp4_index import check_video
-from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.reader import RowStream, episode_places, read_tasks
-from demorec.datasets.lerobot.robots import read_robot
-from demorec.datasets.lerobot.videos import PacketReader
 
 
-def attempt_counts(path: Path) -> tuple[int, int] | None:
-    """(episodes that succeeded, attempts that were made) of a dataset that demorec wrote; None for anybody else's.
+def attempt_counts(folder: LeRobotFolder) -> tuple[int, int] | None:
+    """Count (episodes that succeeded, attempts that were made); None in a dataset that demorec did not write.
 
     Raises:
         ExportError: Its tables are damaged.
     """
-    attempts = tables_in(path, f"{SIDECAR_DIR}/attempts")
+    attempts = folder.sidecar_tables("attempts")
     if not attempts:
         return None
-    successes = sum(row["success"] is True for row in rows_in(path, f"{SIDECAR_DIR}/episodes", ["success"]))
+    successes = sum(row["success"] is True for row in folder.sidecar(["success"]))
     return successes, sum(open_table(file).metadata.num_rows for file in attempts)
 
 
-def known_units(path: Path) -> Mapping[str, tuple[str, ...]]:
-    """Feature -> units of its elements, as demorec keeps them beside its datasets; empty for anybody else's.
+def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
+    """Feature -> units of its elements, as demorec keeps them in the sidecar; empty without one.
 
     Raises:
         ExportError: The tables or the robot's description are damaged.
     """
-    for file in tables_in(path, f"{SIDECAR_DIR}/episodes"):
-        if "robot_digest" in open_table(file).schema_arrow.names:
-            digests = read_table(file, ["robot_digest"]).column(0).drop_null()
-            return read_robot(path, digests[0].as_py()).record.units if len(digests) else {}
-    return {}
+    digests = (row["robot_digest"] for row in folder.sidecar(["robot_digest"]))
+    digest = next((digest for digest in digests if digest), None)
+    return {} if digest is None else folder.robot(digest).record.units
 
 
-def dataset_problems(path: Path, info: DatasetInfo) -> list[str]:
-    """What of a dataset is missing, emptied or cut off, one sentence each; by the ends of its files, which is quick.
+def dataset_problems(folder: LeRobotFolder) -> list[str]:
+    """List what is missing, empty or cut off, one sentence each; by the ends of the files, which is quick.
 
-    `demorec check` reads all that is in them.
+    `demorec check` reads all their content.
     """
     problems: list[str] = []
-    rows: dict[str, int] = {}
-    for place in ("data", *(() if info.is_old else ("meta/episodes",))):
-        rows[place] = 0
-        for file in tables_in(path, place):
-            with _noted(problems, path):
-                rows[place] += open_table(file).metadata.num_rows
-    if not problems:
-        for place, said in (("data", info.total_frames), ("meta/episodes", info.total_episodes)):
-            if rows.get(place, said) != said:
-                problems.append(f"The tables in {place} have {rows[place]} rows, {INFO_PATH} counts {said}")
-    with _noted(problems, path):
-        read_tasks(path)
-    if not info.is_old and not (path / STATS_PATH).exists():
+    places: Sequence[EpisodePlace] = ()
+    with noted(problems, folder.root):
+        places = folder.places
+    for file, listed in folder.num_rows.items() if places else ():
+        with noted(problems, folder.root):
+            if (there := open_table(file).metadata.num_rows) != listed:
+                raise ExportError(f"The data file has {there} rows, its episodes have {listed}: {file}")
+    with noted(problems, folder.root):
+        folder.tasks  # noqa: B018
+    if not folder.info.is_old and not (folder.root / STATS_PATH).exists():
         problems.append(f"The statistics are missing: {STATS_PATH}")
-    with _noted(problems, path):
-        check_tables(path)
-    with _noted(problems, path):
-        for video in sorted({video for place in episode_places(path, info) for video, _ in place.videos.values()}):
-            with _noted(problems, path):
-                check_video(video)
+    with noted(problems, folder.root):
+        check_tables(folder.root)
+    for video in sorted({video for place in places for video, _ in place.videos.values()}):
+        with noted(problems, folder.root):
+            check_video(video)
     return list(dict.fromkeys(problems))
 
 
 @contextmanager
-def _noted(problems: list[str], path: Path) -> Iterator[None]:
-    """Turn an ExportError into one more problem, stated without the dataset's own path."""
+def noted(problems: list[str], root: Path) -> Iterator[None]:
+    """Turn an ExportError into one more problem, without the dataset's own path. Lack of memory is not a problem of
+    the dataset, and is raised."""
     try:
         yield
     except ExportError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        problems.append(without_path(error, path).replace(f"{path}/", ""))
+        problems.append(without_path(error, root).replace(f"{root}/", ""))
 
 
 def has_digest(info: DatasetInfo) -> bool:
@@ -114,33 +106,31 @@ def dataset_digest(path: Path) -> str:
     Raises:
         ExportError: The dataset is damaged.
     """
-    info = DatasetInfo.load(path)
-    return combined_digest(info, list(episode_digests(path, info)))
+    return folder_digest(LeRobotFolder(path))
 
 
-def episode_digests(path: Path, info: DatasetInfo) -> list[str]:
-    """The digest of every episode, in order, read back from all files."""
-    if unknown := _without_digest(info):
-        raise ExportError(f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {path}")
-    tasks = read_tasks(path)
-    rows = RowStream(info)
-    cameras = {key: PacketReader(key) for key in info.video_keys}
-    result = []
-    try:
-        for place in episode_places(path, info):
-            columns = rows.numbers(place)
-            videos = {}
-            for key, packets in cameras.items():
-                images = hashlib.sha256()
-                for sample in packets.read(place):
-                    images.update(sample)
-                videos[key] = images.hexdigest()
-            task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
-            if not 0 <= task_index < len(tasks):  # which NaN, what a null was read as, is neither
-                raise ExportError(f"Episode {place.episode_index} has no task: {path}")
-            task = tasks[int(task_index)]
-            result.append(episode_digest(task, columns, videos))
-    finally:
-        for packets in cameras.values():
-            packets.close()
-    return result
+def folder_digest(folder: LeRobotFolder) -> str:
+    """As `dataset_digest`, of an open dataset."""
+    return combined_digest(folder.info, episode_digests(folder))
+
+
+def episode_digests(folder: LeRobotFolder, numbers: Sequence[int] | None = None) -> list[str]:
+    """Compute the digest of some episodes, all by default, in order, read back from all files."""
+    if unknown := _without_digest(folder.info):
+        raise ExportError(
+            f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {folder.root}"
+        )
+    rows = folder.rows(folder.columns)
+    found: list[str] = []
+    for place in folder.places if numbers is None else [folder.listed[number] for number in numbers]:
+        columns = rows.numbers(place)
+        task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
+        if not 0 <= task_index < len(folder.tasks):  # NaN, which a null is read as, is neither
+            raise ExportError(f"Episode {place.episode_index} has no task: {folder.root}")
+        found.append(episode_digest(folder.tasks[int(task_index)], columns, video_digests(folder, place)))
+    return found
+
+
+def video_digests(folder: LeRobotFolder, place: EpisodePlace) -> dict[str, str]:
+    """SHA-256 (hex) of the encoded images of each camera feature in an episode."""
+    return {key: folder.video(key, place).digest() for key in folder.info.video_keys}

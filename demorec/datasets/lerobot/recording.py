@@ -15,8 +15,8 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
-from demorec.datasets.lerobot.episodes import LeRobotDataset
-from demorec.datasets.lerobot.language import PERSISTENT, EpisodeLanguage, spoken_of
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Outcome, Table, frame_time_ns
@@ -26,7 +26,7 @@ from demorec.episode.roles import Roles
 from demorec.mcap.frame_check import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
-_SUCCESS, _EPISODE = "next.success", "episode_index"
+_SUCCESS = "next.success"
 _TIME_TOLERANCE_S = 1e-4
 """By which LeRobot lets a row's time be off the grid."""
 _UNNAMED_ROBOT = "unknown"
@@ -51,7 +51,7 @@ class DatasetRecording:
     Methods and properties raise ExportError where the files cannot be read.
     """
 
-    def __init__(self, dataset: LeRobotDataset, number: int) -> None:
+    def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         self.place = place = dataset.places[number]
         self.path, self.dataset = dataset.root, dataset
         self.num_frames = place.length
@@ -121,16 +121,12 @@ class DatasetRecording:
 
     @cached_property
     def _rows(self) -> Mapping[str, NDArray[Any]]:
-        rows, info, number = self.dataset.rows.numbers(self.place), self.dataset.info, self.place.episode_index
-        if _EPISODE in rows and (rows[_EPISODE] != number).any():
-            raise ExportError(
-                f"The rows of episode {number} are those of others, by its place in the table: {self.path}"
-            )
+        rows, info = self.dataset.recorded_rows.numbers(self.place), self.dataset.info
         off = np.abs(rows["timestamp"][:, 0].astype(np.float64) - np.arange(self.num_frames) / int(info.fps))
         if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
             raise ExportError(
-                f"Row {wrong[0]} of episode {number} is at {rows['timestamp'][wrong[0], 0]:.4f} s, which is no "
-                f"multiple of 1/{info.fps} s: {self.path}"
+                f"Row {wrong[0]} of episode {self.place.episode_index} is at {rows['timestamp'][wrong[0], 0]:.4f} s, "
+                f"which is no multiple of 1/{info.fps} s: {self.path}"
             )
         for feature in self.dataset.features:
             found, claimed = rows[feature.name].dtype, info.features[feature.name].dtype
@@ -191,13 +187,13 @@ class DatasetRecording:
         """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
         if (video := self._video(camera)) is not None:
             return video.images(-self._lead(camera))
-        return self.dataset.stored_images(self.dataset.keys[camera], self.place)
+        return self.dataset.stored_images[self.dataset.keys[camera]].read(self.place)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
         """What some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
         if (video := self._video(camera)) is not None:
             return video.images_at(frames)
-        return self.dataset.stored_images(self.dataset.keys[camera], self.place, frames)
+        return self.dataset.stored_images[self.dataset.keys[camera]].read(self.place, frames)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""
@@ -208,27 +204,33 @@ class DatasetRecording:
     @cached_property
     def spoken(self) -> EpisodeLanguage:
         """What its language columns hold; nothing in a dataset without them."""
-        stream = self.dataset.language_stream
-        return EpisodeLanguage() if stream is None else spoken_of(stream.batches(self.place), self.path)
+        rows = self.dataset.language_rows
+        return EpisodeLanguage() if rows is None else spoken_of(rows.batches(self.place), self.path)
+
+    @property
+    def subtasks(self) -> tuple[tuple[int, str], ...]:
+        """(frame, what is begun there), in order; empty where none is known, or one cannot be held."""
+        return tuple(sorted(self._subtasks[0].items()))
+
+    @property
+    def language_left_out(self) -> str:
+        """What of its language a recording cannot hold, "" for nothing."""
+        return self._subtasks[1]
 
     @cached_property
-    def subtasks(self) -> tuple[tuple[int, str], ...]:
-        """(frame, what is begun there), in order; empty where nobody said any.
-
-        What else is said, or cannot be held, is noted among what the dataset leaves out.
-        """
+    def _subtasks(self) -> tuple[dict[int, str], str]:
         texts: dict[int, str] = {}
+        left_out = ""
         for row in self.spoken.persistent:
             text, begin = str(row.get("content")), row.get("timestamp")
             frame = begin * self.dataset.info.fps if isinstance(begin, float) else -1
             if row.get("style") != "subtask" or not 0 <= frame < self.num_frames:
-                self.dataset.left_out.setdefault(PERSISTENT, "all but its subtasks")
+                left_out = "all but its subtasks"
             elif len(text) > MAX_SUBTASK or not text.isprintable():
-                self.dataset.left_out[PERSISTENT] = f"a subtask is no single line of at most {MAX_SUBTASK} characters"
-                return ()
+                return {}, f"a subtask is no single line of at most {MAX_SUBTASK} characters"
             else:
                 texts[round(frame)] = text
-        return tuple(sorted(texts.items()))
+        return texts, left_out
 
     def boxes(self, camera: str) -> Iterator[ReadBox]:
         """What a camera sees, with frames in place of rows, of a dataset with boxes beside it."""

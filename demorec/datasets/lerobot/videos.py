@@ -1,194 +1,301 @@
-"""The images of a dataset, whoever wrote it: packets as streams hold them, pixels, distances.
+"""The videos of a dataset: the encoded images of an episode, its pixels, its distances.
 
-A dataset's video holds many episodes. Its packets can be cut out, from the keyframe on that an episode's first image
-needs, where no image is shown in another order than it was encoded in.
+A dataset's video holds many episodes. The images of one are found by the index of the file. They can be copied as they
+are, together with those from which they are decoded: from a keyframe on, and to the last one that a frame needs.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from fractions import Fraction
+import hashlib
+import os
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 import av
 import numpy as np
-import pyarrow as pa
 from av.bitstream import BitStreamFilterContext
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
-from PIL import Image
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
+from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
-from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.mp4_index import check_video
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored
+from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.reader import EpisodePlace, RowStream
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
 
 PacketCodec = Literal["h264", "h265", "av1"]
 PACKET_CODECS: dict[str, PacketCodec] = {"h264": "h264", "hevc": "h265", "av1": "av1", "libdav1d": "av1"}
-"""libav's name of a codec or decoder -> ours."""
+"""libav's name of a codec or decoder -> demorec's."""
+_MP4_NAMES = {"h265": "hevc"}
 _TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
 _TEMPORAL_DELIMITER = b"\x12\x00"
-"""In front of every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
+"""Precedes every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
+_MAX_REORDERED = 32
+"""Images by which one is stored before it is shown; codecs allow 16."""
+
+
+OpenedVideo = tuple[av.container.InputContainer, av.video.stream.VideoStream]
 
 
 @contextmanager
-def opened_video(path: Path) -> Iterator[tuple[av.container.InputContainer, av.video.stream.VideoStream]]:
-    """Open a video; ExportError when it cannot be read, in the block too."""
+def opened_video(path: Path) -> Iterator[OpenedVideo]:
+    """Open a video. Raises ExportError if it cannot be read, also in the block."""
     check_video(path)
+    with _video_errors(path), av.open(str(path), format="mp4") as container:
+        stream = container.streams.video[0]
+        stream.thread_type = "NONE"  # starting threads costs more than what they would save
+        width, height = stream.codec_context.width, stream.codec_context.height
+        if width * height > MAX_PIXELS:
+            raise ValueError(f"it has {width}x{height} pixels, allowed are {MAX_PIXELS:,} in all")
+        yield container, stream
+
+
+@contextmanager
+def _video_errors(path: Path) -> Iterator[None]:
+    """Turn the errors of a video that cannot be read into an ExportError."""
     try:
-        with av.open(str(path), format="mp4") as container:
-            stream = container.streams.video[0]
-            stream.thread_type = "NONE"  # starting threads costs more than what they would save
-            width, height = stream.codec_context.width, stream.codec_context.height
-            if width * height > MAX_PIXELS:
-                raise ValueError(f"it has {width}x{height} pixels, allowed are {MAX_PIXELS:,} in all")
-            yield container, stream
+        yield
     except (OSError, EOFError, ValueError, IndexError, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
 
 
-class PacketReader:
-    """Encoded images of one camera feature as they lie in the mp4 files, in order over all of them.
+class VideoFile:
+    """The encoded images of an mp4 file.
 
     Attributes:
-        keyframe: Number, in its file, of the keyframe from which on the image read last can be decoded; -1 for none.
+        path: Of the file.
+        offsets, sizes, is_keyframe: (N,) of its images, in the order in which they are stored.
+        frames: (N,) int64, number of the frame at which each is shown.
+        order: (N,) by which these rise.
+        keys: (K,) numbers of the keyframes.
+        size, pixels: (width, height) and pixel format, as libav describes them.
+        has_long_lengths: Whether units of H.264 and HEVC have lengths of four bytes, as all writers use them.
+
+    Raises:
+        ExportError: The file cannot be read.
     """
 
-    def __init__(self, key: str) -> None:
-        self._key = key
-        self._path: Path | None = None
-        self._packets = _samples(None)
-        self._next = 0
-        self.keyframe = -1
+    def __init__(self, path: Path, fps: float) -> None:
+        self.path, self._fps = path, fps
+        self.offsets, self.sizes, self.is_keyframe, times = mp4_index(path)
+        self.frames: NDArray[np.int64] = np.rint(times * fps).astype(np.int64)
+        self.order = np.argsort(self.frames, kind="stable")
+        self.keys = np.flatnonzero(self.is_keyframe)
+        with opened_video(path) as (_, stream):
+            context = stream.codec_context
+            self._codec = context.name
+            self.size, self.pixels = (context.width, context.height), context.pix_fmt
+            extra = context.extradata or b""
+            length_size = extra[4] if self._codec == "h264" else extra[21] if len(extra) > 21 else 3
+            self.has_long_lengths = self._codec not in ("h264", "hevc") or (length_size & 3) == 3
+        self._head = b""
 
-    def close(self) -> None:
-        """Close the open file; harmless when called twice."""
-        self._packets.close()
+    @property
+    def codec(self) -> PacketCodec:
+        """The codec of its packets. Raises ExportError if no recording holds them."""
+        if self._codec not in PACKET_CODECS:
+            raise ExportError(
+                f"The video cannot be read (its codec is {self._codec}; h264, hevc and av1 are read): {self.path}"
+            )
+        return PACKET_CODECS[self._codec]
 
-    def read(self, place: EpisodePlace) -> Iterator[bytes]:
-        """The samples of an episode; episodes must be asked for in order."""
-        path, first = place.videos[self._key]
-        if path != self._path:
-            self.close()
-            self._packets = _samples(path)
-            self._path, self._next, self.keyframe = path, 0, -1
-        if first < self._next:
-            raise ExportError(f"Episode {place.episode_index} overlaps the one before it: {path}")
-        begin, self._next = self._next, first + place.length
-        for number in range(begin, self._next):  # those before the first belong to no episode
-            data, is_key = next(self._packets, (b"", False))
-            if not data:
-                raise ExportError(
-                    f"Episode {place.episode_index} has {place.length} frames, but {max(0, number - first)} images: "
-                    f"{path}"
-                )
-            if is_key:
-                self.keyframe = number
-            if number >= first:
-                yield data
+    def samples(self, numbers: Iterable[int]) -> Iterator[bytes]:
+        """Yield images as the file stores them."""
+        try:
+            with open_regular(self.path) as file:
+                for number in numbers:
+                    yield os.pread(file.fileno(), int(self.sizes[number]), int(self.offsets[number]))
+        except OSError as error:
+            raise ExportError(f"The video cannot be read ({describe_error(error)}): {self.path}") from error
+
+    @contextmanager
+    def access_units(self) -> Iterator[Callable[[bytes], bytes]]:
+        """Give what converts a stored image to an access unit of a stream, with start codes or a temporal delimiter."""
+        if self.codec == "av1":
+            yield lambda sample: _TEMPORAL_DELIMITER + sample.removeprefix(_TEMPORAL_DELIMITER)
+            return
+        with opened_video(self.path) as (_, stream):
+            bits = BitStreamFilterContext(_TO_START_CODES[self.codec], stream)
+            yield lambda sample: b"".join(bytes(part) for part in bits.filter(av.Packet(sample)))
+
+    def first_image(self, number: int) -> bytes:
+        """Read a first image as it was encoded: after the parameter sets, which of H.264 and HEVC are the file's."""
+        if self.codec == "av1" or not self._head:
+            with self.access_units() as convert:
+                self._head = convert(*self.samples([number]))
+        return self._head
+
+    def stream_info(self) -> dict[str, Any]:
+        """Describe the encoding as info.json does."""
+        return {
+            "video.height": self.size[1],
+            "video.width": self.size[0],
+            "video.codec": _MP4_NAMES.get(self.codec, self.codec),
+            "video.pix_fmt": self.pixels,
+            "video.fps": int(self._fps),
+            "video.channels": 3,
+            "has_audio": False,
+            "is_depth_map": False,
+        }
 
 
-def _samples(path: Path | None) -> Any:
-    """A generator of each sample of an mp4 file, and whether it is a keyframe; of none without a file."""
-    if path is not None:
-        with opened_video(path) as (container, _):
-            for packet in container.demux(video=0):
-                if packet.size:
-                    is_key = packet.is_keyframe
-                    yield bytes(packet), is_key
+class _Part(NamedTuple):
+    """The stored images from which some frames are decoded.
 
+    Attributes:
+        numbers: (lead + T + tail,) of the images in the file, in the order in which they are stored.
+        places: (lead + T + tail,) at which each is shown, from 0.
+        lead: Number of images that are shown before the first frame.
+        tail: Number of images that are shown after the last frame.
+    """
 
-def access_units(stream: av.video.stream.VideoStream, codec: PacketCodec) -> Callable[[av.Packet], bytes]:
-    """What makes of a sample of an mp4 file what recordings hold: start codes, or a temporal delimiter, in front."""
-    name = _TO_START_CODES.get(codec)
-    if name is None:
-        return lambda packet: _TEMPORAL_DELIMITER + bytes(packet).removeprefix(_TEMPORAL_DELIMITER)
-    bits = BitStreamFilterContext(name, stream)
-    return lambda packet: b"".join(bytes(part) for part in bits.filter(packet))
+    numbers: NDArray[np.intp]
+    places: NDArray[np.int64]
+    lead: int
+    tail: int
 
 
 class EpisodeVideo:
-    """The images of a camera feature in one episode of T frames; methods raise ExportError when they cannot be read.
+    """The images of a camera feature in one episode of T frames.
+
+    Args:
+        open_file: Opens a video file, or gives an open one.
+        key, feature: The camera.
+        place: The episode.
+        fps: Frames per second.
 
     Attributes:
         path: The mp4 file.
         first: Number of the episode's first image in it.
         length: T.
+
+    Methods and properties raise ExportError if the images cannot be read.
     """
 
-    def __init__(self, info: DatasetInfo, key: str, place: EpisodePlace) -> None:
+    def __init__(
+        self, open_file: Callable[[Path], VideoFile], key: str, feature: DatasetFeature, place: EpisodePlace, fps: int
+    ) -> None:
         self.path, self.first = place.videos[key]
         self.length = place.length
-        self._feature, self._key, self._fps = info.features[key], key, int(info.fps)
+        self._open_file, self._key, self._feature, self._fps = open_file, key, feature, fps
         self._episode = place.episode_index
 
-    def _seek(
-        self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, frame: int = 0
-    ) -> Fraction:
-        """Go to a frame or before it; return how many frames a tick of the video's clock is."""
-        assert stream.time_base is not None
-        container.seek(round((self.first + frame) / (self._fps * stream.time_base)), stream=stream)
-        return self._fps * stream.time_base
+    @property
+    def file(self) -> VideoFile:
+        """The mp4 file."""
+        return self._open_file(self.path)
+
+    def _part(self, first: int, last: int) -> _Part:
+        """Find the frames from `first` to before `last`, with all images from which these are decoded."""
+        file, begin, end = self.file, self.first + first, self.first + last
+        if last <= first:
+            return _Part(np.zeros(0, np.intp), np.zeros(0, np.int64), lead=0, tail=0)
+        wanted = file.order[slice(*np.searchsorted(file.frames, (begin, end), sorter=file.order))]
+        if len(wanted) != last - first:
+            count = f"{len(wanted)} images for {last - first} frames of {self._key}"
+            raise ExportError(f"Episode {self._episode} has {count}: {self.path}")
+        keys = file.keys[: np.searchsorted(file.keys, wanted.min(), side="right")]
+        keys = keys[file.frames[keys] <= begin]
+        if not len(keys):
+            raise ExportError(f"Episode {self._episode} does not begin after a keyframe of {self._key}: {self.path}")
+        keyframe = int(file.frames[keys[-1]])
+        numbers = _without_gaps(file.frames, int(keys[-1]), int(wanted.max()) + 1)
+        places = file.frames[numbers] - keyframe
+        if not np.array_equal(np.sort(places), np.arange(len(places))):
+            raise ExportError(f"Two images of {self._key} are shown at one time, or none at some: {self.path}")
+        return _Part(numbers, places, lead=begin - keyframe, tail=len(places) - (end - keyframe))
 
     @cached_property
+    def _whole(self) -> _Part:
+        return self._part(0, self.length)
+
+    @property
     def lead(self) -> int:
-        """How many images there are from the keyframe on that the first frame needs, less that frame."""
-        with opened_video(self.path) as (container, stream):
-            rate, keyframe = self._seek(container, stream), 0
-            for packet in container.demux(stream):
-                if packet.size and packet.pts is not None:
-                    frame = round(packet.pts * rate) - self.first
-                    keyframe = frame if packet.is_keyframe else keyframe
-                    if frame == 0:
-                        return -min(keyframe, 0)
-        raise ExportError(f"Episode {self._episode} has {self.length} frames, the video ends before them: {self.path}")
+        """Number of images from the keyframe on that the first frame needs, without that frame."""
+        return self._whole.lead
+
+    def cut(self, first: int = 0, last: int | None = None) -> EncodedVideo:
+        """Take the images of the frames from `first` to before `last` out, with all from which these are decoded.
+
+        Raises:
+            ExportError: They are not there, or cannot be taken out without encoding them again.
+        """
+        file, part = self.file, self._part(first, self.length if last is None else last)
+        if not file.has_long_lengths:
+            raise ExportError(f"The video has lengths of less than four bytes, which are not copied: {self.path}")
+        shifts = part.places - np.arange(len(part.places))
+        sizes = file.sizes[part.numbers]
+        return EncodedVideo(
+            codec=_MP4_NAMES.get(file.codec, file.codec),
+            width=file.size[0],
+            height=file.size[1],
+            first=file.first_image(int(part.numbers[0])),
+            samples=Stored(path=self.path, spans=_spans(file.offsets[part.numbers], sizes)),
+            sizes=sizes,
+            is_keyframe=file.is_keyframe[part.numbers],
+            lead=part.lead,
+            tail=part.tail,
+            shifts=shifts if shifts.any() else None,
+        )
+
+    def digest(self) -> str:
+        """SHA-256 (hex) of the T stored images, as `EncodedVideo.digest`."""
+        part, digest = self._whole, hashlib.sha256()
+        for sample in self.file.samples(part.numbers[part.lead : part.lead + self.length]):
+            digest.update(sample)
+        return digest.hexdigest()
 
     def packets(self) -> Iterator[tuple[int, bytes, bool]]:
-        """(frame, access unit, whether it is a keyframe) of the `lead`, whose frames are below 0, and of T frames."""
-        with opened_video(self.path) as (container, stream):
-            rate, codec = self._seek(container, stream), codec_of(stream)
-            claimed = str((self._feature.info or {}).get("video.codec"))
-            if PACKET_CODECS.get(claimed, codec) != codec:
-                raise ValueError(f"its codec is {codec}, and meta/info.json says {claimed}")
-            convert, left = access_units(stream, codec), self.length
-            lead: list[tuple[int, bytes, bool]] = []
-            for packet in container.demux(stream):
-                if not packet.size or packet.pts is None:
-                    continue
-                # Read before the conversion, which empties the packet.
-                frame, is_key = round(packet.pts * rate) - self.first, packet.is_keyframe
-                data = convert(packet)
-                if is_key:
-                    lead.clear()
-                if frame < 0:
-                    lead.append((frame, data, is_key))
-                elif frame < self.length:
-                    yield from (*lead, (frame, data, is_key))
-                    lead.clear()
-                    left -= 1
-                if not left:
-                    return
-            raise ValueError(f"episode {self._episode} has {self.length} frames, {left} of them no image")
+        """Yield (frame, access unit, whether it is a keyframe) of the `lead`, with frames below 0, and of T frames."""
+        file, part = self.file, self._whole
+        claimed = str((self._feature.info or {}).get("video.codec"))
+        if PACKET_CODECS.get(claimed, file.codec) != file.codec:
+            raise ExportError(
+                f"The video cannot be read (its codec is {file.codec}, and meta/info.json says {claimed}): {self.path}"
+            )
+        frames = part.places - part.lead
+        shown = np.flatnonzero(frames < self.length)
+        numbers = part.numbers[shown]
+        are_keyframes = file.is_keyframe[numbers].tolist()
+        with file.access_units() as convert:
+            for frame, sample, is_key in zip(frames[shown].tolist(), file.samples(numbers), are_keyframes, strict=True):
+                if not sample:
+                    raise ExportError(
+                        f"Episode {self._episode} has no image of {self._key} in frame {frame}: {self.path}"
+                    )
+                yield frame, convert(sample), is_key
+
+    def why_transcoded(self) -> str:
+        """Why the packets of the episode cannot pass through, or ""."""
+        from demorec.mcap.video import is_keyframe  # loads all that reads recordings
+
+        file, part = self.file, self._whole
+        if (np.diff(file.frames) < 0).any():
+            return "images are not shown in the order in which they were encoded"
+        _, keyframe, _ = next(self.packets())
+        if part.lead > self.length or not is_keyframe(file.codec, keyframe):
+            return "an episode begins far from the keyframe that it needs"
+        return ""
 
     def images(self, begin: int = 0) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of every frame from one on, which may be one of the lead (below 0)."""
-        reformatter = VideoReformatter()  # a frame's own would be set up anew for each
-        for frame in self._frames(begin):
+        """Yield (H, W, 3) uint8 RGB of every frame from one on, which may be one of the lead (below 0)."""
+        reformatter = VideoReformatter()  # a frame's own would be set up again for each
+        for frame in self.decoded(begin):
             yield cast("Rgb", reformatter.reformat(frame, format="rgb24").to_ndarray())
 
     @cached_property
     def depth_scale(self) -> DepthScale:
-        """What the codes of its depth stand for; ExportError when that is not known."""
+        """The distances that the codes of its depth stand for. Raises ExportError if they are not known."""
         try:
             return DepthScale.of(self._feature.info or {})
         except ValueError as error:
@@ -197,38 +304,51 @@ class EpisodeVideo:
             ) from error
 
     def codes(self, begin: int = 0) -> Iterator[NDArray[np.uint16]]:
-        """(H, W) codes of depth, 0 to 4095, of every frame from one on."""
+        """Yield (H, W) codes of depth, 0 to 4095, of every frame from one on."""
         height, width = self._feature.shape[:2]
-        for frame in self._frames(begin, (width, height)):
+        for frame in self.decoded(begin, (width, height)):
             yield np.minimum(frame.to_ndarray(format="gray12le"), LARGEST_CODE)
 
     def distances(self) -> Iterator[NDArray[np.float32]]:
-        """(H, W) metres of every frame, 0 where nothing was measured."""
+        """Yield (H, W) metres of every frame, 0 where nothing was measured."""
         metres = self.depth_scale.shown()
         for codes in self.codes():
             yield metres[codes]
 
     def images_at(self, frames: Sequence[int]) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of some frames, numbered from 0 within the episode."""
+        """Yield (H, W, 3) uint8 RGB of some frames, numbered from 0 within the episode."""
         with opened_video(self.path) as (container, stream):
             for frame in frames:
-                image = next(self._decoded(container, stream, frame))
+                image = next(self._from(container, stream, frame))
                 yield cast("Rgb", image.to_ndarray(format="rgb24"))
 
-    def _frames(self, begin: int = 0, size: tuple[int, int] | None = None) -> Iterator[av.VideoFrame]:
-        """The decoded images from a frame on, one a frame; the size is what info.json claims."""
-        with opened_video(self.path) as (container, stream):
+    def decoded(
+        self, begin: int = 0, size: tuple[int, int] | None = None, opened: OpenedVideo | None = None
+    ) -> Iterator[av.VideoFrame]:
+        """Yield the decoded images from a frame on, one a frame.
+
+        Args:
+            begin: The first frame.
+            size: (width, height) that info.json claims; any by default.
+            opened: The file, if it is open already.
+        """
+        with (
+            _video_errors(self.path),
+            opened_video(self.path) if opened is None else nullcontext(opened) as (container, stream),
+        ):
             found = (stream.codec_context.width, stream.codec_context.height)
             if size not in (None, found):
                 raise ValueError(f"it has {found[0]}x{found[1]} pixels, and meta/info.json says {size[0]}x{size[1]}")
             if begin < self.length:
-                yield from self._decoded(container, stream, begin)
+                yield from self._from(container, stream, begin)
 
-    def _decoded(
+    def _from(
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, begin: int
     ) -> Iterator[av.VideoFrame]:
-        """As `_frames`, of an opened video; ValueError when an image is missing or of another size."""
-        rate, number = self._seek(container, stream, begin), begin
+        """As `decoded`, of an opened video. Raises ValueError if an image is missing or of another size."""
+        assert stream.time_base is not None
+        rate, number = self._fps * stream.time_base, begin
+        container.seek(round((self.first + begin) / rate), stream=stream)
         size = (stream.codec_context.width, stream.codec_context.height)
         for image in container.decode(stream):
             frame = begin - 1 if image.pts is None else round(image.pts * rate) - self.first
@@ -245,95 +365,24 @@ class EpisodeVideo:
         raise ValueError(f"episode {self._episode} has {self.length} frames, and frame {number} no image")
 
 
-def codec_of(stream: av.video.stream.VideoStream) -> PacketCodec:
-    """The codec of a stream; ValueError for one whose packets no recording holds."""
-    name = stream.codec_context.name
-    if name not in PACKET_CODECS:
-        raise ValueError(f"its codec is {name}; h264, hevc and av1 are read")
-    return PACKET_CODECS[name]
+def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np.intp]:
+    """Number the images from one on, in the order in which they are stored, with those that later ones need.
 
-
-def why_transcoded(videos: Sequence[EpisodeVideo]) -> tuple[PacketCodec, tuple[int, int], str]:
-    """Of a camera's videos of all episodes the codec, (width, height), and why packets cannot pass through, or "".
-
-    Raises:
-        ExportError: A video cannot be read, or they are of several codecs or sizes.
+    Images may be shown in another order than they are stored in. Those that are stored after the keyframe and shown
+    before it need images that are not taken. After the last wanted one follow as many as it takes until at every
+    moment one is shown.
     """
-    from demorec.mcap.video import is_keyframe  # loads all that reads recordings
-
-    of_files: dict[Path, dict[int, EpisodeVideo]] = {}
-    for video in videos:
-        of_files.setdefault(video.path, {})[video.first] = video
-    kinds, leads, reason = set(), [], ""
-    for path, beginnings in of_files.items():
-        with opened_video(path) as (container, stream):
-            codec = codec_of(stream)
-            kinds.add((codec, (stream.codec_context.width, stream.codec_context.height)))
-            convert = access_units(stream, codec)
-            last, keyframe = -1, b""
-            for number, packet in enumerate(packet for packet in container.demux(stream) if packet.size):
-                if packet.pts != packet.dts:
-                    reason = reason or "images are not shown in the order in which they were encoded"
-                if packet.is_keyframe:
-                    last, keyframe = number, convert(packet)
-                if (begun := beginnings.get(number)) is not None:
-                    leads.append((begun, number - last))
-                    if last < 0 or number - last > begun.length or not is_keyframe(codec, keyframe):
-                        reason = reason or "an episode begins far from the keyframe that it needs"
-    if len(kinds) != 1:
-        raise ExportError(f"The videos of a camera are of several codecs or sizes: {', '.join(map(str, of_files))}")
-    for video, lead in leads if not reason else ():
-        video.lead = lead
-    ((codec, size),) = kinds
-    return codec, size, reason
+    last = min(end + _MAX_REORDERED, len(frames))
+    while True:
+        part: NDArray[np.intp] = begin + np.flatnonzero(frames[begin:end] >= frames[begin])
+        if len(part) > int(frames[part].max() - frames[begin]) or end >= last:
+            return part
+        end += 1
 
 
-class StoredImages:
-    """The images of a camera feature that are in the rows of the data files, PNG or JPEG."""
-
-    def __init__(self, info: DatasetInfo, key: str) -> None:
-        self._key = key
-        self._stream = RowStream(info, [key])
-
-    def read(self, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of some frames of an episode, of all by default; ExportError when they cannot be read."""
-        columns = (batch.column(self._key) for batch in self._stream.batches(place))
-        yield from self.decode(place, columns if frames is None else _some_rows(columns, frames))
-
-    def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
-        """(H, W, 3) uint8 RGB of some rows of an episode, whose column was read already; ExportError as `read`."""
-        path = place.data
-        shape: tuple[int, ...] | None = None
-        for column in columns:
-            for item in column:
-                value = item.as_py()
-                data = value.get("bytes") if isinstance(value, dict) else None
-                try:
-                    image = self._decoded(data or b"")
-                    if shape not in (None, image.shape):
-                        raise ValueError(f"it is of another size, {image.shape[1]}x{image.shape[0]} pixels")
-                except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
-                    raise ExportError(
-                        f"An image of {self._key} cannot be read ({describe_error(error)}): {path}"
-                    ) from error
-                shape = image.shape
-                yield image
-
-    def _decoded(self, data: bytes) -> Rgb:
-        if not data:
-            raise ValueError("it is not in the table")
-        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
-            if image.width * image.height > MAX_PIXELS:
-                raise ValueError(f"{image.width}x{image.height} pixels, at most {MAX_PIXELS:,} are read")
-            if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
-                raise ValueError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
-            return np.asarray(image.convert("RGB"))
-
-
-def _some_rows(columns: Iterable[pa.Array], wanted: Collection[int]) -> Iterator[pa.Array]:
-    """Of a column that comes in pieces, the rows of some numbers."""
-    first = 0
-    for column in columns:
-        is_wanted = [first + row in wanted for row in range(len(column))]
-        yield column.filter(pa.array(is_wanted, pa.bool_()))
-        first += len(column)
+def _spans(offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
+    """Return (begin, bytes) of the parts of a file in which images are adjacent."""
+    ends = offsets + sizes
+    begins = np.flatnonzero(np.append(True, offsets[1:] != ends[:-1]))
+    lasts = np.append(begins[1:], len(offsets)) - 1
+    return tuple(zip(offsets[begins].tolist(), (ends[lasts] - offsets[begins]).tolist(), strict=True))

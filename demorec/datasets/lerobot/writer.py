@@ -45,7 +45,7 @@ from demorec.datasets.lerobot.layout import (
 from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, next_position, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.reader import column_values
+from demorec.datasets.lerobot.rows import column_values
 from demorec.datasets.lerobot.stats import (
     NAMES,
     PixelHistogram,

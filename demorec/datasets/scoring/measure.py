@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,9 +15,8 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.modality import dataset_roles
-from demorec.datasets.lerobot.reader import EpisodePlace, OpenDataset, RowStream
-from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
 
 _MIN_FRAMES = 8
 _HIGH = 0.65
@@ -32,7 +30,7 @@ _STEADY = 0.02
 _MAX_LAG_S = 0.5
 
 
-class Reading(NamedTuple):
+class QuantityReading(NamedTuple):
     """A number, and the first and last frame that it comes from."""
 
     value: float
@@ -40,7 +38,7 @@ class Reading(NamedTuple):
     last: int
 
 
-class Motion(NamedTuple):
+class ArmMotion(NamedTuple):
     """State and action (T, D) of the same elements; without an action the state stands for it."""
 
     state: NDArray[Any]
@@ -52,30 +50,25 @@ class MeasuredEpisode(NamedTuple):
 
     place: EpisodePlace
     flaw: str
-    readings: Mapping[str, Reading]
+    readings: Mapping[str, QuantityReading]
 
 
-def measure_dataset(root: Path, named: NamedRoles = NO_NAMES) -> list[MeasuredEpisode]:
+def measure_dataset(dataset: LeRobotFolder) -> list[MeasuredEpisode]:
     """Measure all episodes of a dataset, in order.
-
-    Args:
-        root: Its folder.
-        named: Features whose role the user names.
 
     Raises:
         ConfigError: A named feature is missing.
         ExportError: It has no state, or its tables cannot be read.
     """
-    dataset = OpenDataset(root)
-    roles = dataset_roles(root, dataset.info, named)
+    roles = dataset.roles
     if not roles.state:
-        raise ExportError(f"No state was found to score episodes by, name it by --state FEATURE: {root}")
+        raise ExportError(f"No state was found to score episodes by, name it by --state FEATURE: {dataset.root}")
     columns = [place for place in roles.in_state(roles.action) if place is not None] if roles.action else []
     has_action = len(columns) == len(roles.elements(roles.state))
     is_gripper = roles.grippers()
-    stream = RowStream(dataset.info, list(dict.fromkeys((*roles.state, *roles.action))))
+    stream = dataset.rows(list(dict.fromkeys((*roles.state, *roles.action))))
     flaws: list[str] = []
-    motions: list[Motion | None] = []
+    motions: list[ArmMotion | None] = []
     for place in dataset.places:
         rows = stream.numbers(place)
         flaws.append(_flaw(rows, place.length))
@@ -83,9 +76,9 @@ def measure_dataset(root: Path, named: NamedRoles = NO_NAMES) -> list[MeasuredEp
             motions.append(None)
             continue
         state = _joined(roles.state, rows)
-        motions.append(Motion(state, _joined(roles.action, rows)[:, columns] if has_action else state))
+        motions.append(ArmMotion(state, _joined(roles.action, rows)[:, columns] if has_action else state))
     known = [motion for motion in motions if motion is not None]
-    ranges = Motion(_range([motion.state for motion in known]), _range([motion.action for motion in known]))
+    ranges = ArmMotion(_range([motion.state for motion in known]), _range([motion.action for motion in known]))
     fps = float(dataset.info.fps)
     readings = [{} if motion is None else _readings(motion, ranges, is_gripper, fps) for motion in motions]
     return [MeasuredEpisode(*parts) for parts in zip(dataset.places, flaws, readings, strict=True)]
@@ -122,7 +115,9 @@ def _shares(values: NDArray[Any], ranges: Array) -> Array:
     return np.asarray((values - ranges[0]) / np.maximum(width, floor), dtype=np.float64)
 
 
-def _readings(motion: Motion, ranges: Motion, is_gripper: NDArray[np.bool_], fps: float) -> dict[str, Reading]:
+def _readings(
+    motion: ArmMotion, ranges: ArmMotion, is_gripper: NDArray[np.bool_], fps: float
+) -> dict[str, QuantityReading]:
     state = _shares(motion.state[:, ~is_gripper], ranges.state[:, ~is_gripper])
     action = _shares(motion.action[:, ~is_gripper], ranges.action[:, ~is_gripper])
     openings = _shares(motion.state[:, is_gripper], ranges.state[:, is_gripper])
@@ -131,42 +126,42 @@ def _readings(motion: Motion, ranges: Motion, is_gripper: NDArray[np.bool_], fps
     last = len(state) - 1
     readings = {
         "pause": _pause(state, openings, fps),
-        "duration": Reading(float(np.log(len(state) / fps)), 0, last),
-        "switches": Reading(len(switches), 0, last),
+        "duration": QuantityReading(float(np.log(len(state) / fps)), 0, last),
+        "switches": QuantityReading(len(switches), 0, last),
         "path": _detour(state, [0, *(frame for frame in switches if frame < last), last]),
         "noise": _roughness(action),
     }
     lag = None if motion.action is motion.state else _lag(state, action, fps)
-    return readings if lag is None else readings | {"lag": Reading(lag, 0, last)}
+    return readings if lag is None else readings | {"lag": QuantityReading(lag, 0, last)}
 
 
-def _pause(state: Array, openings: Array, fps: float) -> Reading:
+def _pause(state: Array, openings: Array, fps: float) -> QuantityReading:
     """Return the longest time for which arm (T, K) and grippers (T, G) stand still amid the motion."""
     steps = np.linalg.norm(np.diff(state, axis=0), axis=1)
     is_still = steps < _STILL_RATIO * max(float(np.quantile(steps, 0.9)), 1e-9)
     is_still &= (np.abs(np.diff(openings, axis=0)) < _STEADY).all(axis=1)
     moving = np.flatnonzero(~is_still)
     if len(moving) < 2:
-        return Reading(0.0, 0, len(state) - 1)
+        return QuantityReading(0.0, 0, len(state) - 1)
     gaps = np.diff(moving) - 1
     longest = int(np.argmax(gaps))
-    return Reading(float(gaps[longest]) / fps, int(moving[longest]) + 1, int(moving[longest + 1]))
+    return QuantityReading(float(gaps[longest]) / fps, int(moving[longest]) + 1, int(moving[longest + 1]))
 
 
-def _detour(state: Array, bounds: Sequence[int]) -> Reading:
+def _detour(state: Array, bounds: Sequence[int]) -> QuantityReading:
     """Return how much longer the path is than straight lines between the bounds, and the stretch with most of it."""
     excess = []
     for first, last in pairwise(bounds):
         path = float(np.linalg.norm(np.diff(state[first : last + 1], axis=0), axis=1).sum())
         excess.append(path - float(np.linalg.norm(state[last] - state[first])))
     worst = int(np.argmax(excess))
-    return Reading(sum(excess), bounds[worst], bounds[worst + 1])
+    return QuantityReading(sum(excess), bounds[worst], bounds[worst + 1])
 
 
-def _roughness(values: Array) -> Reading:
+def _roughness(values: Array) -> QuantityReading:
     """Return the logarithm of the third differences: smooth motion has hardly any, white noise has most."""
     third = np.linalg.norm(np.diff(values, 3, axis=0), axis=1)
-    return Reading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
+    return QuantityReading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
 
 
 def _lag(state: Array, action: Array, fps: float) -> float | None:

@@ -19,8 +19,8 @@ import numpy as np
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import MAX_JSON_BYTES, read_json_limited
 from demorec.core.replacing import ReplaceableKind
-from demorec.datasets.scoring.measure import Reading, measure_dataset
-from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.scoring.measure import QuantityReading, measure_dataset
 
 MIN_SOUND = 0.8
 """Score from which a demonstration is sound."""
@@ -70,9 +70,9 @@ class EpisodeScore:
     reasons: tuple[Reason, ...]
 
 
-def score_dataset(root: Path, named: NamedRoles = NO_NAMES) -> list[EpisodeScore]:
-    """Score all episodes of a LeRobot dataset, in order; arguments and errors as `measure_dataset`."""
-    episodes = measure_dataset(root, named)
+def score_dataset(folder: LeRobotFolder) -> list[EpisodeScore]:
+    """Score all episodes of a LeRobot dataset, in order; errors as `measure_dataset`."""
+    episodes = measure_dataset(folder)
     reasons: list[list[Reason]] = [
         [Reason("flaw", 0.0, each.flaw, 0, each.place.length - 1)] if each.flaw else [] for each in episodes
     ]
@@ -101,7 +101,7 @@ def _groups(tasks: Sequence[str]) -> Iterable[list[int]]:
     return found.values()
 
 
-def _judged(name: str, readings: Mapping[int, Reading]) -> Iterator[tuple[int, Reason]]:
+def _judged(name: str, readings: Mapping[int, QuantityReading]) -> Iterator[tuple[int, Reason]]:
     """Yield (number, reason) of each reading."""
     floor, words = _QUANTITIES[name]
     values = np.array([reading.value for reading in readings.values()])

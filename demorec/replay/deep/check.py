@@ -10,10 +10,10 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.dataset import Dataset, DescribedEpisode
+from demorec.check.dataset import CheckedDataset, DescribedEpisode
 from demorec.check.run_dataset import episode_differences, export_options, with_videos
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
-from demorec.core.errors import ConfigError, DemorecError, NotAllowedError, RecordingError, resource_error
+from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.plain import digest
 from demorec.core.processes import in_turn
@@ -246,11 +246,15 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
     """
     with closing(SimulatorCache()) as simulators:
         try:
-            dataset = Dataset(path)
+            dataset = CheckedDataset(path)
             if not dataset.sidecar:
                 raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
             dataset.check_simulated()
             options = export_options(path)
+            if missing := dataset.folder.missing:
+                raise ExportError(missing)
+            for number, problem in dataset.unreadable.items():
+                yield _impossible(DeepReport(path=path / f"episode {number}"), ExportError(problem))
             for episode, videos in with_videos(dataset):
                 info = episode.info
                 report = DeepReport(

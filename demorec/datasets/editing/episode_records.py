@@ -1,0 +1,70 @@
+"""What the tables of a dataset record of each episode: values to choose and sort episodes by, and statistics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import chain
+from typing import Any
+
+from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches, tables_in
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH
+from demorec.datasets.lerobot.stats import NAMES
+
+_OLD_STATS = "meta/episodes_stats.jsonl"
+_SIDECAR = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
+"""Columns of the sidecar that episodes can be chosen by."""
+
+
+def episode_columns(folder: LeRobotFolder) -> list[dict[str, Any]]:
+    """Read what episodes are chosen and sorted by: name -> value, for each episode in order."""
+    found = [
+        {
+            "episode_index": place.episode_index,
+            "num_frames": place.length,
+            "length": place.length,
+            "duration_s": place.length / folder.info.fps,
+            "task": "; ".join(place.tasks),
+            "tasks": list(place.tasks),
+        }
+        for place in folder.places
+    ]
+    more = read_json_lines(folder.root / OLD_EPISODES_PATH) if folder.info.is_old else episode_facts(folder)
+    sidecar = {row["episode_index"]: row for row in folder.sidecar(_SIDECAR)}
+    for row, facts in zip(found, more, strict=True):
+        known = {**sidecar.get(row["episode_index"], {}), **facts}
+        row |= {name: value for name, value in known.items() if name not in row}
+    return found
+
+
+def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
+    """Read the columns of the episodes' table beyond LeRobot's own, for each episode in order."""
+    if folder.info.is_old:
+        return [{} for _ in folder.places]
+    found: list[dict[str, Any]] = []
+    for path in tables_in(folder.root, "meta/episodes"):
+        there = open_table(path).schema_arrow.names
+        for batch in table_batches(path, ["episode_index", *(name for name in folder.fact_types if name in there)]):
+            found += batch.to_pylist()
+    return found
+
+
+def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
+    """Yield (episode_index, feature, its statistics as LeRobot writes them) where a table has all ten."""
+    if folder.info.is_old:
+        path = folder.root / _OLD_STATS
+        for line in read_json_lines(path) if path.exists() else ():
+            stats, number = line.get("stats"), line.get("episode_index")
+            if isinstance(stats, dict) and isinstance(number, int):
+                yield from ((number, name, stats[name]) for name in features if isinstance(stats.get(name), dict))
+        return
+    for path in tables_in(folder.root, "meta/episodes"):
+        there = set(open_table(path).schema_arrow.names)
+        columns = {name: [f"stats/{name}/{key}" for key in NAMES] for name in features}
+        complete = {name: wanted for name, wanted in columns.items() if there.issuperset(wanted)}
+        for batch in table_batches(path, ["episode_index", *chain.from_iterable(complete.values())]):
+            for row in batch.to_pylist():
+                for name, wanted in complete.items():
+                    values = [row[column] for column in wanted]
+                    if None not in values:
+                        yield row["episode_index"], name, dict(zip(NAMES, values, strict=True))

@@ -1,0 +1,137 @@
+"""The tables of episodes and of tasks: which episodes a dataset has, and where their rows and images are stored."""
+
+from __future__ import annotations
+
+import reprlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.files import read_json_lines, read_table, tables_in
+from demorec.datasets.lerobot.layout import (
+    OLD_EPISODES_PATH,
+    OLD_TASKS_PATH,
+    TASKS_PATH,
+    VIDEO_PATH,
+    DatasetInfo,
+    FilePosition,
+)
+
+_MAX_VALUE = 1 << 40
+"""Above all rows, frames and seconds of any dataset."""
+_VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")
+"""Columns that locate the images of an episode, for each camera."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodePlace:
+    """Where the rows and images of an episode are stored.
+
+    Attributes:
+        episode_index, length, tasks: As in the episodes' table.
+        data: File of its rows.
+        first_row: Of its rows in that file.
+        from_index: Of its first row over the whole dataset.
+        videos: Camera feature -> (mp4 file, first image in it).
+    """
+
+    episode_index: int
+    length: int
+    tasks: tuple[str, ...]
+    data: Path
+    first_row: int
+    from_index: int
+    videos: dict[str, tuple[Path, int]]
+
+
+def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
+    """Read the place of every episode in order. Raises ExportError if a table cannot be read."""
+    columns = ["episode_index", "length", "tasks", "data/chunk_index", "data/file_index", "dataset_from_index"]
+    for key in info.video_keys:
+        columns += [f"videos/{key}/{name}" for name in _VIDEO_COLUMNS]
+    if info.is_old:
+        rows = _old_rows(root, info)
+    else:
+        rows = (
+            (path, row) for path in tables_in(root, "meta/episodes") for row in read_table(path, columns).to_pylist()
+        )
+    ends: dict[Path, int] = {}
+
+    @cache  # many episodes share a file
+    def file(template: str, key: str, chunk: int, number: int) -> Path:
+        return root / FilePosition(chunk=chunk, file=number).path(template, key)
+
+    for path, row in rows:
+        _check_row(row, path)
+        data = file(info.data_path, "", row["data/chunk_index"], row["data/file_index"])
+        first = ends.get(data, 0)
+        ends[data] = first + row["length"]
+        videos = {}
+        for key in info.video_keys:
+            chunk, number, start = (row[f"videos/{key}/{name}"] for name in _VIDEO_COLUMNS)
+            videos[key] = file(info.video_path or VIDEO_PATH, key, chunk, number), round(start * info.fps)
+        yield EpisodePlace(
+            episode_index=row["episode_index"],
+            length=row["length"],
+            tasks=tuple(row["tasks"]),
+            data=data,
+            first_row=first,
+            from_index=row["dataset_from_index"],
+            videos=videos,
+        )
+
+
+def _old_rows(root: Path, info: DatasetInfo) -> Iterator[tuple[Path, dict[str, Any]]]:
+    """Convert the lines of a table before v3.0, where each episode has its own files, to the columns of v3.0."""
+    path, begin = root / OLD_EPISODES_PATH, 0
+    for line in read_json_lines(path):
+        row: dict[str, Any] = {name: line.get(name) for name in ("episode_index", "length", "tasks")}
+        _check_row(row, path)
+        number = row["episode_index"]
+        row |= {"data/chunk_index": number // int(info.chunks_size), "data/file_index": number}
+        row["dataset_from_index"] = begin
+        for key in info.video_keys:
+            row |= {f"videos/{key}/{name}_index": row[f"data/{name}_index"] for name in ("chunk", "file")}
+            row[f"videos/{key}/from_timestamp"] = 0
+        begin += row["length"]
+        yield path, row
+
+
+def _check_row(row: dict[str, Any], path: Path) -> None:
+    """Raise ExportError if a row of the episodes' table has values that no position can have."""
+    for name, value in row.items():
+        if name == "tasks":
+            is_good = isinstance(value, list) and all(isinstance(task, str) for task in value)
+        elif name.endswith("/from_timestamp"):
+            is_good = isinstance(value, float | int) and 0 <= value < _MAX_VALUE
+        else:
+            is_good = isinstance(value, int) and 0 <= value < _MAX_VALUE
+        if not is_good:
+            raise ExportError(f"The episodes' table has {reprlib.repr(value)} as {name}: {path}")
+
+
+def read_tasks(root: Path) -> list[str]:
+    """Read the instructions in the order of their indices. Raises ExportError if the table cannot be read."""
+    path = root / TASKS_PATH
+    if not path.exists() and (root / OLD_TASKS_PATH).exists():
+        path = root / OLD_TASKS_PATH
+        lines = [(line.get("task_index"), str(line.get("task"))) for line in read_json_lines(path)]
+        if not all(isinstance(index, int) for index, _ in lines):
+            raise ExportError(f"The tasks' table has no task_index: {path}")
+        return [task for _, task in sorted(lines)]
+    table = read_table(path)
+    # pandas names an index column without a name.
+    column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
+    if (
+        column is None
+        or "task_index" not in table.column_names
+        or not pa.types.is_integer(table.schema.field("task_index").type)
+    ):
+        raise ExportError(f"The tasks' table has no task or no task_index: {path}")
+    rows = zip(table.column("task_index").to_pylist(), table.column(column).to_pylist(), strict=True)
+    return [str(task) for _, task in sorted(rows, key=lambda row: -1 if row[0] is None else row[0])]

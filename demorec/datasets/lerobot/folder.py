@@ -1,0 +1,294 @@
+"""A LeRobot dataset of format v2.0 to v3.0, whoever wrote it.
+
+    folder = LeRobotFolder(root)
+    rows = folder.rows(["observation.state", "action"])
+    for place in folder.places:
+        rows.numbers(place)["action"]
+        folder.video("observation.images.front", place).images()
+
+Files are opened when something of them is asked for, so that a missing or damaged one spoils only its episodes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from functools import cached_property, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import pyarrow as pa
+
+from demorec.core.errors import ConfigError, ExportError, describe_error
+from demorec.datasets.lerobot.episode_table import EpisodePlace, read_episode_table, read_tasks
+from demorec.datasets.lerobot.files import open_table, read_json, table_batches, tables_in
+from demorec.datasets.lerobot.language import COLUMNS
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
+from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.datasets.lerobot.rows import DataRows, IndexedRows
+from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
+
+# What reads videos, images, robots and the sidecar takes longer to load than to read the numbers of most datasets.
+if TYPE_CHECKING:
+    from demorec.datasets.lerobot.attempts import Attempts
+    from demorec.datasets.lerobot.robots import DatasetRobot
+    from demorec.datasets.lerobot.stored_images import StoredImages
+    from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
+    from demorec.episode.info import Camera, Feature, Kept
+    from demorec.robots.motors import Motors
+
+_MAX_OPEN_VIDEOS = 16
+"""Video files of which the index is kept: that of 15 minutes takes one MB."""
+_KNOWN = ("source", "success", "failure_reason", "root_seed", "cameras", "robot_digest")
+"""Columns of the sidecar that recordings of other robots can hold; the rest is of simulated episodes alone."""
+
+
+class LeRobotFolder:
+    """An open dataset.
+
+    Args:
+        root: Its folder.
+        motors: The servos whose values its state and actions are, if the user says so.
+        named: Features whose role the user names.
+
+    Attributes:
+        root, motors: As given.
+        info: The content of meta/info.json.
+
+    Raises:
+        ConfigError: The dataset has no state of these servos.
+        ExportError: info.json is missing or damaged. Methods and properties raise it where other files are.
+    """
+
+    def __init__(self, root: Path, motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
+        self.root, self.motors, self._named = root, motors, named
+        self.info = DatasetInfo.load(root)
+        if motors is not None and self.roles.elements(self.roles.state) != motors.names:
+            raise ConfigError(
+                f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
+            )
+        self.open_video = lru_cache(maxsize=_MAX_OPEN_VIDEOS)(self._video_file)
+        self._cameras: dict[str, Camera] = {}
+        self._robots: dict[str, DatasetRobot] = {}
+
+    def _video_file(self, path: Path) -> VideoFile:
+        from demorec.datasets.lerobot.videos import VideoFile
+
+        return VideoFile(path, self.info.fps)
+
+    @cached_property
+    def roles(self) -> Roles:
+        """The role of each feature. Raises ConfigError if the dataset lacks one that the user names."""
+        from demorec.datasets.lerobot.modality import dataset_roles
+
+        return dataset_roles(self.root, self.info, self._named)
+
+    @cached_property
+    def listed(self) -> tuple[EpisodePlace, ...]:
+        """The episodes of the episodes' table, in order."""
+        return tuple(read_episode_table(self.root, self.info))
+
+    @property
+    def missing(self) -> str:
+        """In how many episodes info.json and the episodes' table differ, as a sentence; "" if in none."""
+        counted = int(self.info.total_episodes), int(self.info.total_frames)
+        listed = len(self.listed), sum(place.length for place in self.listed)
+        if counted == listed:
+            return ""
+        return (
+            f"The dataset is not whole: {INFO_PATH} counts {counted[0]} episodes of {counted[1]} frames, its table of "
+            f"episodes has {listed[0]} of {listed[1]}. Complete the recording or the download: {self.root}"
+        )
+
+    @cached_property
+    def places(self) -> tuple[EpisodePlace, ...]:
+        """All episodes, in order. Raises ExportError if there are more or fewer than info.json counts."""
+        if missing := self.missing:
+            raise ExportError(missing)
+        return self.listed
+
+    @cached_property
+    def tasks(self) -> list[str]:
+        """Instructions in the order of their indices."""
+        return read_tasks(self.root)
+
+    @cached_property
+    def statistics(self) -> Mapping[str, Any]:
+        """The content of meta/stats.json, an object for each feature."""
+        path = self.root / STATS_PATH
+        try:
+            found = read_json(path)
+            if not isinstance(found, dict) or not all(isinstance(entry, dict) for entry in found.values()):
+                raise ValueError("it is not an object of objects")
+        except (OSError, ValueError) as error:
+            raise ExportError(f"The statistics cannot be read ({describe_error(error)}): {path}") from error
+        return found
+
+    @cached_property
+    def num_rows(self) -> Mapping[Path, int]:
+        """Data file -> number of rows that its episodes have."""
+        found: dict[Path, int] = {}
+        for place in self.listed:
+            found[place.data] = found.get(place.data, 0) + place.length
+        return found
+
+    def count_rows(self) -> int:
+        """Count the rows of all data files, by their footers."""
+        return sum(open_table(path).metadata.num_rows for path in tables_in(self.root, "data"))
+
+    def rows(self, names: Sequence[str]) -> DataRows:
+        """Read some columns of the data files."""
+        return DataRows(self.info.features, self.num_rows, names)
+
+    @property
+    def columns(self) -> list[str]:
+        """Features that are stored in the data files."""
+        return [name for name, feature in self.info.features.items() if not feature.is_video]
+
+    def video(self, key: str, place: EpisodePlace) -> EpisodeVideo:
+        """Open the images of a video feature in an episode."""
+        from demorec.datasets.lerobot.videos import EpisodeVideo
+
+        return EpisodeVideo(self.open_video, key, self.info.features[key], place, int(self.info.fps))
+
+    @cached_property
+    def stored_images(self) -> Mapping[str, StoredImages]:
+        """Feature -> its images, of those whose images are stored in the data files."""
+        from demorec.datasets.lerobot.stored_images import StoredImages
+
+        keys = [name for name, feature in self.info.features.items() if feature.dtype == "image"]
+        return {key: StoredImages(self.rows([key])) for key in keys}
+
+    def sidecar_tables(self, table: str) -> list[Path]:
+        """List the files of a table of the sidecar: "episodes", "attempts", or "camera_poses"."""
+        return tables_in(self.root, f"{SIDECAR_DIR}/{table}")
+
+    def sidecar_rows(self, table: str, episode_index: int) -> list[dict[str, Any]]:
+        """Read all that a table of the sidecar has of an episode."""
+        found = IndexedRows(self.sidecar_tables(table), rows=64).read(episode_index)
+        return [] if found is None else found.to_pylist()
+
+    def sidecar(self, names: Sequence[str]) -> list[dict[str, Any]]:
+        """Read columns of the sidecar's row of every episode, None where a table lacks one; empty without a sidecar."""
+        tables = self.sidecar_tables("episodes")
+        if not tables:
+            return []
+        from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
+
+        found: list[dict[str, Any]] = []
+        for path in tables:
+            schema = open_table(path, ["episode_index"]).schema_arrow
+            there = [name for name in ("episode_index", *names) if name in schema.names]
+            for name in there:
+                if schema.field(name).type != EPISODE_SCHEMA.field(name).type:
+                    raise ExportError(f"The column {name} of the sidecar is {schema.field(name).type}: {path}")
+            for batch in table_batches(path, there):
+                found += [dict.fromkeys(names) | row for row in batch.to_pylist()]
+        return found
+
+    @cached_property
+    def attempts(self) -> Attempts:
+        """The attempts of the sidecar."""
+        from demorec.datasets.lerobot.attempts import Attempts
+
+        return Attempts(self.sidecar_tables("attempts"))
+
+    @cached_property
+    def fact_types(self) -> Mapping[str, pa.DataType]:
+        """Columns of the episodes' table beyond LeRobot's own -> their types; empty before v3.0."""
+        from demorec.datasets.lerobot.facts import fact_columns
+
+        return fact_columns(self.root)
+
+    @cached_property
+    def known(self) -> Mapping[int, dict[str, Any]]:
+        """Episode index -> what the sidecar knows of it, as far as any recording can hold it."""
+        return {row["episode_index"]: row for row in self.sidecar(_KNOWN)}
+
+    @cached_property
+    def has_one_robot(self) -> bool:
+        """Whether the sidecar describes the same robot for all episodes, or none for any."""
+        return len({self.known.get(place.episode_index, {}).get("robot_digest") for place in self.places}) <= 1
+
+    def robot(self, digest: str) -> DatasetRobot:
+        """Read the arm that episodes name by this digest."""
+        from demorec.datasets.lerobot.robots import read_robot
+
+        if digest not in self._robots:
+            self._robots[digest] = read_robot(self.root, digest)
+        return self._robots[digest]
+
+    @cached_property
+    def features(self) -> tuple[Feature, ...]:
+        """The numbers that its recordings have."""
+        from demorec.datasets.lerobot.recorded_features import recorded_feature, why_not_recorded
+
+        roles = self.roles.beyond_names()
+        return tuple(
+            replace(recorded_feature(name, feature, self.roles.columns[name].elements), role=roles.get(name, ""))
+            for name, feature in self.info.features.items()
+            if not (feature.is_camera or name in AUTOMATIC_FEATURES or why_not_recorded(name, feature))
+        )
+
+    def leave_out(self, name: str) -> None:
+        """Let no recording have a feature."""
+        self.features = tuple(feature for feature in self.features if feature.name != name)
+
+    @cached_property
+    def keys(self) -> Mapping[str, str]:
+        """Camera, as its recordings name it -> feature. Raises ConfigError if two would get one name."""
+        from demorec.datasets.lerobot.recorded_features import camera_name, why_not_recorded
+
+        found: dict[str, str] = {}
+        for key, feature in self.info.features.items():
+            if not feature.is_camera or why_not_recorded(key, feature):
+                continue
+            if (name := camera_name(key)) in found:
+                raise ConfigError(f"Two cameras of the dataset would be called {name!r}: {self.root}")
+            found[name] = key
+        return found
+
+    def camera(self, name: str) -> Camera:
+        """Describe a camera by its first file or image that can be read."""
+        if name not in self._cameras:
+            self._cameras[name] = self._described(name, self.keys[name])
+        return self._cameras[name]
+
+    def _described(self, name: str, key: str) -> Camera:
+        from demorec.episode.info import Camera
+
+        problem = ExportError(f"The dataset has no image of {key}: {self.root}")
+        for number, place in enumerate(self.listed):
+            try:
+                width, height, kept = self._image_format(key, place)
+            except ExportError as error:
+                problem = problem if number else error
+            else:
+                return Camera(name=name, width=width, height=height, kept=kept, source=key)
+        raise problem
+
+    def _image_format(self, key: str, place: EpisodePlace) -> tuple[int, int, Kept]:
+        """Width, height and codec ("" if encoded as single images) of a camera in an episode."""
+        feature = self.info.features[key]
+        if feature.is_depth:
+            height, width = feature.shape[:2]
+            return width, height, "32FC1"
+        if feature.is_video:
+            file = self.open_video(place.videos[key][0])
+            return *file.size, file.codec
+        first = next(self.stored_images[key].read(place, [0]), None)
+        if first is None:
+            raise ExportError(f"Episode {place.episode_index} has no image of {key}: {place.data}")
+        return first.shape[1], first.shape[0], ""
+
+    @cached_property
+    def recorded_rows(self) -> DataRows:
+        """Read the columns that recordings need: features, times, tasks and outcomes."""
+        names = [*(feature.name for feature in self.features), "timestamp", "task_index"]
+        return self.rows([*names, *(name for name in ("next.success",) if name in self.info.features)])
+
+    @cached_property
+    def language_rows(self) -> DataRows | None:
+        """Read the language columns; None in a dataset without them."""
+        spoken = {name for name, feature in self.info.features.items() if feature.dtype == "language"}
+        return self.rows(COLUMNS) if spoken >= set(COLUMNS) else None

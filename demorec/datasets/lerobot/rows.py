@@ -1,0 +1,207 @@
+"""Rows of a dataset's tables by episode: those of the data files, and those of tables with an `episode_index`."""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from demorec.core.errors import ExportError, describe_error
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.files import TableReader, column_numbers, open_table, table_batches
+from demorec.datasets.lerobot.language import column_digests
+from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.paths import INFO_PATH
+
+_NUMBERS = ("float32", "float64", "int64", "bool")
+_OWN = ("episode_index", "frame_index")
+"""Columns that prove whose rows these are."""
+_INDEX_ROWS = 4096
+
+
+class DataRows:
+    """Some columns of the data files, episode after episode, in any order; one batch of a file is in memory.
+
+    Every row is proven to be the episode's own: by its `episode_index` and, where the file has one, `frame_index`.
+
+    Args:
+        features: Of the dataset.
+        num_rows: Data file -> number of rows that its episodes have.
+        names: Columns to read.
+
+    Attributes:
+        names: Columns to read.
+
+    Methods raise ExportError if the rows cannot be read, or are those of other episodes.
+    """
+
+    def __init__(
+        self, features: Mapping[str, DatasetFeature], num_rows: Mapping[Path, int], names: Sequence[str]
+    ) -> None:
+        if missing := [name for name in names if name not in features]:
+            raise ExportError(f"The dataset has no {', '.join(missing)}, by {INFO_PATH}")
+        self.names = list(names)
+        self._features = {name: features[name] for name in names}
+        self._num_rows = num_rows
+        kinds = {feature.dtype for feature in self._features.values()}
+        max_rows = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
+        self._tables = TableReader(names, optional=_OWN, rows=max_rows)
+
+    def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
+        """Yield the rows of an episode."""
+        found = 0
+        if place.length:
+            self._check_count(place)
+        for batch in self._tables.read(place.data, place.first_row, place.length) if place.length else ():
+            _check_own(batch, place, found)
+            found += len(batch)
+            yield batch
+        if found < place.length:
+            raise ExportError(
+                f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {place.data}"
+            )
+
+    def _check_count(self, place: EpisodePlace) -> None:
+        """Raise ExportError if the episodes' table lists fewer rows than the file of an episode has."""
+        there, listed = self._tables.num_rows(place.data), self._num_rows[place.data]
+        if there > listed:
+            raise ExportError(
+                f"The data file has {there} rows, the episodes' table only lists {listed} of them, so that it is not "
+                f"complete: {place.data}"
+            )
+
+    def read(self, place: EpisodePlace) -> pa.Table:
+        """Read all rows of an episode. Raises ExportError also if it has none."""
+        if not place.length:
+            raise ExportError(
+                f"Episode {place.episode_index} has no frames, drop that episode: its data would be in {place.data}"
+            )
+        return pa.Table.from_batches(list(self.batches(place)))
+
+    def numbers(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
+        """Read feature -> (T, D) numbers of an episode as info.json describes them, or (T, 1) texts.
+
+        Of language and of stored images, the texts are digests of each row.
+        """
+        parts = [
+            [self._values(name, batch.column(name), place) for name in self.names] for batch in self.batches(place)
+        ]
+        if not parts:
+            return {name: np.zeros((0, 1)) for name in self.names}
+        columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
+        return dict(zip(self.names, columns, strict=True))
+
+    def _values(self, name: str, column: pa.Array, place: EpisodePlace) -> NDArray[Any]:
+        feature = self._features[name]
+        with _column_errors(name, place):
+            if feature.dtype == "language":
+                values = column_digests(column)
+            elif feature.dtype == "image":
+                values = _image_digests(column)
+            else:
+                values = column_values(column)
+        if feature.dtype in _NUMBERS and values.shape[1:] != (math.prod(feature.shape),):
+            raise ExportError(
+                f"The column {name} has {values.shape[1:]} values, expected {feature.shape}: {place.data}"
+            )
+        return values
+
+
+def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int) -> None:
+    """Raise ExportError unless a batch, the first row of which is the frame `begin`, has rows of this episode."""
+    expected = {"episode_index": place.episode_index, "frame_index": np.arange(begin, begin + len(batch))}
+    for name, numbers in expected.items():
+        if name not in batch.schema.names:
+            continue
+        with _column_errors(name, place):
+            found = column_values(batch.column(name))[:, 0]
+        if len(wrong := np.flatnonzero(found != numbers)):
+            raise ExportError(
+                f"The rows of episode {place.episode_index} are not its own: frame {begin + int(wrong[0])} has the "
+                f"{name} {found[wrong[0]]}. Restore the file, or drop the episode: {place.data}"
+            )
+
+
+@contextmanager
+def _column_errors(name: str, place: EpisodePlace) -> Iterator[None]:
+    """Turn the errors of a column with unexpected content into an ExportError."""
+    try:
+        yield
+    except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
+        raise ExportError(f"The column {name} holds something else than numbers: {place.data}") from error
+
+
+def column_values(column: pa.Array) -> NDArray[Any]:
+    """Convert a column to (T, D) numbers, or (T, 1) texts."""
+    if str(column.type) in ("string", "large_string"):
+        return np.array(column.to_pylist(), dtype=np.str_).reshape(-1, 1)
+    return column_numbers(column)
+
+
+def _image_digests(column: pa.Array) -> NDArray[np.str_]:
+    """(T, 1) SHA-256 (hex) of each encoded image."""
+    images = column.field("bytes") if pa.types.is_struct(column.type) else column
+    digests = [hashlib.sha256(data or b"").hexdigest() for data in images.to_pylist()]
+    return np.array(digests, dtype=np.str_).reshape(-1, 1)
+
+
+class IndexedRows:
+    """Rows of tables with a column `episode_index`, by episode.
+
+    Args:
+        paths: The tables.
+        schema: Columns to read, null where a table lacks one; by default those of the first table.
+        rows: Maximum number of rows in a batch.
+
+    Methods raise ExportError if the tables cannot be read.
+    """
+
+    def __init__(self, paths: Sequence[Path], schema: pa.Schema | None = None, *, rows: int) -> None:
+        self._parts: dict[int, list[tuple[Path, int, int]]] = {}
+        for path in paths:
+            there, first = open_table(path, ["episode_index"]).schema_arrow, 0
+            schema = schema or there.remove_metadata()
+            for batch in table_batches(path, ["episode_index"], rows=_INDEX_ROWS):
+                episodes = column_numbers(batch.column(0))[:, 0]
+                begins = [0, *(np.flatnonzero(np.diff(episodes)) + 1).tolist()]
+                for begin, end in zip(begins, [*begins[1:], len(episodes)], strict=True):
+                    self._parts.setdefault(int(episodes[begin]), []).append((path, first + begin, end - begin))
+                first += len(batch)
+        self._schema = schema or pa.schema([])
+        self._tables = TableReader(["episode_index"], optional=self._schema.names, rows=rows)
+
+    def read(self, episode_index: int) -> pa.Table | None:
+        """Read all rows of an episode; None if there are none."""
+        batches = [
+            self._conformed(batch, path)
+            for path, first, count in self._parts.get(episode_index, ())
+            for batch in self._tables.read(path, first, count)
+        ]
+        return pa.Table.from_batches(batches) if batches else None
+
+    def frames(self, episode_index: int, first: int, last: int) -> pa.Table | None:
+        """Read the rows with a `frame_index` from `first` to before `last`, in order."""
+        if (rows := self.read(episode_index)) is None:
+            return None
+        frames = rows.column("frame_index").to_numpy()
+        kept = np.flatnonzero((frames >= first) & (frames < last))
+        return rows.take(pa.array(kept[np.argsort(frames[kept], kind="stable")]))
+
+    def _conformed(self, batch: pa.RecordBatch, path: Path) -> pa.RecordBatch:
+        try:
+            columns = [
+                batch.column(item.name).cast(item.type)
+                if item.name in batch.schema.names
+                else pa.nulls(len(batch), item.type)
+                for item in self._schema
+            ]
+            return pa.RecordBatch.from_arrays(columns, schema=self._schema)
+        except (ValueError, pa.ArrowException) as error:
+            raise ExportError(f"The table has columns of other types ({describe_error(error)}): {path}") from error

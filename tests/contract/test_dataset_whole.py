@@ -1,0 +1,237 @@
+"""Every command that reads a dataset notices missing episodes and rows of other episodes, and one damaged file spoils
+only its own episode."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from support.check import checked
+from support.commands import exit_code, words_of
+from support.export import content_of, export, make_run, recordings
+
+NUM_EPISODES, LENGTH = 4, 8
+READERS = {
+    "info": "info PATH",
+    "check": "check PATH --only dataset_readable dataset_counts",
+    "view": "view PATH --episodes 1 --save NEW.rrd",
+    "export-hdf5": "export hdf5 PATH --out NEW.hdf5",
+    "export-lerobot": "export lerobot PATH --out NEW --no-verify",
+    "import": "import lerobot PATH --out NEW",
+    "select": "dataset select PATH --episodes 0:3 --out NEW",
+    "drop": "dataset drop PATH --episodes 0 --out NEW",
+    "trim": "dataset trim PATH --head 1 --out NEW",
+    "trim-idle": "dataset trim PATH --idle --out NEW",
+    "split": "dataset split PATH --shares a=0.5 b=0.5 --out NEW",
+    "merge": "dataset merge PATH PATH --out NEW",
+    "rename": "dataset rename PATH action=command --out NEW",
+    "drop-features": "dataset drop-features PATH next.reward --out NEW",
+    "set-task": "dataset set-task PATH --task push --out NEW",
+    "reorder": "dataset reorder PATH --by num_frames --out NEW",
+    "shuffle": "dataset shuffle PATH --out NEW",
+    "diff": "dataset diff PATH PATH",
+    "score": "dataset score PATH --out NEW.json",
+}
+"""Command -> how it is called with a PATH; what it writes begins with NEW."""
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return make_run(tmp_path_factory.mktemp("whole") / "run", [LENGTH] * NUM_EPISODES, cameras=("front",))
+
+
+@pytest.fixture(scope="module")
+def exported(run: Path) -> Path:
+    """A dataset with all rows in one file, and all images in another one."""
+    export(run, run / "dataset")
+    return run / "dataset"
+
+
+@pytest.fixture(scope="module")
+def apart(run: Path) -> Path:
+    """The same with files of its own for each episode."""
+    export(run, run.parent / "apart", data_files_mb=1e-6, video_files_mb=1e-6)
+    assert len(list((run.parent / "apart").glob("data/*/*.parquet"))) == NUM_EPISODES
+    return run.parent / "apart"
+
+
+def change_table(root: Path, place: str, change: Callable[[pa.Table], pa.Table]) -> None:
+    (path,) = root.glob(f"{place}/*/*.parquet")
+    table = pq.read_table(path)
+    changed = change(table)
+    assert not changed.equals(table)
+    pq.write_table(changed, path)
+
+
+def without_table(root: Path) -> None:
+    shutil.rmtree(root / "meta/episodes")
+
+
+def short_table(root: Path) -> None:
+    change_table(root, "meta/episodes", lambda table: table.slice(0, NUM_EPISODES - 1))
+
+
+def short_table_and_info(root: Path) -> None:
+    """The counts of info.json fit, and only the rows show that an episode is missing."""
+    short_table(root)
+    info = json.loads((root / "meta/info.json").read_text())
+    info |= {"total_episodes": NUM_EPISODES - 1, "total_frames": (NUM_EPISODES - 1) * LENGTH}
+    (root / "meta/info.json").write_text(json.dumps(info))
+
+
+def longer_episode(root: Path) -> None:
+    lengths = pa.array([LENGTH] * (NUM_EPISODES - 1) + [LENGTH + 1])
+    change_table(root, "meta/episodes", lambda t: t.set_column(t.schema.get_field_index("length"), "length", lengths))
+
+
+def exchanged_rows(root: Path) -> None:
+    """Two rows of the episodes 1 and 2 change places."""
+    order = np.arange(NUM_EPISODES * LENGTH)
+    order[[LENGTH + 2, 2 * LENGTH + 3]] = order[[2 * LENGTH + 3, LENGTH + 2]]
+    change_table(root, "data", lambda table: table.take(pa.array(order)))
+
+
+def rows_of_one_episode_exchanged(root: Path) -> None:
+    order = np.arange(NUM_EPISODES * LENGTH)
+    order[[LENGTH + 2, LENGTH + 3]] = order[[LENGTH + 3, LENGTH + 2]]
+    change_table(root, "data", lambda table: table.take(pa.array(order)))
+
+
+FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
+    "no table of episodes": (without_table, ("is not whole", "total_episodes is 4, found 0")),
+    "an episode less in the table": (short_table, ("is not whole", "total_episodes is 4, found 3")),
+    "an episode less in table and info": (short_table_and_info, ("has 32 rows",)),
+    "an episode that is longer": (longer_episode, ("is not whole", "total_frames is 32, found 33")),
+    "rows exchanged between episodes": (exchanged_rows, ("not its own",)),
+    "rows exchanged in an episode": (rows_of_one_episode_exchanged, ("not its own",)),
+}
+"""Fault -> what makes it, and the words of which one names it."""
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.parametrize("command", READERS)
+def test_a_dataset_that_is_not_whole_is_refused(
+    command: str, fault: str, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(exported, tmp_path / "d"))
+    spoil, words = FAULTS[fault]
+    spoil(root)
+    before = content_of(root)
+    code = exit_code(*words_of(READERS[command], root, tmp_path / "new"))
+    assert code == {"info": 0, "diff": 2}.get(command, 1)  # info lists problems, and 1 of diff means a difference
+    captured = capsys.readouterr()
+    assert any(text in captured.out + captured.err for text in words)
+    assert content_of(root) == before
+    written = [path for path in tmp_path.glob("new*") for path in (path, *path.rglob("*")) if path.is_file()]
+    # An import goes on with the recordings, and a split writes the parts one after the other.
+    assert not written or (command in ("import", "split") and fault.startswith("rows exchanged"))
+
+
+def test_the_commands_succeed_on_the_whole_one(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    codes = {name: exit_code(*words_of(call, exported, tmp_path / name)) for name, call in READERS.items()}
+    assert codes == dict.fromkeys(READERS, 0), capsys.readouterr().err
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_dataset_that_is_not_whole_is_not_appended_to(
+    fault: str, run: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(exported, tmp_path / "d"))
+    FAULTS[fault][0](root)
+    before = content_of(root)
+    assert exit_code("export", "lerobot", recordings(run)[0], "--out", root, "--append", "--no-verify") == 1
+    told = capsys.readouterr().err
+    assert "is not whole" in told or "not its own" in told
+    assert content_of(root) == before
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_report_names_the_fault(
+    fault: str, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(exported, tmp_path / "d"))
+    spoil, words = FAULTS[fault]
+    spoil(root)
+    code = exit_code("report", root, "--no-checks", "--out", tmp_path / "page.html")
+    told = (tmp_path / "page.html").read_text() if code == 0 else capsys.readouterr().err
+    assert any(text in told for text in words)
+
+
+@pytest.fixture(params=["data", "videos"])
+def spoilt(request: pytest.FixtureRequest, apart: Path, tmp_path: Path) -> tuple[Path, Path]:
+    """A dataset without one file of the episode 1, and that file."""
+    root = Path(shutil.copytree(apart, tmp_path / "d"))
+    (path,) = root.glob(f"{request.param}/**/file-001.*")
+    path.unlink()
+    return root, path
+
+
+def test_the_checks_judge_the_other_episodes(spoilt: tuple[Path, Path]) -> None:
+    root, path = spoilt
+    found = {result.check: result for result in checked(root, "dataset", images=False).results}
+    is_data = path.suffix == ".parquet"
+    assert found["dataset_readable"].value == (1 if is_data else 0)
+    assert found["dataset_videos"].value == (0 if is_data else 1)
+    assert path.name in found["dataset_readable" if is_data else "dataset_videos"].detail
+    assert {found[name].level for name in ("finite_numbers", "dataset_counts", "dataset_statistics")} <= {
+        "pass",
+        "skip",
+    }
+    assert found["finite_numbers"].level == "pass"
+
+
+def test_info_names_the_file_once(spoilt: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
+    root, path = spoilt
+    assert exit_code("info", root) == 0
+    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("problem"))
+    assert path.relative_to(root).as_posix() in line
+
+
+def test_the_other_episodes_are_shown(spoilt: tuple[Path, Path], tmp_path: Path) -> None:
+    root, _ = spoilt
+    assert exit_code("view", root, "--episodes", "2:4", "--save", tmp_path / "shown.rrd") == 0
+    assert exit_code("view", root, "--episodes", "1", "--save", tmp_path / "bad.rrd") == 1
+
+
+def test_a_report_shows_the_other_episodes(spoilt: tuple[Path, Path], tmp_path: Path) -> None:
+    root, path = spoilt
+    assert exit_code("report", root, "--no-checks", "--out", tmp_path / "page.html") == 0
+    page = (tmp_path / "page.html").read_text()
+    assert path.name in page
+    assert all(f"episode {number}" in page for number in range(NUM_EPISODES))
+
+
+def test_the_other_episodes_are_imported(
+    spoilt: tuple[Path, Path], apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, path = spoilt
+    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run") == 1
+    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run", "--skip-bad") == 1
+    told = capsys.readouterr().out
+    assert f"3 episodes, {3 * LENGTH} frames" in told
+    assert "Skipped 1 of 4 episodes:" in told
+    assert path.name in told.splitlines()[-1]
+    assert [file.stem for file in recordings(tmp_path / "run")] == [f"episode_00000{number}" for number in (0, 2, 3)]
+    (root / path.relative_to(root)).write_bytes((apart / path.relative_to(root)).read_bytes())
+    assert exit_code("import", "lerobot", root, "--out", tmp_path / "run") == 0
+    assert exit_code("import", "lerobot", apart, "--out", tmp_path / "other") == 0
+    assert len(recordings(tmp_path / "run")) == NUM_EPISODES
+    for mine, other in zip(recordings(tmp_path / "run"), recordings(tmp_path / "other"), strict=True):
+        assert mine.read_bytes() == other.read_bytes()
+
+
+def test_the_other_episodes_are_edited(spoilt: tuple[Path, Path], apart: Path, tmp_path: Path) -> None:
+    root, _ = spoilt
+    assert exit_code("dataset", "drop", root, "--episodes", "1", "--out", tmp_path / "new") == 0
+    assert exit_code("dataset", "drop", apart, "--episodes", "1", "--out", tmp_path / "expected") == 0
+    assert content_of(tmp_path / "new") == content_of(tmp_path / "expected")
+    assert exit_code("dataset", "drop", root, "--episodes", "0", "--out", tmp_path / "bad") == 1
+    assert not (tmp_path / "bad").exists()
