@@ -58,8 +58,9 @@ def dataset_statistics(dataset: CheckedDataset) -> Iterator[Found]:
     counts = _numbering_counts(dataset)
     columns += counts.values()
     for number, row in enumerate(rows_in(dataset.path, "meta/episodes", columns)):
-        rows = dataset.rows.get(number, {})
-        for name in names if rows else ():
+        if (rows := dataset.rows.get(number)) is None:
+            continue
+        for name in names:
             stored = {quantity: row[f"stats/{name}/{quantity}"] for quantity in NAMES}
             values = _vectors(dataset, name, rows[name])
             yield from _errors(stored, values, len(rows[name]), f"{name}, episode {number}", {}, {})

@@ -123,7 +123,7 @@ def recode(video: Path, change: Callable[[list[Any]], object] = lambda images: N
 
 
 def rewrite_video(dataset: Path, key: str, change: Callable[[list[Any]], list[Any]]) -> None:
-    """The images of a camera's only file, changed and coded anew at 10 a second."""
+    """The images of a camera's only file, changed and coded anew at the rate of the dataset."""
     import av
 
     path = next(dataset.glob(f"videos/{key}/*/*.mp4"))
@@ -133,7 +133,7 @@ def rewrite_video(dataset: Path, key: str, change: Callable[[list[Any]], list[An
     changed = change(images)
     assert len(changed) != len(before) or not np.array_equal(np.stack(changed), before)
     with av.open(str(path), "w") as container:
-        stream = container.add_stream("libx264", rate=10, options={"crf": "18", "g": "2", "bf": "0"})
+        stream = container.add_stream("libx264", rate=info(dataset)["fps"], options={"crf": "18", "g": "2", "bf": "0"})
         stream.height, stream.width = before.shape[1:3]
         stream.pix_fmt = "yuv420p"
         for image in changed:
