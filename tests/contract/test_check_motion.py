@@ -150,7 +150,7 @@ def test_a_state_that_is_its_own_action(foreign: Path, tmp_path: Path) -> None:
 
 def test_a_frozen_camera(foreign: Path, tmp_path: Path) -> None:
     spoilt = copy(foreign, tmp_path / "spoilt")
-    rewrite_video(spoilt, FRONT, lambda images: [*images[:40], *[images[40]] * 50, *images[90:]])
+    rewrite_video(spoilt, FRONT, lambda images: [*images[:40], *[images[40]] * 80, *images[120:]])
     assert level(spoilt, "frozen_images") == "fail"
 
 
