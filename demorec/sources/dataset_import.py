@@ -66,7 +66,8 @@ def import_lerobot(
     root = roots[0]
     expect(root, "dataset")
     dataset = LeRobotFolder(root, motors, named)
-    if elements := [name for name in named.gripper if name not in dataset.info.features]:
+    elements = dataset.roles.elements(dataset.roles.state)  # ConfigError if a named feature is missing
+    if elements := [name for name in named.gripper if name in elements and name not in dataset.info.features]:
         raise ConfigError(f"An import takes whole features: --gripper names {elements[0]!r}, an element of the state.")
     if not dataset.places:
         raise ConfigError(f"The dataset has no episodes: {root}")
