@@ -66,8 +66,9 @@ def import_lerobot(
     root = roots[0]
     expect(root, "dataset")
     dataset = LeRobotFolder(root, motors, named)
-    if elements := [name for name in named.gripper if name not in dataset.info.features]:
-        raise ConfigError(f"An import takes whole features: --gripper names {elements[0]!r}, an element of the state.")
+    state = dataset.roles.elements(dataset.roles.state)  # ConfigError if a named feature is missing
+    if parts := [name for name in named.gripper if name in state and name not in dataset.info.features]:
+        raise ConfigError(f"An import takes whole features: --gripper names {parts[0]!r}, an element of the state.")
     if not dataset.places:
         raise ConfigError(f"The dataset has no episodes: {root}")
     left_out = _left_out(dataset)
