@@ -27,9 +27,9 @@ from demorec.episode import features
 from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Scene
-from demorec.episode.sensed import SENSED, ObservationRows
-from demorec.episode.simulated import with_simulation
+from demorec.episode.simulated import on_request, with_simulation
 from demorec.episode.variation import Preset
 from demorec.loop import PreparedEpisode, Session, SimulatorCache, Step, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
@@ -156,12 +156,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         config.validate()
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
-        self._sensed = tuple(check_choice("sensed", name, tuple(SENSED)) for name in sensed)
         self.config, self.render_mode = config, _checked(render_mode)
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
         info = self.episode.info
+        known = {feature.name: feature for feature in on_request(info)}
+        self._sensed = tuple(known[check_choice("sensed", name, tuple(known))] for name in sensed)
         self._max_episode_steps = episode_length or round(
             SECONDS_PER_GOAL * config.fps * max(1, len(info.simulated.scene.goals))
         )

@@ -9,7 +9,6 @@ import numpy as np
 from demorec.check.base import Found, Measurement, counted, file_check, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.mcap import channels, messages
-from demorec.mcap.streams import frame_streams
 
 
 @file_check(
@@ -44,7 +43,7 @@ def checksums(episode: CheckedEpisode) -> Measurement:
 def topics(episode: CheckedEpisode) -> Measurement:
     """Find the streams that the metadata lists: each of its type, with one message for each frame."""
     expected: dict[str, tuple[str, int | None]] = {}
-    for stream in frame_streams(episode.info):
+    for stream in episode.recording.streams:
         expected[stream.topic] = (stream.schema, episode.num_frames)
     for camera in episode.cameras:
         expected |= {topic: (schema, episode.num_frames) for topic, schema in _image_streams(episode, camera.name)}
@@ -111,7 +110,7 @@ def complete(episode: CheckedEpisode) -> Measurement:
 def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
     """Compare the times of every stream of numbers with multiples of 1 / fps."""
     expected = episode.frame_times
-    for topic in (stream.topic for stream in frame_streams(episode.info) if stream.topic in episode.scan):
+    for topic in (stream.topic for stream in episode.recording.streams if stream.topic in episode.scan):
         times = episode.scan[topic].time_ns
         if topic == channels.JOINT_STATES and len(times) != len(expected):
             times = times[np.isin(times, expected)]  # others are between the frames

@@ -18,7 +18,7 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import is_dataset
 from demorec.datasets.lerobot.prepare import reasons_to_transcode, recorded_videos
 from demorec.datasets.lerobot.sidecar import EXPORT_PATH, EpisodeRecord
-from demorec.mcap import open_recording
+from demorec.mcap import open_simulated
 from demorec.runs.run_file import DATASET
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
@@ -91,7 +91,7 @@ def episode_differences(
         ResourceError: This machine cannot read it.
     """
     try:
-        with open_recording(recording_file, simulated=True) as recording:
+        with open_simulated(recording_file) as recording:
             expected = ExportEpisode(recording, options)
             columns, record = expected.columns, EpisodeRecord.of(expected)
             # Encoded again, images have the bytes of the version and machine that encoded them.

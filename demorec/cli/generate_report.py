@@ -19,7 +19,7 @@ from demorec.episode.features import ENVIRONMENT_STATE, observation_names
 from demorec.generate.contents import set_aside
 from demorec.generate.executor import Made
 from demorec.generate.options import RunOptions, RunResult
-from demorec.mcap import open_recording
+from demorec.mcap import open_simulated
 from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
 
 if TYPE_CHECKING:
@@ -160,7 +160,7 @@ def has_environment_state(result: RunResult) -> bool:
     """Whether the first recordings have equally many numbers about objects, as a policy without images needs."""
     lengths = set()
     for attempt in result.run.successes[:MAX_PROBED_EPISODES]:
-        with open_recording(result.folder / attempt.file, simulated=True) as recording:
+        with open_simulated(result.folder / attempt.file) as recording:
             info = recording.info
         names = observation_names(info.simulated.robot, info.simulated.scene, privileged=True)
         lengths.add(len(names[ENVIRONMENT_STATE]))

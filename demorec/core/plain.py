@@ -119,9 +119,9 @@ def from_plain[T](data: object, cls: type[T]) -> T:
         raise ValueError(f"{reprlib.repr(data)} is no {cls.__name__}") from error
 
 
-def leave_out_default(cls: type, name: str) -> None:
-    """Write a dataclass without a field that has its default value."""
-    changes: Any = {name: override(omit_if_default=True)}
+def leave_out_default(cls: type, *names: str) -> None:
+    """Write a dataclass without those of these fields that have their default value."""
+    changes: Any = dict.fromkeys(names, override(omit_if_default=True))
     _converter.register_unstructure_hook(cls, make_dict_unstructure_fn(cls, _converter, **changes))
 
 

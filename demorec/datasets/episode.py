@@ -29,8 +29,8 @@ from demorec.episode.features import (
     observation_vectors,
 )
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.sensed import ObservationRows
-from demorec.episode.simulated import scene_of
+from demorec.episode.observation_rows import ObservationRows
+from demorec.episode.simulated import on_request, scene_of
 from demorec.mcap import Recording, channels
 
 REWARD = "next.reward"
@@ -118,9 +118,8 @@ class ExportEpisode[O: CommonOptions]:
         if self.scene is None:
             return {feature.name: feature.names for feature in self.info.features}
         robot, options = self.info.simulated.robot, self.options
-        names = observation_names(
-            robot, self.scene, privileged=options.privileged, state=self.state, sensed=options.features
-        )
+        sensed = [feature for feature in on_request(self.info) if feature.name in options.features]
+        names = observation_names(robot, self.scene, privileged=options.privileged, state=self.state, sensed=sensed)
         if COMMAND in options.features:
             names[COMMAND] = action_names(robot, "joint")
         return {**names, ACTION: action_names(robot, options.action)}

@@ -46,7 +46,7 @@ class Observation:
         base_from_tcp: TCP pose in the base frame.
         object_poses: name -> world_from_object, of every movable body of the scene.
         contact_force: Sum of the normal forces on the fingers, N.
-        sensed: What else is sensed: quantity -> (D,), by the rows of `demorec.episode.sensed`.
+        sensed: What else is sensed: quantity -> (D,), by the rows of `demorec.sim.sensors`.
     """
 
     joint_position: Array

@@ -11,7 +11,7 @@ Frames: everything is expressed in the robot's base frame (the world's, where th
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Literal, get_args
 
 import numpy as np
@@ -19,8 +19,9 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose, quat_multiply, quat_product, rotation_rows
 from demorec.episode.episode import Trajectory
+from demorec.episode.info import Feature
+from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Goal, Scene
-from demorec.episode.sensed import SENSED, ObservationRows
 from demorec.robots.robot import RobotSpec
 
 Vectors = NDArray[np.float32] | NDArray[np.float64]
@@ -29,6 +30,8 @@ VectorType = type[np.float32] | type[np.float64]
 STATE = "observation.state"
 VELOCITY = "observation.velocity"
 EE_POSE = "observation.ee_pose"
+EFFORT = "observation.effort"
+CONTACT_FORCE = "observation.contact_force"
 ENVIRONMENT_STATE = "observation.environment_state"
 ACTION = "action"
 COMMAND = "command"
@@ -74,7 +77,7 @@ def observation_names(
     *,
     privileged: bool = False,
     state: StateKind = "joint",
-    sensed: Collection[str] = (),
+    sensed: Sequence[Feature] = (),
 ) -> dict[str, tuple[str, ...]]:
     """Feature name -> name of every component, in the order of `observation_vectors`."""
     names = {
@@ -84,7 +87,7 @@ def observation_names(
     }
     if privileged:
         names[ENVIRONMENT_STATE] = tuple(_environment_names(robot, scene))
-    return names | {name: feature.names(robot) for name, feature in SENSED.items() if name in sensed}
+    return names | {feature.name: feature.names for feature in sensed}
 
 
 def observation_vectors(
@@ -94,7 +97,7 @@ def observation_vectors(
     *,
     privileged: bool = False,
     state: StateKind = "joint",
-    sensed: Collection[str] = (),
+    sensed: Sequence[Feature] = (),
     dtype: VectorType = np.float32,
 ) -> dict[str, Vectors]:
     """Feature name -> (T, D) numbers of that type.
@@ -105,9 +108,9 @@ def observation_vectors(
     - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw. Of the two signs of the quaternion the one
       with x >= 0: it does not jump for a hand that points down within 180 degrees of yaw.
     - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
-    - those of `SENSED` that `sensed` names, as far as they were sensed.
+    - `sensed`: the observations that are there on request, in their units.
     """
-    arm = len(robot.arm_joints)
+    arm, count = len(robot.arm_joints), len(rows.gripper_width)
     tcp = _continuous(rows.base_from_tcp)
     features = {
         STATE: [rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])],
@@ -116,9 +119,9 @@ def observation_vectors(
     }
     if privileged:
         features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
-    for name, feature in SENSED.items():
-        if name in sensed and (values := feature.values(rows.sensed, robot)) is not None:
-            features[name] = [values]
+    for feature in sensed:
+        values = rows.sensed[feature.name].reshape(count, -1)
+        features[feature.name] = [values[:, : len(feature.names)]]  # a gripper's joints are behind those of the arm
     return {name: _joined(columns, dtype) for name, columns in features.items()}
 
 

@@ -33,6 +33,22 @@ DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
 
 
 @dataclass(frozen=True, kw_only=True)
+class SensorStream:
+    """The messages of a simulated sensor, one a frame.
+
+    Attributes:
+        topic: Topic of the messages.
+        layout: "wrench" for three forces and three torques (geometry_msgs/WrenchStamped), "array" for any vector
+            (std_msgs/Float64MultiArray).
+        frame: Link along whose axes the vectors of a wrench are.
+    """
+
+    topic: str
+    layout: Literal["wrench", "array"] = "array"
+    frame: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Feature:
     """A vector that every frame has.
 
@@ -47,6 +63,7 @@ class Feature:
         calibration: For each element a factor and an offset: factor times the value plus offset is rad or m, of servos
             that say something else; empty where the unit says it.
         role: Role that its name does not say; "" where names in common use do (`demorec.episode.roles`).
+        stream: Messages of a simulated sensor; None for any other feature.
     """
 
     name: str
@@ -57,6 +74,7 @@ class Feature:
     source: str = ""
     calibration: tuple[tuple[float, float], ...] = ()
     role: Literal["", "state", "action", "gripper"] = ""
+    stream: SensorStream | None = None
 
     def in_si(self, values: NDArray[Any]) -> Array:
         """(..., D) float64 of values (..., D): positions in rad and m, other values unchanged."""
@@ -67,7 +85,14 @@ class Feature:
         return np.asarray(values.astype(np.float64) * factor + offset)
 
 
-leave_out_default(Feature, "role")
+leave_out_default(Feature, "role", "stream")
+
+_OBSERVATION = "observation."
+
+
+def sensor_feature(quantity: str) -> str:
+    """Return the feature of a sensed quantity: "observation.wrench" for "wrench"."""
+    return _OBSERVATION + quantity
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -188,6 +213,11 @@ class EpisodeInfo:
     origin: str | Origin = ""
     versions: Mapping[str, str] = field(default_factory=dict)
     simulation: Simulation | None = None
+
+    @property
+    def sensors(self) -> Mapping[str, Feature]:
+        """Sensed quantity, as in `Observation.sensed` -> its feature."""
+        return {f.name.removeprefix(_OBSERVATION): f for f in self.features if f.stream is not None}
 
     @property
     def simulated(self) -> Simulation:

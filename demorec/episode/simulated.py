@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -13,7 +13,9 @@ from demorec.episode.episode import Outcome, Table, Trajectory
 from demorec.episode.features import (
     ACTION,
     COMMAND,
+    CONTACT_FORCE,
     EE_POSE,
+    EFFORT,
     STATE,
     VELOCITY,
     action_names,
@@ -23,13 +25,14 @@ from demorec.episode.features import (
     observation_vectors,
 )
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
+from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Scene
-from demorec.episode.sensed import SENSED, ObservationRows
 
 
 def simulated_info(
     simulation: Simulation,
     *,
+    sensors: Sequence[Feature] = (),
     episode_index: int,
     instruction: str,
     fps: int,
@@ -37,14 +40,20 @@ def simulated_info(
     origin: str = "",
     versions: Mapping[str, str] | None = None,
 ) -> EpisodeInfo:
-    """Describe an episode that demorec simulates; arguments as the attributes of `EpisodeInfo`."""
+    """Describe an episode that demorec simulates.
+
+    Args:
+        simulation: Scene, seed and robot.
+        sensors: Features that have a stream.
+        episode_index, instruction, fps, attempt, origin, versions: As in `EpisodeInfo`.
+    """
     return EpisodeInfo(
         episode_index=episode_index,
         attempt=attempt,
         instruction=instruction,
         robot_name=simulation.robot.name,
         fps=fps,
-        features=simulated_features(simulation),
+        features=simulated_features(simulation, sensors),
         cameras=simulated_cameras(simulation.scene),
         origin=origin,
         versions=versions or {},
@@ -59,8 +68,7 @@ def with_simulation(info: EpisodeInfo, **changes: Any) -> EpisodeInfo:
         RecordingError: demorec did not simulate this episode.
     """
     simulation = replace(info.simulated, **changes)
-    listed = {feature.name for feature in info.features}
-    features = tuple(feature for feature in simulated_features(simulation) if feature.name in listed)
+    features = simulated_features(simulation, list(info.sensors.values()))
     return replace(info, simulation=simulation, features=features, cameras=simulated_cameras(simulation.scene))
 
 
@@ -79,20 +87,29 @@ def simulated_cameras(scene: Scene) -> tuple[Camera, ...]:
     )
 
 
-def simulated_features(simulation: Simulation) -> tuple[Feature, ...]:
+def simulated_features(simulation: Simulation, sensors: Sequence[Feature]) -> tuple[Feature, ...]:
     """Describe the vectors of a simulated episode; `simulated_table` gives their values."""
     robot, arm = simulation.robot, simulation.robot.arm_joints
-    names = observation_names(robot, simulation.scene, sensed=SENSED)
+    names = observation_names(robot, simulation.scene)
     target_names = action_names(robot, "joint")
     joints, units = (*arm, ""), (*("rad" for _ in arm), "m")
     return (
         Feature(name=STATE, names=names[STATE], units=units, joints=joints),
         Feature(name=VELOCITY, names=names[VELOCITY], units=(*("rad/s" for _ in arm), "m/s")),
         Feature(name=EE_POSE, names=names[EE_POSE], units=("m", "m", "m", "", "", "", "")),
-        *(
-            Feature(name=name, names=names[name], units=row.units(robot), source=row.meaning)
-            for name, row in SENSED.items()
+        Feature(
+            name=EFFORT,
+            names=tuple(f"{joint}.effort" for joint in arm),
+            units=("N m",) * len(arm),
+            source="motor torques of the arm's joints (N m)",
         ),
+        Feature(
+            name=CONTACT_FORCE,
+            names=("gripper.force",),
+            units=("N",),
+            source="sum of the normal forces on the fingers (N)",
+        ),
+        *sensors,
         Feature(name=ACTION, names=target_names, units=units, joints=joints),
         Feature(name=COMMAND, names=target_names, units=units, joints=joints),
     )
@@ -103,7 +120,7 @@ def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
     robot, scene = info.simulated.robot, info.simulated.scene
     rows = ObservationRows.of_trajectory(trajectory)
     vectors = {
-        **observation_vectors(rows, robot, scene, sensed=SENSED, dtype=np.float64),
+        **observation_vectors(rows, robot, scene, sensed=on_request(info), dtype=np.float64),
         ACTION: action_vectors(trajectory, scene, "joint", dtype=np.float64),
         COMMAND: command_vectors(trajectory),
     }
@@ -116,6 +133,11 @@ def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
         images=dict.fromkeys(cameras, np.arange(trajectory.num_frames, dtype=np.int64)),
         image_stamps=dict.fromkeys(cameras, trajectory.time_ns),
     )
+
+
+def on_request(info: EpisodeInfo) -> tuple[Feature, ...]:
+    """Return the observations that datasets and environments have only when they are asked for by name."""
+    return tuple(feature for feature in info.features if feature.name in (EFFORT, CONTACT_FORCE) or feature.stream)
 
 
 def description_of(info: EpisodeInfo) -> dict[str, Any]:

@@ -67,7 +67,10 @@ def _contradictions(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
     """What the description of a possible simulation says twice, and differently."""
     if info.robot_name != simulation.robot.name:
         yield f"the robot is {info.robot_name!r} and {simulation.robot.name!r}"
-    known = simulated_features(simulation)
+    known = simulated_features(simulation, list(info.sensors.values()))
+    for feature in info.sensors.values():
+        yield from _feature(feature, frozenset())
+        yield from _sensor_stream(feature)
     if unknown := [feature.name for feature in info.features if feature not in known]:
         yield f"the features {', '.join(unknown)} are not those of its robot"
     yield from _unique("features", [feature.name for feature in info.features])
@@ -195,6 +198,7 @@ def _unique(what: str, names: Iterable[str], *, commas: bool = True) -> Iterator
 
 
 _FEATURE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*")
+_TOPIC = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*)+")
 _CAMERA = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera", "language")
 """First words of topics that are no feature's."""
@@ -262,6 +266,16 @@ def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
     if unknown := [joint for joint in named if joints and joint not in joints]:
         yield f"the feature {name!r} has joints that the URDF does not have: {', '.join(unknown)}"
     yield from _unique(f"joints of the feature {name!r}", named, commas=False)
+
+
+def _sensor_stream(feature: Feature) -> Iterator[str]:
+    stream = feature.stream
+    if feature.name.partition(".")[0] != "observation" or feature.dtype != "float64":
+        yield f"the sensor {feature.name!r} is not an observation in float64"
+    if stream is not None and stream.layout == "wrench" and len(feature.names) != 6:
+        yield f"the wrench {feature.name!r} has {len(feature.names)} elements, it must have 6"
+    if stream is not None and not _TOPIC.fullmatch(stream.topic):
+        yield f"the topic of the sensor {feature.name!r} is {stream.topic!r}"
 
 
 def _external_camera(camera: Camera, links: frozenset[str]) -> Iterator[str]:

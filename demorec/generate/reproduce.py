@@ -24,7 +24,7 @@ from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
 from demorec.generate.options import RunResult
-from demorec.mcap import open_recording
+from demorec.mcap import open_recording, open_simulated
 from demorec.runs.find import expect
 from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
 
@@ -112,7 +112,7 @@ def _read_run(source: Path) -> Original:
         if not attempt.file:  # no scene could be laid out, so that nothing was recorded
             continue
         try:
-            with open_recording(path, simulated=True) as recording:
+            with open_simulated(path) as recording:
                 info, found = recording.info, recording.digest()
         except RecordingError as error:
             digests[key] = ""

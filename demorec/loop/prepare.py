@@ -25,6 +25,7 @@ from demorec.render import Renderer
 from demorec.render.painter import WarmRenderer
 from demorec.robots.assets import allow_models, model_name
 from demorec.robots.robot import RobotSpec
+from demorec.sim.sensors import SENSORS
 from demorec.sim.world import World
 from demorec.tasks.base import Task
 from demorec.tasks.sampling import Sampler, stratified_point
@@ -127,6 +128,7 @@ def prepare(plan: EpisodePlan) -> PreparedEpisode:
     )
     info = simulated_info(
         simulation,
+        sensors=[sensor.feature(robot) for sensor in SENSORS],
         episode_index=plan.episode_index,
         attempt=plan.attempt,
         instruction=task.instruction(scene, _rng(plan, "expert")),

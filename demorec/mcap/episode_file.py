@@ -14,17 +14,18 @@ from numpy.typing import NDArray
 from demorec.core.errors import RecordingError, without_path
 from demorec.core.files import Closing
 from demorec.core.plain import to_json
-from demorec.episode.episode import Outcome, frame_time_ns
+from demorec.episode.episode import Outcome
 from demorec.episode.info import DEPTH_UNITS, EpisodeInfo
 from demorec.episode.simulated import description_of, has_failed
 from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
-from demorec.mcap.channels import GRIPPER, camera_topic, description_topic, video_topic
+from demorec.mcap.channels import camera_topic, description_topic, video_topic
 from demorec.mcap.container import Container, damage_as_recording_error
+from demorec.mcap.episode_layout import EpisodeLayout, episode_layout
 from demorec.mcap.images import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.lossless import decode_distances
 from demorec.mcap.metadata import CameraStreams
-from demorec.mcap.streams import FRAMES
+from demorec.mcap.streams import FrameStream
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 
 _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
@@ -39,6 +40,7 @@ class EpisodeFile(Closing):
     num_frames: int
     is_recovered: bool
     _cameras: Mapping[str, CameraStreams]
+    _layout: EpisodeLayout
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -60,18 +62,22 @@ class EpisodeFile(Closing):
 
     def _read_metadata(self, found: Mapping[str, str]) -> None:
         """Read what is known without reading the numbers."""
-        info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(found)
-        self._read_end(info)
-        if self.num_frames and len(self._cameras) != len(info.cameras):
+        self.info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(found)
+        self._layout = episode_layout(self.info)
+        self._read_end()
+        if self.num_frames and len(self._cameras) != len(self.info.cameras):
             raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
-        self.info = self._with_urdf(info, urdf_sha256) if urdf_sha256 else info
+        if urdf_sha256:
+            self.info = self._with_urdf(urdf_sha256)
 
-    def _read_end(self, info: EpisodeInfo) -> None:
+    def _read_end(self) -> None:
         """Read how it ended; RecordingError unless the outcome has as many frames as there are messages."""
-        topic = FRAMES if info.simulation is None else GRIPPER
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
-        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome, info)
-        self.num_frames, self.is_recovered = self._container.counts.get(topic, 0), recovered is not None
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
+        self.num_frames, self.is_recovered = (
+            self._container.counts.get(self._layout.frame_topic, 0),
+            recovered is not None,
+        )
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
         if self.outcome is None and not self.is_recovered:
@@ -81,13 +87,18 @@ class EpisodeFile(Closing):
                 f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}"
             )
 
-    def _with_urdf(self, info: EpisodeInfo, sha256: str) -> EpisodeInfo:
+    @property
+    def streams(self) -> tuple[FrameStream, ...]:
+        """Streams with one message at each frame."""
+        return self._layout.streams
+
+    def _with_urdf(self, sha256: str) -> EpisodeInfo:
         urdf = ""
         for _, text in self._read(description_topic(), messages.read_string):
             urdf = text  # the last one holds
         if metadata.urdf_sha256(urdf) != sha256:
             raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
-        described = replace(info, urdf=urdf)
+        described = replace(self.info, urdf=urdf)
         if wrong := find_problems(described):
             raise RecordingError(f"The URDF of the recording does not fit its metadata ({wrong[0]})")
         return described
@@ -170,14 +181,14 @@ class EpisodeFile(Closing):
             yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
-        """As `_read`, of a topic of images; RecordingError unless a simulated episode has one at each frame's time."""
-        count, is_simulated = 0, self.info.simulation is not None
+        """As `_read`, of a topic of images; RecordingError unless they are at the times at which they are due."""
+        due_ns, count = self._layout.due_ns(self.num_frames), 0
         for time_ns, image in self._read(topic, read):
-            if is_simulated and (count >= self.num_frames or time_ns != frame_time_ns(count, self.info.fps)):
+            if due_ns is not None and (count >= len(due_ns) or time_ns != due_ns[count]):
                 raise self._wrong_times(topic)
             yield time_ns, image
             count += 1
-        if is_simulated and count != self.num_frames:
+        if due_ns is not None and count != len(due_ns):
             raise self._wrong_times(topic)
 
     def _wrong_times(self, topic: str) -> RecordingError:

@@ -15,6 +15,7 @@ from demorec.core.errors import RecordingError, describe_error
 from demorec.core.plain import from_json, to_json
 from demorec.episode.episode import Outcome
 from demorec.episode.info import FORMAT_VERSION, EpisodeInfo
+from demorec.episode.simulated import simulation_facts
 from demorec.episode.validity import read_episode_info
 from demorec.mcap.video import VideoSettings
 
@@ -44,12 +45,13 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
 
     The URDF is a message; the record has its SHA-256.
     """
-    about = {"instruction": info.instruction, "robot": info.robot_name, "episode_index": str(info.episode_index)}
-    if info.simulation is not None:
-        about |= {"task": info.simulated.task, "attempt": str(info.attempt), "root_seed": str(info.simulated.root_seed)}
     return sealed(
         {
-            **about,
+            "instruction": info.instruction,
+            "robot": info.robot_name,
+            "episode_index": str(info.episode_index),
+            "attempt": str(info.attempt),
+            **{key: str(value) for key, value in simulation_facts(info).items() if key in ("task", "root_seed")},
             "format_version": str(FORMAT_VERSION),
             "urdf_sha256": urdf_sha256(info.urdf),
             "info": to_json(replace(info, urdf="")),
@@ -92,31 +94,26 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
 
 
 def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
-    """ValueError unless all cameras (of a simulation none, before the first frame) were recorded as `info` says."""
-    is_simulated = info.simulation is not None
-    if not cameras and is_simulated:
-        return
-    if cameras.keys() != {camera.name for camera in info.cameras}:
+    """Raise ValueError unless the cameras, where any were recorded, are as the description says."""
+    if cameras and cameras.keys() != {camera.name for camera in info.cameras}:
         raise ValueError("the recorded cameras are not those of the description")
-    for camera in info.cameras:
+    for camera in info.cameras if cameras else ():
         video = cameras[camera.name].video
-        if (video.width, video.height) != (camera.width, camera.height) or (is_simulated and video.fps != info.fps):
+        if (video.width, video.height, video.fps) != (camera.width, camera.height, info.fps):
             raise ValueError(f"the video of the camera {camera.name!r} has another size or rate than the description")
-        if is_simulated and video.gop < 1:
+        if not camera.kept and video.gop < 1:
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
         if camera.kept and video.codec != camera.kept:
             raise ValueError(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
-        if not is_simulated and cameras[camera.name].depth != camera.is_depth:
+        if camera.kept and cameras[camera.name].depth != camera.is_depth:
             raise ValueError(f"the camera {camera.name!r} is not the depth camera that its streams say")
 
 
-def read_outcome_metadata(metadata: Mapping[str, str], info: EpisodeInfo) -> Outcome:
+def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
     """Inverse of `outcome_metadata`. Raises RecordingError if the record is damaged."""
     check_seal(OUTCOME, metadata)
     try:
         outcome = from_json(metadata["outcome"], Outcome)
-        if info.simulation is not None and outcome.success is None:
-            raise ValueError("it does not say whether the episode succeeded")
         if min(outcome.num_frames, outcome.num_retries, *outcome.drops.values(), 0) < 0:
             raise ValueError("a number of frames, retries or drops below 0")
     except (KeyError, ValueError) as error:

@@ -16,10 +16,8 @@ from demorec.core.errors import MissingDependencyError
 from demorec.core.text import printable
 from demorec.episode.episode import Table, Trajectory
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.sensed import STREAMS
 from demorec.episode.simulated import simulation_facts
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.robots.robot import RobotSpec
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -77,21 +75,22 @@ def table_of(info: EpisodeInfo, numbers: Table | Trajectory) -> pd.DataFrame:
         raise MissingDependencyError("A table of the frames", "pandas", "pip install pandas") from error
     table: dict[str, Any] = {"time_ns": numbers.time_ns}
     if isinstance(numbers, Trajectory):
-        table |= _trajectory_columns(info.simulated.robot, numbers)
+        table |= _trajectory_columns(info, numbers)
     else:
         for feature in info.features:
             table |= _components(feature.name, numbers.features[feature.name], feature.names)
     return pd.DataFrame(table, index=pd.RangeIndex(numbers.num_frames, name="frame_index"))
 
 
-def _trajectory_columns(robot: RobotSpec, trajectory: Trajectory) -> dict[str, Any]:
+def _trajectory_columns(info: EpisodeInfo, trajectory: Trajectory) -> dict[str, Any]:
     table: dict[str, Any] = {"phase": trajectory.phase}
+    robot = info.simulated.robot
     joints, arm = robot.joint_names, robot.arm_joints
     for name in ("joint_position", "joint_velocity", "joint_effort"):
         table |= _components(name, getattr(trajectory, name), joints)
     table |= {"gripper_width": trajectory.gripper_width, "contact_force": trajectory.contact_force}
     for name, values in trajectory.sensed.items():
-        table |= _components(name, values, STREAMS[name].components(robot))
+        table |= _components(name, values, info.sensors[name].names)
     table |= _components("base_from_tcp", trajectory.base_from_tcp, _POSE)
     for kind in ("action", "command"):
         table |= _components(f"{kind}_joint_target", getattr(trajectory, f"{kind}_joint_target"), arm)

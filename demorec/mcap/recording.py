@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
-from itertools import islice, repeat
+from itertools import chain, islice, repeat
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
@@ -22,9 +22,9 @@ from demorec.mcap import channels, messages, notebook
 from demorec.mcap.chunks import Block
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.frames import Said, frame_times, frames_of, pose_of, read_numbers
+from demorec.mcap.frames import frames_of, pose_of
 from demorec.mcap.lossless import LabelDecoder, from_labels
-from demorec.mcap.streams import SUBTASK, frame_streams
+from demorec.mcap.streams import FrameStream, TimedMessages
 from demorec.mcap.video import Rgb, is_keyframe
 from demorec.robots.urdf import check_primitives
 
@@ -84,16 +84,16 @@ class Recording(EpisodeFile):
         return self._numbers_and_events[0]
 
     @cached_property
-    def _numbers_and_events(self) -> tuple[Table | Trajectory, Said]:
+    def _numbers_and_events(self) -> tuple[Table | Trajectory, TimedMessages]:
         """Read once: an export and a check look at them from several sides."""
         topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
-        return read_numbers(self._container, self.info, self.num_frames, topics)
+        return self._layout.read(self._container, self.num_frames, topics)
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
         """(frame, what is begun there), in order, as the source states it; empty where nobody said any."""
         found = []
-        for time_ns, text in self._read(SUBTASK, messages.read_string):
+        for time_ns, text in self._read(channels.SUBTASK, messages.read_string):
             frame = int(np.searchsorted(self.time_ns, time_ns))
             if frame == self.num_frames or self.time_ns[frame] != time_ns:
                 raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
@@ -114,20 +114,23 @@ class Recording(EpisodeFile):
 
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state of a simulation in order of time: the frames' own and those between them."""
-        if self.info.simulation is None:
-            return
-        stream = next(row for row in frame_streams(self.info) if row.topic == channels.JOINT_STATES)
-        read = self._read(channels.JOINT_STATES, lambda data: stream.layout.decode([data]).reshape(3, -1))
+        for stream in self.streams:
+            if stream.is_dense:
+                yield from self._joint_samples(stream)
+
+    def _joint_samples(self, stream: FrameStream) -> Iterator[JointSample]:
+        read = self._read(stream.topic, lambda data: stream.layout.decode([data]).reshape(3, -1))
         for time_ns, (position, velocity, effort) in read:
             yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """(time_ns, event) in order of time; changes of phase are in `phases`."""
-        if self.info.simulation is None:
-            return
-        # They lie among the numbers, with which they may have been read already.
-        is_read = "_numbers_and_events" in vars(self)
-        for time_ns, data in self._numbers_and_events[1] if is_read else self._read(channels.EVENTS, bytes):
+        # They are stored among the numbers, with which they may have been read already.
+        if "_numbers_and_events" in vars(self):
+            found: Iterable[tuple[int, bytes]] = self._numbers_and_events[1]
+        else:
+            found = chain.from_iterable(self._read(topic, bytes) for topic in self._layout.event_topics)
+        for time_ns, data in found:
             with damage_as_recording_error(self.path):
                 event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:
@@ -137,10 +140,9 @@ class Recording(EpisodeFile):
         """camera -> all its encoded images, read in one pass; they are in memory together."""
         topics = {camera: self._image_topic(camera) for camera in cameras}
         found = self._container.blocks(tuple(topics.values()))
-        images = {}
+        images, due_ns = {}, self._layout.due_ns(self.num_frames)
         for camera, topic in topics.items():
-            times = frame_times(self.num_frames, self.info.fps)
-            if self.info.simulation is not None and not np.array_equal(found[topic].time_ns, times):
+            if due_ns is not None and not np.array_equal(found[topic].time_ns, due_ns):
                 raise self._wrong_times(topic)
             with damage_as_recording_error(self.path):
                 images[camera] = messages.coded_images(found[topic], self.video_settings(camera).codec)
@@ -172,7 +174,7 @@ class Recording(EpisodeFile):
     def _shown(self, camera: str) -> NDArray[np.int64]:
         """(T,) number of the image of a camera that each frame holds."""
         self._camera(camera)
-        return np.arange(self.num_frames) if isinstance(self._numbers, Trajectory) else self._numbers.images[camera]
+        return self._table.images[camera]
 
     def image(self, camera: str, frame: int) -> Rgb | None:
         """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
@@ -202,7 +204,7 @@ class Recording(EpisodeFile):
 
         Columns are named as in `demorec.episode.episode.Trajectory`, vectors with their component:
         `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
-        `wrench.fz` (N) and `wrench.tx` (N m) where they were recorded, `object_poses.red_cube.z` (m, world frame),
+        `wrench.hand.force.z` (N) where it was recorded, `object_poses.red_cube.z` (m, world frame),
         `phase`. `time_ns` is simulated time since the episode's start. Of an external episode there are the stamps of
         its frames and its features: `observation.state.shoulder`.
 
@@ -307,18 +309,19 @@ def _content(numbers: Table | Trajectory) -> Iterator[tuple[str, bytes]]:
             yield field.name, value.tobytes() if isinstance(value, np.ndarray) else "\n".join(value).encode()
 
 
-def open_recording(path: str | Path, *, simulated: bool = False) -> Recording:
-    """Open a recording.
+def open_recording(path: str | Path) -> Recording:
+    """Open a recording; errors as of `Recording`."""
+    return Recording(path)
 
-    Args:
-        path: Of the file.
-        simulated: Whether only an episode that demorec simulated will do.
+
+def open_simulated(path: str | Path) -> Recording:
+    """Open the recording of an episode that demorec simulated.
 
     Raises:
-        RecordingError: As `Recording`, or it was recorded by another robot or program, and that will not do.
+        RecordingError: As `Recording`, or it was recorded by another robot or program.
     """
     recording = Recording(path)
-    if simulated and recording.info.simulation is None:
+    if recording.info.simulation is None:
         recording.close()
         raise RecordingError(f"{NOT_SIMULATED}: {recording.path}")
     return recording

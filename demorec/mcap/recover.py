@@ -7,7 +7,7 @@ front until one is cut off or damaged; what all streams have in common up to the
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,16 +16,14 @@ from mcap.records import Metadata
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import MCAP_MAGIC, make_folder, open_regular
-from demorec.episode.episode import frame_time_ns
-from demorec.episode.info import EpisodeInfo, Origin
-from demorec.mcap import channels, messages, metadata
+from demorec.episode.info import Origin
+from demorec.mcap import messages, metadata
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.metadata import CameraStreams
+from demorec.mcap.episode_layout import episode_layout
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.mcap.scan import CutOffError, ScannedMessage, scan
-from demorec.mcap.streams import frame_streams
 
 _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
@@ -176,28 +174,10 @@ def _survey(source: Path) -> _Survey:
     if metadata.EPISODE in found:
         episode, outcome = found[metadata.EPISODE], found.get(metadata.OUTCOME)
         info, cameras, _ = metadata.read_episode_metadata(episode)
-        num_frames, keeps = _frames(info, cameras, counts)
+        num_frames, keeps = episode_layout(info).whole_frames(counts, cameras)
         reason = reason or "the end is missing"
-        if outcome is not None and metadata.read_outcome_metadata(outcome, info).num_frames != num_frames:
+        if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
             outcome = None
         if num_frames:
             return _Survey(episode, outcome, reason, num_frames, keeps)
     raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
-
-
-def _frames(
-    info: EpisodeInfo, cameras: Mapping[str, CameraStreams], counts: Counter[str]
-) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
-    """`num_frames` and `keeps` of a survey, by the description and the number of messages on each topic."""
-    topics = {stream.topic for stream in frame_streams(info)}
-    if info.simulation is None:  # images come before the frames that hold them: what is there of these has its images
-        num_frames = min(counts[topic] for topic in topics)
-        topics.add(channels.TF)
-        return num_frames, lambda message, count: message.channel.topic not in topics or count <= num_frames
-    topics.remove(channels.JOINT_STATES)
-    for camera, streams in cameras.items():
-        topics.add(channels.video_topic(camera, streams.video.codec))
-        topics |= {channels.camera_topic(camera, name) for name in ("depth", "segmentation") if getattr(streams, name)}
-    num_frames = min(counts[topic] for topic in topics)
-    last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
-    return num_frames, lambda message, count: message.log_ns <= last_ns

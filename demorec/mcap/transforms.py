@@ -7,18 +7,19 @@ physics move is on `/tf` at each frame, the rest on `/tf_static`.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_multiply
-from demorec.episode.episode import SampledFrame, Vector
-from demorec.episode.info import EpisodeInfo, Feature
-from demorec.episode.scene import Body
+from demorec.episode.episode import Vector
+from demorec.episode.info import Camera, Feature
+from demorec.episode.scene import Scene
 from demorec.mcap import messages
-from demorec.mcap.cdr import Layout, Slot, layout
-from demorec.robots.assets import asset_path
+from demorec.mcap.cdr import Slot, layout
+from demorec.mcap.channels import TF
+from demorec.mcap.streams import FrameStream
 from demorec.robots.urdf import Urdf, joint_motion
 
 WORLD = "world"
@@ -37,57 +38,57 @@ def camera_frame(camera: str) -> str:
     return f"camera_{camera}"
 
 
-def transforms_layout(frames: Sequence[tuple[str, str]]) -> Layout:
-    """Of tf2_msgs/TFMessage with these (parent, child): position and quaternion xyzw of each."""
-    return layout(messages.TRANSFORMS, tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in frames))
-
-
 class FrameTree:
-    """The frames of one episode whose robot is described; a joint that is not recorded stays at 0.
+    """The coordinate frames of one episode whose robot is described; a joint that is not recorded stays at 0.
+
+    Args:
+        urdf: The robot.
+        joints: Names of the recorded joints.
+        cameras: Cameras; those with a mount become frames.
+        scene: Place of the robot, and bodies.
 
     Attributes:
         static: Rows that never change.
-        moving: (parent, child) of those that do, in the order of `rows`.
     """
 
-    def __init__(self, info: EpisodeInfo) -> None:
-        world_from_base, bodies = Pose(), tuple[Body, ...]()
-        if info.simulation is None:
-            urdf, self._places = Urdf.parse(info.urdf), joint_places(info.features)
-            names: Sequence[str] = [*self._places]
-        else:
-            urdf = Urdf.load(asset_path(info.simulated.robot.urdf), scale=info.simulated.scene.robot.scale)
-            world_from_base, bodies, names = (
-                info.simulated.scene.robot.world_from_base,
-                info.simulated.scene.bodies,
-                info.simulated.robot.joint_names,
-            )
-        self._objects = [body.name for body in bodies if body.movable]
-        self._joints = MovingJoints(urdf, names)
-        self.moving = (*self._joints.moving, *((WORLD, name) for name in self._objects))
+    def __init__(
+        self,
+        urdf: Urdf,
+        joints: Sequence[str],
+        cameras: Sequence[Camera],
+        scene: Scene | None = None,
+    ) -> None:
+        bodies = () if scene is None else scene.bodies
+        self._joints = MovingJoints(urdf, joints)
+        self._moving = (*self._joints.moving, *((WORLD, body.name) for body in bodies if body.movable))
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
-            (WORLD, urdf.root, world_from_base),
+            (WORLD, urdf.root, Pose() if scene is None else scene.robot.world_from_base),
             *self._joints.static,
             *((WORLD, body.name, body.world_from_body) for body in bodies if not body.movable),
             *(
                 (camera.mount or urdf.root, camera_frame(camera.name), camera.mount_from_camera)
-                for camera in info.cameras
+                for camera in cameras
                 if camera.mount_from_camera is not None
             ),
         )
 
-    def rows(self, frames: Sequence[Any]) -> Array:
-        """(N, 7 n) position and quaternion xyzw of every moving row at N frames (`FrameValues` or `SampledFrame`)."""
-        if isinstance(frames[0], SampledFrame):
-            features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
-            positions = joint_positions(self._places, features)
-            poses = []
-        else:
-            positions = np.array([frame.observation.joint_position for frame in frames])
-            poses = [frame.observation.object_poses[name].vector() for frame in frames for name in self._objects]
-        joints = self._joints.values(positions).reshape(len(frames), -1)
-        return np.concatenate((joints, np.array(poses).reshape(len(frames), 7 * len(self._objects))), axis=1)
+    def streams(self, state: Callable[[Sequence[Any]], tuple[Array, Array]]) -> tuple[FrameStream, ...]:
+        """The stream of the frames that move, which becomes no column; empty where nothing moves.
+
+        Args:
+            state: Joint positions (N, n) in the order of `joints`, and world_from_object of all movable bodies
+                (N, 7 k), given N frames.
+        """
+        if not self._moving:
+            return ()
+
+        def rows(frames: Sequence[Any]) -> Array:
+            positions, poses = state(frames)
+            return np.concatenate((self._joints.values(positions).reshape(len(frames), -1), poses), axis=1)
+
+        values = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in self._moving)
+        return (FrameStream(TF, messages.TRANSFORMS, layout(messages.TRANSFORMS, values), rows, lambda values: {}),)
 
 
 class MovingJoints:

@@ -25,10 +25,11 @@ from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.scene import Physics, RobotPlacement, Scene
 from demorec.episode.simulated import simulated_info
-from demorec.mcap import Recording, open_recording
+from demorec.mcap import Recording, open_recording, open_simulated
 from demorec.mcap.frames import action_at, frames_of, observation_at
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
+from demorec.sim.sensors import SENSORS
 
 if TYPE_CHECKING:
     from demorec.check.evidence import Motion
@@ -144,7 +145,8 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         RecordingError: It is damaged or empty.
         ConfigError: `export_hz` does not divide its rate.
     """
-    info, trajectory = recording.info, recording.trajectory()
+    info, trajectory = _sensed_here(recording.info), recording.trajectory()
+    trajectory = replace(trajectory, sensed={name: trajectory.sensed[name] for name in info.sensors})
     if trajectory.num_frames == 0:
         raise RecordingError(f"The recording has no frames: {recording.path}")
     fps = options.export_hz or info.fps
@@ -176,6 +178,13 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
     )
 
 
+def _sensed_here(info: EpisodeInfo) -> EpisodeInfo:
+    """Leave out the sensors of a recording that this version does not simulate."""
+    here = {sensor.quantity for sensor in SENSORS}
+    unknown = [feature for quantity, feature in info.sensors.items() if quantity not in here]
+    return replace(info, features=tuple(feature for feature in info.features if feature not in unknown))
+
+
 def seen_in(observation: Observation) -> dict[str, Array]:
     """All that is sensed, in words -> (D,)."""
     return {
@@ -205,7 +214,7 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
                 table.features, info.features, info.fps, info.urdf, table.time_ns, named=options.named
             )
         return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=info.episode_index)
-    with open_recording(path, simulated=True) as recording:
+    with open_simulated(path) as recording:
         return replace(open_demonstration(recording, options), source=path)
 
 

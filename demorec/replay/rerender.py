@@ -26,7 +26,7 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.simulated import with_simulation
 from demorec.episode.variation import Ranges, resolve
-from demorec.mcap import EpisodeWriter, Recording, open_recording
+from demorec.mcap import EpisodeWriter, Recording, open_simulated
 from demorec.mcap.frames import frames_of
 from demorec.render import Renderer, RenderSetup
 from demorec.render.painter import Painter, WarmRenderer
@@ -240,7 +240,7 @@ def rerender(
     if out.resolve() == source.resolve():
         raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
     allow_models(options.allowed)
-    with open_recording(source, simulated=True) as recording:
+    with open_simulated(source) as recording:
         info, trajectory = recording.info, recording.trajectory()
         if trajectory.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
@@ -295,7 +295,7 @@ def _is_drawn(out: Path, info: EpisodeInfo, outcome: Outcome) -> bool:
     The description holds the digest of the source, the cameras, the looks and every option of the drawing.
     """
     try:
-        with open_recording(out, simulated=True) as drawn:
+        with open_simulated(out) as drawn:
             is_same = to_json(drawn.info) == to_json(info) and drawn.outcome == outcome
             return is_same and bool(drawn.digest())  # which reads it to its end, against its checksums
     except RecordingError:
@@ -323,7 +323,7 @@ def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[
     found: dict[str, int | None] = {}
     if options.looks is not None:
         return found
-    with open_recording(out, simulated=True) as new:
+    with open_simulated(out) as new:
         how, how_now = (
             (c.get("renderer"), c.get("antialias", True))
             for c in (recording.info.simulated.config, new.info.simulated.config)

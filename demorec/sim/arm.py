@@ -151,10 +151,10 @@ class Arm:
         position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
         return position, velocity, effort
 
-    def sensed(self) -> dict[str, Array]:
-        """Of the last physics step, as `Observation.sensed`."""
+    def hand_wrench(self) -> Array:
+        """Force (N) and torque (N m) with which the arm holds the hand, (6,), along the axes of the hand's link."""
         wrench = np.array(self._client.getJointState(self.body, self._hand)[2])
-        return {"wrench": self._hand_from_inertia.apply(wrench.reshape(2, 3)).reshape(6)}
+        return self._hand_from_inertia.apply(wrench.reshape(2, 3)).reshape(6)
 
     def gripper_width(self) -> float:
         """Opening, metres."""

@@ -21,6 +21,7 @@ from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import Arm
 from demorec.sim.bodies import ShapeRows, add_body, base_from_inertial, body_poses, shape_rows, visual_bodies
 from demorec.sim.client import connect
+from demorec.sim.sensors import SENSORS
 
 SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""
@@ -193,7 +194,7 @@ class World:
                 for link in self.arm.finger_links
                 for contact in self.client.getContactPoints(bodyA=self.arm.body, linkIndexA=link)
             ),
-            sensed=self.arm.sensed(),
+            sensed={sensor.quantity: sensor.sense(self.client, self.arm) for sensor in SENSORS},
         )
 
     def body(self, name: str) -> Body:

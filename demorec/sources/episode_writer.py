@@ -16,7 +16,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.files import Closing
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import DEPTH_UNITS
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SampledWriter
 from demorec.mcap.cdr import Values
 from demorec.runs.external import episode_path, external_line
 from demorec.runs.run_file import Attempt
@@ -132,7 +132,7 @@ class ImportedEpisodeWriter(Closing):
         self._rows, self._subtasks, self._next_row = episode.rows, episode.subtasks, 0
         self._cameras = {name: _CameraImages(plan) for name, plan in episode.rows.cameras.items()}
         path = episode_path(folder, episode.info.episode_index)
-        self._writer = EpisodeWriter(path, episode.info, video=video, keeps_part=False)
+        self._writer = SampledWriter(path, episode.info, video=video, keeps_part=False)
 
     def close(self) -> None:
         """Leave nothing behind unless it is finished."""

@@ -18,14 +18,14 @@ from demorec.core.files import read_text_limited
 from demorec.episode.episode import Outcome, Sample, SampledFrame, Vector, frame_time_ns
 from demorec.episode.features import STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SampledWriter
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder, episode_path
 from demorec.sources.fields import FieldError
 from demorec.sources.mapping import SourceMapping
 
 Image = bytes | NDArray[Any]
-"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `EpisodeWriter.image` takes them."""
+"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `SampledWriter.image` takes them."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,7 +162,7 @@ def write_frames(
     path = episode_path(folder.path, info.episode_index)
     leads = leads or {}
     begin = max(leads.values(), default=0)
-    with EpisodeWriter(path, info, video=video, keeps_part=False) as writer:
+    with SampledWriter(path, info, video=video, keeps_part=False) as writer:
         for name, lead in leads.items():
             for number in range(begin - lead, begin):
                 writer.image(name, frame_time_ns(number, info.fps), next(images[name]))

@@ -16,7 +16,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
 from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
 from demorec.episode.validity import find_problems
-from demorec.mcap.frame_check import MAX_STAMP_NS, MAX_SUBTASK
+from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.video import size_problem
 from demorec.runs.external import differences
 from demorec.sources.bag import Bag, Files

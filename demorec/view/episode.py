@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event, Outcome
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.scene import Scene
-from demorec.episode.sensed import SENSED
 from demorec.episode.simulated import scene_of
 from demorec.robots.robot import RobotSpec
 
@@ -20,6 +20,8 @@ Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
 Depth = Callable[[], Iterator[tuple[int, Distances]]]
 """Reads the distances of a camera, each image with its time_ns."""
+EFFORT_CURVES = "effort (N m)"
+FORCE_CURVES = "contact_force (N)"
 Box = tuple[float, float, float, float]
 Statements = tuple[tuple[int, str, str], ...]
 """(time_ns, kind, sentence), each holds until the next one of its kind."""
@@ -57,9 +59,9 @@ class Video:
 class PlayedEpisode:
     """What is shown of an episode. What a source does not have is None or empty.
 
-    The curves of a simulated one are "position" and "velocity" of the joints, "gripper" (m), "ee" (m) and those of
-    `demorec.episode.sensed`; "target" and "gripper target" are what was asked for. Those of any other are the elements
-    of its features, by the features' names.
+    The curves of a simulated one are "position" and "velocity" of the joints, "gripper" (m), "ee" (m) and those that
+    `sensed_curves` names; "target" and "gripper target" are what was asked for. Those of any other are the elements of
+    its features, by the features' names.
 
     Attributes:
         name: In the list of recordings.
@@ -150,7 +152,8 @@ class PlayedEpisode:
 def simulated_curves(
     robot: RobotSpec,
     time_ns: NDArray[np.int64],
-    sensed: Mapping[str, Array],
+    values: Mapping[str, NDArray[Any]],
+    sensed: Sequence[Feature],
     *,
     joints: Mapping[str, Array],
     opening: Array,
@@ -162,22 +165,27 @@ def simulated_curves(
     Args:
         robot: The robot.
         time_ns: (T,) of the frames.
-        sensed: Quantity -> (T, ...), of those that were sensed.
+        values: Feature -> (T, D).
+        sensed: Features that have curves of their own.
         joints: Name of the curves -> (T, ...) of the arm's joints, and maybe of others behind them.
         opening, target: (T,) of the gripper: measured, and what was asked for, metres.
         base_from_tcp: (T, 7).
     """
     shown = [(name, values, robot.arm_joints) for name, values in joints.items()]
-    for row in SENSED.values():
-        if (values := row.values(sensed, robot)) is not None:
-            for plot in row.plots:
-                names = plot.names or robot.arm_joints
-                shown.append((plot.curves, values, names))
-                values = values[:, len(names) :]
+    for feature in sensed:
+        shown += sensed_curves(feature, values[feature.name])
     shown.append(("gripper", opening[:, None], ("opening",)))
     shown.append(("gripper target", target[:, None], ("target",)))
     shown.append(("ee", base_from_tcp, ("x", "y", "z")))
     return {name: Curves(time_ns=time_ns, values=values[:, : len(names)], names=names) for name, values, names in shown}
+
+
+def sensed_curves(feature: Feature, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any], tuple[str, ...]]]:
+    """Split a feature's values (T, D) by unit: name of the curves as "wrench (N)", values and names of elements."""
+    for unit in dict.fromkeys(feature.units):
+        columns = [number for number, other in enumerate(feature.units) if other == unit]
+        names = tuple(feature.names[number] for number in columns)
+        yield f"{feature.name.removeprefix('observation.')} ({unit})", values[:, columns], names
 
 
 def timed[Image](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Image]]) -> Iterator[tuple[int, Image]]:

@@ -30,7 +30,7 @@ from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
-from demorec.episode.sensed import SENSED
+from demorec.episode.simulated import on_request
 from demorec.episode.validity import read_episode_info
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
@@ -121,7 +121,8 @@ def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str
         curves=simulated_curves(
             info.simulated.robot,
             episode.time_ns,
-            {row.quantity: data[name] for name, row in SENSED.items() if name in data},
+            data,
+            [feature for feature in on_request(info) if feature.name in data],
             joints=joints,
             opening=state[:, num_arm],
             target=data["action"][:, -1],

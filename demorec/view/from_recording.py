@@ -19,12 +19,12 @@ from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.episode import NO_IMAGE, Table, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import NO_NAMES, ROLES, NamedRoles, Roles, roles_of_recording
-from demorec.episode.sensed import ObservationRows
+from demorec.episode.simulated import on_request
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.channels import JOINT_STATES, description_topic
 from demorec.mcap.transforms import joint_places, joint_positions
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import Curves, PlayedEpisode, Video, simulated_curves, timed
+from demorec.view.episode import EFFORT_CURVES, Curves, PlayedEpisode, Video, simulated_curves, timed
 
 
 @contextmanager
@@ -137,7 +137,8 @@ def _curves(recording: Recording, trajectory: Trajectory) -> dict[str, Curves]:
     result = simulated_curves(
         robot,
         trajectory.time_ns,
-        ObservationRows.of_trajectory(trajectory).sensed,
+        recording.table().features,
+        on_request(recording.info),
         joints={
             "position": trajectory.joint_position,
             "velocity": trajectory.joint_velocity,
@@ -150,8 +151,8 @@ def _curves(recording: Recording, trajectory: Trajectory) -> dict[str, Curves]:
     if recording.topics[JOINT_STATES][1] > recording.num_frames:
         samples = list(recording.joint_samples())
         time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
-        for name in ("position", "velocity", "effort"):
-            values = np.array([getattr(sample, f"joint_{name}") for sample in samples])
+        for name, quantity in (("position", "position"), ("velocity", "velocity"), (EFFORT_CURVES, "effort")):
+            values = np.array([getattr(sample, f"joint_{quantity}") for sample in samples])
             values = values[:, : len(robot.arm_joints)]
-            result[name] = Curves(time_ns=time_ns, values=values, names=robot.arm_joints)
+            result[name] = Curves(time_ns=time_ns, values=values, names=result[name].names)
     return result

@@ -10,8 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from demorec.episode.features import ACTION, STATE
-from demorec.episode.sensed import SENSED
-from demorec.view.episode import PlayedEpisode
+from demorec.view.episode import EFFORT_CURVES, FORCE_CURVES, PlayedEpisode
 from demorec.view.paths import FRAMES, SECONDS, Paths
 from demorec.view.scene import DIFFERENCES, A, B
 
@@ -22,10 +21,11 @@ _PLOTS: Mapping[str, tuple[str, ...]] = {
     "joint velocity (rad/s)": ("velocity",),
     "gripper position (m)": ("ee",),
     "gripper opening (m)": ("gripper", "gripper target"),
-    **{plot.title: (plot.curves,) for row in SENSED.values() for plot in row.plots},
+    "joint effort (N m)": (EFFORT_CURVES,),
+    "contact force (N)": (FORCE_CURVES,),
 }
-"""Title -> curves of a simulated episode; those of `_SIDE` stand beside the tabs of the others. Any other curve, as of
-the features of other episodes, has a plot of its own."""
+"""Title -> curves of a simulated episode; those of `_SIDE` stand beside the tabs of the others. Any other curve has a
+plot of its own: those of sensors in further tabs, the features of other episodes next to each other."""
 _COMPARED_PLOTS = {("joints (rad)" if "position" in names else title): names[:1] for title, names in _PLOTS.items()}
 """Of two episodes over each other: what was asked for would hide what is compared."""
 _NOT_IN_3D: tuple[Literal["/depth", "/segmentation", "/boxes"], ...] = ("/depth", "/segmentation", "/boxes")
@@ -214,12 +214,11 @@ def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
     plots = _PLOTS if len(roots) == 1 else _COMPARED_PLOTS
     known = {name for names in plots.values() for name in names} | {"target", "gripper target"}
     tabs = [item for title, names in plots.items() if title not in _SIDE and (item := view(title, *names)) is not None]
-    beside = [
-        *((title, plots[title]) for title in _SIDE),
-        *((_feature_title(name, episode.roles), (name,)) for name in episode.curves if name not in known),
-    ]
+    others = [view(_feature_title(name, episode.roles), name) for name in episode.curves if name not in known]
+    beside = [item for title in _SIDE if (item := view(title, *plots[title])) is not None]
+    (tabs or beside).extend(item for item in others if item is not None)
     columns: list[rrb.View | rrb.Container] = [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
-    columns += [item for title, names in beside if (item := view(title, *names)) is not None]
+    columns += beside
     return rrb.Horizontal(*columns, column_shares=[1.8, *([1.0] * (len(columns) - 1))] if tabs else None)
 
 

@@ -5,6 +5,7 @@ The time lines are seconds since the episode's start, and frame numbers.
 
 from __future__ import annotations
 
+import re
 from typing import Literal
 
 import numpy as np
@@ -52,9 +53,10 @@ class Paths:
 
     def curves(self, name: str) -> str:
         """Numbers over time."""
-        return f"{self.root}/plots/{name.replace(' ', '_')}"
+        return f"{self.root}/plots/{_NOT_IN_PATHS.sub('_', name)}"
 
 
+_NOT_IN_PATHS = re.compile(r"[ /()]+")
 SECONDS = "time"
 FRAMES = "frame"
 

@@ -16,7 +16,7 @@ from demorec.episode.scene import Rgba
 from demorec.episode.simulated import simulation_facts
 from demorec.view.bodies import log_bodies, log_robot
 from demorec.view.cameras import log_cameras
-from demorec.view.episode import Curves, PlayedEpisode, Statements
+from demorec.view.episode import FORCE_CURVES, Curves, PlayedEpisode, Statements
 from demorec.view.paths import Paths, indexes
 from demorec.view.style import (
     ASKED,
@@ -32,7 +32,7 @@ from demorec.view.style import (
 
 _HEADINGS = {"subtask": "Now", "motion": "Motion", "plan": "Plan", "memory": "So far"}
 """Kind of statement -> its heading, in the order of the page."""
-_COLORS = {"gripper": MEASURED, "gripper target": TARGET, "force": FORCE, "target": ASKED}
+_COLORS = {"gripper": MEASURED, "gripper target": TARGET, FORCE_CURVES: FORCE, "target": ASKED}
 _WIDTHS = {"target": 0.7, "gripper target": 1.2}
 _LEVELS = {"info": "INFO", "warning": "WARN", "error": "ERROR"}
 _LEVEL_COLORS: dict[str, Color] = {"info": (200, 200, 200), "warning": (255, 200, 60), "error": (255, 80, 80)}

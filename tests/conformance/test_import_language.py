@@ -18,7 +18,7 @@ from support.export import export, recordings
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.errors import ConfigError
-from demorec.mcap import EpisodeWriter, Recording, recover
+from demorec.mcap import Recording, SampledWriter, recover
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 ARM = [note for note in bags.so101(3.0) if "joint_states" in note.topic]
@@ -212,7 +212,7 @@ def test_recovery_keeps_what_was_said(tmp_path: Path) -> None:
     from support.external import make_external
 
     given = make_external(cameras=())
-    with EpisodeWriter(tmp_path / "a.mcap", given.info) as writer:
+    with SampledWriter(tmp_path / "a.mcap", given.info) as writer:
         for number, frame in enumerate(given.frames):
             writer.write(replace(frame, subtask={0: "reach", 9: "grasp"}.get(number, "")))
         writer.flush()

@@ -15,10 +15,11 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, RecordingError
 from demorec.core.tables import EXPORTERS
-from demorec.episode.sensed import SENSED
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.recover import recover
 from demorec.runs.find import find, name_of
+
+ON_REQUEST = ("observation.effort", "observation.contact_force", "observation.wrench")
 
 pytestmark = pytest.mark.parametrize("exporter", EXPORTERS.names())
 
@@ -41,7 +42,7 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
     assert files_of(run) == before
 
 
-@pytest.mark.parametrize("name", [*SENSED, "command"])
+@pytest.mark.parametrize("name", [*ON_REQUEST, "command"])
 def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, features=(name,), episodes="0")
     with Recording(run / "episodes" / "episode_000000.mcap") as recording:

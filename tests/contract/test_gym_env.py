@@ -24,11 +24,13 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
 from demorec.episode.episode import Trajectory
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.sensed import SENSED, ObservationRows
+from demorec.episode.observation_rows import ObservationRows
 from demorec.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
 from demorec.mcap import Recording
+
+ON_REQUEST = ("observation.effort", "observation.contact_force", "observation.wrench")
 
 FRAMES = 45
 VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes", "pick_anything")
@@ -102,17 +104,19 @@ def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_pa
 def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> None:
     """Every feature of `export --features`, row by row; the command is that of the step that leads to the next row."""
     path = simulate(tmp_path / "e.mcap", episode_index=3)
-    export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False, features=(*SENSED, "command")))
+    export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False, features=(*ON_REQUEST, "command")))
     table = data_table(tmp_path / "ds")
-    exported = {name: np.array(table.column(name).to_pylist(), np.float32) for name in (*SENSED, "command", "action")}
+    exported = {
+        name: np.array(table.column(name).to_pylist(), np.float32) for name in (*ON_REQUEST, "command", "action")
+    }
     with Recording(path) as recording:
         trajectory = recording.trajectory()
-    env = make(split="all", sensed=tuple(SENSED))
+    env = make(split="all", sensed=tuple(ON_REQUEST))
     observation, _ = env.reset(seed=3)
     assert env.observation_space.contains(observation)
     assert np.abs(exported["observation.contact_force"]).max() > 1.0
     for t in range(trajectory.num_frames):
-        for name in SENSED:
+        for name in ON_REQUEST:
             expected = exported[name][t].reshape(-1)  # a column of one number is a column of scalars
             assert np.array_equal(observation[name.removeprefix("observation.")], expected), (name, t)
         command = np.append(trajectory.command_joint_target[t], trajectory.command_gripper[t])

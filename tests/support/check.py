@@ -25,9 +25,9 @@ from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container
-from demorec.mcap.frame_check import FrameCheck
 from demorec.mcap.frames import frames_of
 from demorec.mcap.part_file import PartFile
+from demorec.mcap.simulated_writer import FrameCheck
 from demorec.robots.motors import Motors
 from demorec.runs.recorded import inspect_recording
 from demorec.runs.run_file import Generation, RunFile, save_run_file

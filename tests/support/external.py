@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SampledWriter
 
 URDF = """<robot name="two_joints">
  <link name="base"><visual><geometry><box size="0.1 0.1 0.1"/></geometry></visual></link>
@@ -114,7 +114,7 @@ def _image(camera: Camera, index: int) -> NDArray[np.uint8]:
     return pixels
 
 
-def write_images_and_frames(writer: EpisodeWriter, episode: Episode) -> None:
+def write_images_and_frames(writer: SampledWriter, episode: Episode) -> None:
     """Everything but the end."""
     given = dict.fromkeys(episode.images, 0)
     for frame in episode.frames:
@@ -129,7 +129,7 @@ def write_images_and_frames(writer: EpisodeWriter, episode: Episode) -> None:
 def write_external(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
     """A recording of an external episode."""
     episode = episode or make_external()
-    with EpisodeWriter(path, episode.info, video=video) as writer:
+    with SampledWriter(path, episode.info, video=video) as writer:
         write_images_and_frames(writer, episode)
         writer.finish(episode.outcome)
     return path

@@ -31,6 +31,7 @@ from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, SceneCamera
 from demorec.episode.simulated import simulated_info
 from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import ParallelGripper, RobotSpec
+from demorec.sim.sensors import SENSORS
 
 Codec = Literal["h264", "av1", "jpeg"]
 PHASES = ("approach", "descend", "grasp", "lift", "transport", "place", "retreat")
@@ -93,6 +94,7 @@ def make_episode(
     )
     info = simulated_info(
         simulation,
+        sensors=[sensor.feature(PANDA) for sensor in SENSORS],
         episode_index=episode_index,
         instruction="pick up the red cube and place it on the green target",
         fps=fps,
@@ -243,7 +245,10 @@ def _frame(
             base_from_tcp=tcp,
             object_poses={"cube": Pose.from_yaw((0.45, -0.1 + 0.01 * seconds, 0.0225 + 0.02 * seconds), 0.3 + seconds)},
             contact_force=max(0.0, 5.0 * math.sin(seconds)),
-            sensed={"wrench": np.array([math.sin((n + 1) * seconds) - n for n in range(6)])},
+            sensed={
+                sensor.quantity: np.array([math.sin((n + 1) * seconds) - n for n in range(len(sensor.elements(PANDA)))])
+                for sensor in SENSORS
+            },
         ),
         action=action,
         command=command,

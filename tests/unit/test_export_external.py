@@ -149,7 +149,7 @@ def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
 def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     from typing import cast
 
-    from demorec.mcap import EpisodeWriter
+    from demorec.mcap import SampledWriter
 
     context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
     context.width, context.height, context.pix_fmt, context.time_base = 64, 48, "yuv420p", Fraction(1, 30)
@@ -162,7 +162,7 @@ def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
         packets += [bytes(packet) for packet in context.encode(frame)]
     packets += [bytes(packet) for packet in context.encode(None)]
     (tmp_path / "run" / "episodes").mkdir(parents=True)
-    with EpisodeWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
+    with SampledWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
         for frame_, packet in zip(episode.frames, packets, strict=True):
             writer.image("top", frame_.time_ns, packet)
             writer.write(frame_)

@@ -22,7 +22,7 @@ from support.external import (
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import Recording, SampledWriter
 
 
 @pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
@@ -54,21 +54,21 @@ def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
         assert table.image_age_ns("top").tolist() == [7_000_000] * num_frames
 
 
-def _frame(**changes: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
+def _frame(**changes: Any) -> Callable[[SampledWriter, SampledFrame], object]:
     return lambda writer, frame: writer.write(replace(frame, **changes))
 
 
-def _sample(feature: str, vector: object, stamp_ns: object = 5) -> Callable[[EpisodeWriter, SampledFrame], object]:
+def _sample(feature: str, vector: object, stamp_ns: object = 5) -> Callable[[SampledWriter, SampledFrame], object]:
     sample = Sample(stamp_ns=cast(int, stamp_ns), vector=cast(Any, vector))
     return lambda writer, frame: writer.write(replace(frame, samples={**frame.samples, feature: sample}))
 
 
-def _image(*arguments: Any) -> Callable[[EpisodeWriter, SampledFrame], object]:
+def _image(*arguments: Any) -> Callable[[SampledWriter, SampledFrame], object]:
     return lambda writer, frame: writer.image(*arguments)
 
 
 PIXELS = np.zeros((48, 64, 3), dtype=np.uint8)
-BAD: dict[str, tuple[Callable[[EpisodeWriter, SampledFrame], object], str]] = {
+BAD: dict[str, tuple[Callable[[SampledWriter, SampledFrame], object], str]] = {
     "length": (
         _sample("action", np.zeros(2)),
         r"'action' of frame 1 is float64 of shape \(2,\), it must be float64 of",
@@ -97,7 +97,7 @@ BAD: dict[str, tuple[Callable[[EpisodeWriter, SampledFrame], object], str]] = {
 def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what: str) -> None:
     act, words = BAD[what]
     episode = make_external(num_frames=2, cameras=(TOP,))
-    with EpisodeWriter(tmp_path / "a.mcap", episode.info) as writer:
+    with SampledWriter(tmp_path / "a.mcap", episode.info) as writer:
         writer.image("top", *episode.images["top"][0])
         writer.write(episode.frames[0])
         with pytest.raises(RecordingError, match=words) as error:
@@ -127,5 +127,5 @@ def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what
 def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:
     info: EpisodeInfo = replace(make_external(num_frames=1).info, **changes)
     with pytest.raises(ConfigError, match=words):
-        EpisodeWriter(tmp_path / "a.mcap", info)
+        SampledWriter(tmp_path / "a.mcap", info)
     assert not list(tmp_path.iterdir())

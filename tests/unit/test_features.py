@@ -22,8 +22,8 @@ from demorec.episode.features import (
     observation_vectors,
     pose_from_delta,
 )
+from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
-from demorec.episode.sensed import ObservationRows
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

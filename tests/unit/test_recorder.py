@@ -21,9 +21,8 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE
 from demorec.episode.info import Camera, Feature
-from demorec.mcap import Recording
+from demorec.mcap import Recording, SampledWriter
 from demorec.mcap.recorder.encoder import BackgroundEncoder
-from demorec.mcap.writer import EpisodeWriter
 from demorec.robots.panda import PANDA
 from demorec.runs.run_file import load_any_run_file
 
@@ -320,13 +319,13 @@ def test_frames_that_the_encoder_cannot_take_are_counted(tmp_path: Path, monkeyp
 
 
 def test_an_error_of_the_encoder_reaches_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: EpisodeWriter) -> None:
+    def fail(self: SampledWriter) -> None:
         raise RecordingError("The recording cannot be written (No space left on device)")
 
     with recorder(tmp_path / "run") as run:
         episode = run.episode()
         episode.write([0.0])
-        monkeypatch.setattr(EpisodeWriter, "flush", fail)
+        monkeypatch.setattr(SampledWriter, "flush", fail)
         with pytest.raises(RecordingError, match="No space left"):  # noqa: PT012
             for _ in range(2000):
                 episode.write([0.0])

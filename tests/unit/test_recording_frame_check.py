@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from support.recording import make_episode
 
-from demorec.core.errors import RecordingError
+from demorec.core.errors import ConfigError, RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Frame
 from demorec.episode.info import EpisodeInfo
@@ -112,10 +112,13 @@ def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
 
 @pytest.mark.parametrize(
     ("names", "words"),
-    [(("elbow",), "has no joints elbow; those of its URDF are"), (("panda_joint2",), "the joints panda_joint2 twice")],
+    [
+        (("elbow",), "has no joints elbow; those of its URDF are"),
+        (("panda_joint2",), "2 joints of the robot are called 'panda_joint2'"),
+    ],
 )
 def test_joints_that_the_robot_does_not_have_are_refused(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
     info, _, _ = make_episode(num_frames=1, cameras=())
-    with pytest.raises(RecordingError, match=words):
+    with pytest.raises(ConfigError, match=words):
         EpisodeWriter(tmp_path / "e.mcap", renamed(info, *names))
     assert not list(tmp_path.iterdir())  # refused before anything is written

@@ -15,7 +15,7 @@ from support.external import TOP, make_external
 from support.recording import make_episode
 
 from demorec.episode.episode import frame_time_ns
-from demorec.mcap import EpisodeWriter, Recording
+from demorec.mcap import EpisodeWriter, Recording, SampledWriter
 
 READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "packets": lambda recording: recording.packets("front"),
@@ -77,7 +77,7 @@ def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_ar
     short = make_external(cameras=(), num_frames=60)
     peaks, num_bytes = [], []
     for count in (60, 1500, 6000):  # the first loads what is loaded once
-        with EpisodeWriter(tmp_path / f"{count}.mcap", short.info) as writer:
+        with SampledWriter(tmp_path / f"{count}.mcap", short.info) as writer:
             for index in range(count):
                 frame = short.frames[index % 60]
                 later = (index // 60) * 10_000_000_000
@@ -98,7 +98,7 @@ def test_numbers_of_a_external_episode_are_read_without_its_images(tmp_path: Pat
     given = make_external(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
     noise = np.random.default_rng(0)
     num_bytes = 0
-    with EpisodeWriter(tmp_path / "a.mcap", given.info) as writer:
+    with SampledWriter(tmp_path / "a.mcap", given.info) as writer:
         for number, frame in enumerate(given.frames):
             num_bytes += 200_000
             assert writer.image("top", frame.time_ns, noise.bytes(200_000)) == number

@@ -18,7 +18,7 @@ from support.recording import Codec, frame_number, make_episode, write_episode
 from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Frame
-from demorec.mcap import Recording, open_recording
+from demorec.mcap import Recording, open_recording, open_simulated
 
 NUM_FRAMES = 47
 
@@ -82,8 +82,8 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
         assert row["is_deliberate_miss"] == frame.is_deliberate_miss
         assert row["joint_position.panda_joint3"] == seen.joint_position[2]
         assert row["joint_effort.panda_finger_joint2"] == seen.joint_effort[8]
-        assert row["wrench.fz"] == seen.sensed["wrench"][2]
-        assert row["wrench.tx"] == seen.sensed["wrench"][3]
+        assert row["wrench.hand.force.z"] == seen.sensed["wrench"][2]
+        assert row["wrench.hand.torque.x"] == seen.sensed["wrench"][3]
         assert row["base_from_tcp.z"] == seen.base_from_tcp.position[2]
         assert row["object_poses.cube.qw"] == seen.object_poses["cube"].quat_xyzw[3]
         assert row["command_joint_target.panda_joint7"] == command.joint_target[6]
@@ -155,11 +155,11 @@ def test_an_external_recording_is_at_home_in_notebooks(tmp_path: Path) -> None:
         with pytest.raises(RecordingError, match="needs the scene of an episode that demorec simulated"):
             next(iter(recording))
     with pytest.raises(RecordingError, match=f"needs the scene of an episode that demorec simulated.*: {tmp_path}"):
-        open_recording(tmp_path / "episode.mcap", simulated=True)
+        open_simulated(tmp_path / "episode.mcap")
 
 
 def test_a_simulated_recording_says_which_image_each_frame_holds(path: Path) -> None:
-    with open_recording(path, simulated=True) as recording:
+    with open_simulated(path) as recording:
         table, info = recording.table(), recording.info
         for camera in info.cameras:
             assert table.images[camera.name].tolist() == list(range(NUM_FRAMES))

@@ -24,7 +24,7 @@ def main(source: Path, target: Path, camera: str) -> None:
             rrb.TimeSeriesView(
                 origin="/", contents=[paths.curves("gripper"), paths.curves("gripper target")], name="opening (m)"
             ),
-            rrb.TimeSeriesView(origin=paths.curves("force"), name="contact force (N)"),
+            rrb.TimeSeriesView(origin=paths.curves("contact_force (N)"), name="contact force (N)"),
             row_shares=[4, 1, 1],
         ),
         collapse_panels=True,

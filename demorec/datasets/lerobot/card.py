@@ -32,7 +32,6 @@ from demorec.episode.features import (
     VELOCITY,
     ActionKind,
 )
-from demorec.episode.sensed import SENSED
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""
@@ -55,7 +54,6 @@ _SIMULATED_MEANING = {
     PERSISTENT: "what is said of the episode, each entry from its `timestamp` on until the next one of its style; all "
     "of it in every row",
     EVENTS: "what is said at this row alone",
-    **{name: row.meaning for name, row in SENSED.items()},
 }
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
@@ -89,18 +87,25 @@ _RECORDED_SIDECAR = (
 
 
 def write_card(
-    root: Path, info: DatasetInfo, options: ExportOptions, configs: Mapping[str, Any], *, is_transcoded: bool
+    root: Path,
+    info: DatasetInfo,
+    options: ExportOptions,
+    configs: Mapping[str, Any],
+    *,
+    meanings: Mapping[str, str],
+    is_transcoded: bool,
 ) -> None:
     """Write the card of a finished dataset folder.
 
     Args:
         configs: Config digest -> configuration of the runs; empty if demorec simulated no episode.
+        meanings: Feature -> its description in the recordings.
         is_transcoded: Whether any images were transcoded.
     """
     there = root / CARD_PATH
     path = root / SECOND_CARD_PATH if has_own_card(root) else there
     path.unlink(missing_ok=True)
-    write_text(path, _marked("\n".join(_card(root, info, options, configs, is_transcoded)) + "\n"))
+    write_text(path, _marked("\n".join(_card(root, info, options, configs, meanings, is_transcoded)) + "\n"))
 
 
 def has_own_card(root: Path) -> bool:
@@ -123,9 +128,11 @@ def _card(
     info: DatasetInfo,
     options: ExportOptions,
     configs: Mapping[str, Any],
+    meanings: Mapping[str, str],
     is_transcoded: bool,
 ) -> Iterable[str]:
-    meaning = {**_MEANING, **(_simulated_meaning(options) if configs else {})}
+    sensed = {name: markdown(source) for name, source in meanings.items() if source}
+    meaning = {**_MEANING, **({**sensed, **_simulated_meaning(options)} if configs else {})}
     tasks = read_tasks(root)
     minutes = info.total_frames / info.fps / 60
     pictures = "some pictures were coded anew" if is_transcoded else "every video packet is the one that was recorded"

@@ -131,7 +131,14 @@ class _Export:
             configs = sidecar.finish(self._about_this_export())
         if self._options.progress:
             write_progress(self._folder)
-        write_card(self._folder, finished, self._options, configs, is_transcoded=bool(self._transcoded))
+        write_card(
+            self._folder,
+            finished,
+            self._options,
+            configs,
+            meanings=first.meanings,
+            is_transcoded=bool(self._transcoded),
+        )
         return ExportReport(
             path=self._folder,
             num_episodes=finished.total_episodes,

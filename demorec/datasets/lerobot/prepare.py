@@ -45,6 +45,7 @@ class ExportedEpisode:
         info: Description of a dataset made from this episode.
         depth_left_out: Depth cameras that were not asked for.
         transcoded: Cameras with transcoded images, and the reason.
+        meanings: Feature -> its description in the recording.
     """
 
     data: EpisodeData
@@ -54,6 +55,7 @@ class ExportedEpisode:
     info: DatasetInfo
     depth_left_out: tuple[str, ...]
     transcoded: tuple[str, ...]
+    meanings: Mapping[str, str]
 
 
 def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
@@ -106,6 +108,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         info=info,
         depth_left_out=episode.depth_left_out,
         transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
+        meanings={feature.name: feature.source for feature in episode.info.features},
     )
 
 

@@ -23,7 +23,7 @@ from demorec.episode.episode import Outcome, Table, frame_time_ns
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.roles import Roles
-from demorec.mcap.frame_check import MAX_SUBTASK
+from demorec.mcap.sampled_writer import MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
 _SUCCESS = "next.success"

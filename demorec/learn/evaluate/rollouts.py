@@ -43,8 +43,17 @@ from demorec.core.replacing import (
 )
 from demorec.core.tables import ROBOTS, camera_name
 from demorec.episode.episode import Outcome
-from demorec.episode.features import ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, ActionKind, StateKind, state_names
-from demorec.episode.sensed import SENSED
+from demorec.episode.features import (
+    CONTACT_FORCE,
+    EFFORT,
+    ENVIRONMENT_STATE,
+    IMAGE_PREFIX,
+    STATE,
+    ActionKind,
+    StateKind,
+    state_names,
+)
+from demorec.episode.info import sensor_feature
 from demorec.episode.simulated import with_simulation
 from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Raised
@@ -67,7 +76,10 @@ from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import RobotSpec
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
+from demorec.sim.sensors import SENSORS
 from demorec.sim.world import World
+
+_SENSORS = [sensor_feature(sensor.quantity) for sensor in SENSORS]
 
 MAKE_ROLLOUT = "demorec.learn.evaluate.rollouts:make_rollout"
 
@@ -184,7 +196,7 @@ def settings_for(
         action=action,
         action_steps=action_steps,
         privileged=ENVIRONMENT_STATE in inputs,
-        sensed=tuple(name for name in SENSED if name in inputs),
+        sensed=tuple(name for name in (EFFORT, CONTACT_FORCE, *_SENSORS) if name in inputs),
         state=_state_kind(inputs, ROBOTS.load(config.robot)),
         episode_length=episode_length,
     )

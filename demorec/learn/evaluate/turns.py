@@ -20,7 +20,7 @@ from demorec.learn.evaluate import TakeOver
 from demorec.learn.evaluate.policy import Policy
 from demorec.learn.evaluate.watch import Watch, correcting_behaviour
 from demorec.loop.session import ActionNoise
-from demorec.mcap import open_recording
+from demorec.mcap import open_simulated
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Step
@@ -183,7 +183,7 @@ def read_takeover(path: Path) -> TakenOver | None:
     Raises:
         RecordingError: It cannot be read.
     """
-    with open_recording(path, simulated=True) as recording:
+    with open_simulated(path) as recording:
         messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
         if not messages:
             return None

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from demorec.episode.episode import SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
-from demorec.mcap import EpisodeWriter
+from demorec.mcap import SampledWriter
 
 WhenFull = Literal["error", "drop", "wait"]
 
@@ -78,7 +78,7 @@ class BackgroundEncoder:
 
     def __init__(
         self,
-        writer: EpisodeWriter,
+        writer: SampledWriter,
         buffers: Buffers,
         *,
         cameras: Sequence[Camera],

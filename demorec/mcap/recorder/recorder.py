@@ -21,8 +21,7 @@ from demorec.core.registry import nearest_match
 from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.episode.validity import find_problems
-from demorec.mcap import EpisodeWriter
-from demorec.mcap.frame_check import SampledFrameCheck
+from demorec.mcap import SampledWriter
 from demorec.mcap.recorder.encoder import BackgroundEncoder, Buffers, WaitingImages, WhenFull
 from demorec.mcap.recorder.vectors import (
     NamedVectors,
@@ -33,6 +32,7 @@ from demorec.mcap.recorder.vectors import (
     named_vectors,
     robot_facts,
 )
+from demorec.mcap.sampled_writer import SampledFrameCheck
 from demorec.mcap.video import size_problem
 from demorec.runs.external import ExternalFolder, episode_path, open_external_run
 
@@ -315,7 +315,7 @@ class Recorder(Closing):
             raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
         info = self._info(self._features, self._folder.next_index, instruction)
         path = episode_path(self.path, info.episode_index)
-        writer = EpisodeWriter(path, info, video=self._video, begins=False)
+        writer = SampledWriter(path, info, video=self._video, begins=False)
         encoder = BackgroundEncoder(
             writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait"
         )

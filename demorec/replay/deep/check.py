@@ -22,7 +22,7 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
-from demorec.mcap import EpisodeWriter, Recording, open_recording
+from demorec.mcap import EpisodeWriter, Recording, open_simulated
 from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.replay.deep.contents import Contents, RemakeDifference, coded_topics, content_differences
@@ -84,7 +84,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
     try:
         with (
             tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder,
-            open_recording(path, simulated=True) as recording,
+            open_simulated(path) as recording,
         ):
             info = recording.info
             report = replace(report, num_frames=recording.num_frames, is_derived=bool(info.origin))
@@ -199,7 +199,7 @@ def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter |
 def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[RemakeDifference]:
     """Ordered by the first frame."""
     found, made = Contents.of(recording.path), Contents.of(again)
-    with open_recording(again, simulated=True) as remade:
+    with open_simulated(again) as remade:
         if recording.is_recovered:
             made.cut_off(found)
         differences, images = content_differences(found, made, remade.info, recording.info.fps)

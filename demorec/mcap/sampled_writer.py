@@ -1,114 +1,116 @@
-"""What a frame must be to be recorded, refused at once where it is not, in one sentence.
+"""Write an episode that demorec does not simulate: images come at their own times, and several frames may show one.
 
-Of a simulated episode: vectors of the robot's lengths, poses of the scene's objects, finite numbers (`FrameCheck`). Of
-any other: the features and images that its description names, at stamps that go forward (`SampledFrameCheck`).
+Images are written in front of the frames that show them, so that whatever a crash leaves of the frames has its images.
 """
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
+from demorec.core.geometry import Array
 from demorec.core.registry import nearest_match
-from demorec.episode.episode import CameraImages, Frame, JointSample, SampledFrame
+from demorec.episode.episode import SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
-from demorec.episode.sensed import STREAMS
+from demorec.mcap import messages
+from demorec.mcap.cdr import encode
+from demorec.mcap.channels import SUBTASK
+from demorec.mcap.images import CameraWriter
 from demorec.mcap.lossless import DEPTH_TYPES
-from demorec.mcap.metadata import CameraStreams
-from demorec.robots.assets import asset_path
+from demorec.mcap.sampled_layout import SampledLayout
+from demorec.mcap.transforms import FrameTree, joint_places, joint_positions
+from demorec.mcap.writer import BatchWriter, PendingFrame, check_description
 from demorec.robots.urdf import Urdf
 
 
-def check_joint_names(info: EpisodeInfo) -> None:
-    """Raise RecordingError unless the robot's joints are different ones that its URDF has."""
-    robot = info.simulated.robot
-    known = {joint.name for joint in Urdf.load(asset_path(robot.urdf)).joints if joint.kind != "fixed"}
-    if wrong := [name for name in robot.joint_names if name not in known]:
-        raise RecordingError(
-            f"The robot {robot.name!r} has no joints {', '.join(wrong)}; those of its URDF are "
-            f"{', '.join(sorted(known))}: {robot.urdf}"
-        )
-    if twice := [name for name, count in Counter(robot.joint_names).items() if count > 1]:
-        raise RecordingError(f"The robot {robot.name!r} names the joints {', '.join(twice)} twice.")
+class SampledWriter(BatchWriter):
+    """Context manager that writes an episode of another robot or program; arguments and errors as of `BatchWriter`.
 
+    Args:
+        begins: Whether all of `info` is known. Otherwise only file and encoders are opened, and `begin` must follow.
+    """
 
-class FrameCheck:
-    """Checks frame after frame of one episode; takes microseconds, since it is part of every recording."""
+    def __init__(
+        self,
+        path: Path,
+        info: EpisodeInfo,
+        *,
+        video: VideoConfig | None = None,
+        overwrite: bool = False,
+        begins: bool = True,
+        keeps_part: bool = True,
+    ) -> None:
+        if begins:
+            check_description(info)
+        video = video or VideoConfig()
+        cameras = {camera.name: CameraWriter(camera, video, info.fps) for camera in info.cameras}
+        super().__init__(path, info, cameras, overwrite=overwrite, keeps_part=keeps_part)
+        if begins:
+            self._describe(info)
 
-    def __init__(self, info: EpisodeInfo) -> None:
-        self._joints, self._arm = (len(info.simulated.robot.joint_names),), (len(info.simulated.robot.arm_joints),)
-        self._objects = {body.name for body in info.simulated.scene.movable}
-        self._cameras = {camera.name for camera in info.simulated.scene.cameras}
-        self._sensed = {name: (len(row.names(info.simulated.robot)),) for name, row in STREAMS.items()}
+    def begin(self, info: EpisodeInfo) -> None:
+        """Describe the episode, of which only the cameras were known; before its first image and frame.
 
-    def __call__(self, frame: Frame) -> None:
-        """Raise RecordingError for what is wrong with a frame; images are looked at when they are encoded."""
-        poses, images = frame.observation.object_poses, frame.images
-        for what, found, known, fits in (
-            ("poses of the objects", poses, self._objects, poses.keys() == self._objects),
-            ("images of the cameras", images, self._cameras, images.keys() <= self._cameras),
-        ):
-            if not fits:
-                raise RecordingError(
-                    f"Frame {frame.frame_index} has {what} {', '.join(sorted(found)) or 'none'}, the scene has "
-                    f"{', '.join(sorted(known)) or 'none'}."
-                )
-        vectors = list(self._vectors(frame))
-        for owner, name, vector, shape in vectors:
-            if vector is None or vector.shape != shape:
-                given = f"no {name}" if vector is None else f"a {name} of shape {vector.shape}"
-                raise RecordingError(
-                    f"Frame {frame.frame_index} has {given} in its {owner}, it must be of shape {shape}."
-                )
-        if not np.isfinite(np.concatenate([vector for _, _, vector, _ in vectors])).all():
-            owner, name = next((owner, name) for owner, name, vector, _ in vectors if not np.isfinite(vector).all())
-            raise RecordingError(f"Frame {frame.frame_index} has a {name} in its {owner} that is not finite.")
+        Raises:
+            ConfigError: The description is impossible.
+            RecordingError: The disk is full; nothing of the episode is left then.
+        """
+        check_description(info)
+        self._describe(info)
 
-    def _vectors(self, frame: Frame) -> Iterator[tuple[str, str, Any, tuple[int, ...]]]:
-        """Where, what, numbers, their shape; None for the numbers of what is missing."""
-        seen = frame.observation
-        for state in (seen, *frame.joint_samples):
-            owner = f"joint sample at {state.time_ns} ns" if isinstance(state, JointSample) else "observation"
-            for name in ("joint_position", "joint_velocity", "joint_effort"):
-                yield owner, name, getattr(state, name), self._joints
-        for name in ("gripper_width", "contact_force"):
-            yield "observation", name, np.array([getattr(seen, name)]), (1,)
-        for name, shape in self._sensed.items():
-            yield "observation", name, seen.sensed.get(name), shape
-        for owner, action in (("action", frame.action), ("command", frame.command)):
-            yield owner, "joint_target", action.joint_target, self._arm
-            yield owner, "gripper_target", np.array([action.gripper_target]), (1,)
-            yield owner, "base_from_tcp_target", action.base_from_tcp_target.vector(), (7,)
-        yield "observation", "base_from_tcp", seen.base_from_tcp.vector(), (7,)
-        for pose in seen.object_poses.values():
-            yield "observation", "object_poses", pose.vector(), (7,)
-        for camera, images in frame.images.items():
-            yield f"image of {camera}", "world_from_camera", images.world_from_camera.vector(), (7,)
+    def _describe(self, info: EpisodeInfo) -> None:
+        self._info, self._check = info, SampledFrameCheck(info)
+        *features, frames = SampledLayout(info).streams
+        self._places = joint_places(info.features)
+        self._tree = FrameTree(Urdf.parse(info.urdf), [*self._places], info.cameras) if info.urdf else None
+        self._streams = (*features, *(self._tree.streams(self._state) if self._tree else ()), frames)
+        self._write_description()
 
+    def _state(self, frames: Sequence[SampledFrame]) -> tuple[Array, Array]:
+        """Joint positions (N, n), and no poses of bodies (N, 0)."""
+        features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
+        return joint_positions(self._places, features), np.empty((len(frames), 0))
 
-def check_images(frame: Frame, camera: Camera, streams: CameraStreams) -> CameraImages:
-    """A frame's images of a camera; RecordingError unless they are those that are recorded, all of its size."""
-    images = frame.images.get(camera.name)
-    if images is None:
-        raise RecordingError(f"Frame {frame.frame_index} has no image of the camera {camera.name!r}.")
-    size = (camera.height, camera.width)
-    for kind, pixels, is_recorded in (
-        ("colour", images.color, True),
-        ("depth", images.depth, streams.depth),
-        ("segmentation", images.segmentation, streams.segmentation),
-    ):
-        if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
-            found = "is missing" if pixels is None else f"has shape {pixels.shape}"
-            raise RecordingError(
-                f"The {kind} image of the camera {camera.name!r} at frame {frame.frame_index} {found}: every frame has "
-                f"the same images of {camera.width}x{camera.height} pixels."
-            )
-    return images
+    def image(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
+        """Add the next image of a camera, and return its number, by which frames show it.
+
+        Args:
+            camera: One of the episode's.
+            stamp_ns: When it was taken, by the camera's clock; later than the one before.
+            data: (H, W, 3) uint8 RGB; for a camera whose images are kept an access unit (H.264 and H.265 with start
+                codes), a temporal unit (AV1) or a JPEG file, which stays as it is; for a depth camera (H, W) uint16
+                millimetres or float32 metres.
+
+        Raises:
+            RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
+        """
+        self._check.check_image(camera, stamp_ns, data)
+        self._check.note_image(camera, stamp_ns)
+        return self._cameras[camera].add(int(stamp_ns), data)
+
+    def write(self, frame: SampledFrame) -> None:
+        """Add the next frame.
+
+        Raises:
+            RecordingError: Frames out of order; features that are missing, unknown, of another length or type; numbers
+                that are not finite; images that have not come; a full disk.
+        """
+        self._check.check_frame(frame)
+        self._check.note_frame(frame)
+        text = frame.subtask
+        changes = [(SUBTASK, messages.STRING, encode(messages.STRING, text))] if text else []
+        self._add(PendingFrame(frame.time_ns, frame, frame.images, changes, []))
+
+    def flush(self) -> None:
+        """See `BatchWriter`."""
+        self._write_images({name: camera.num_ready for name, camera in self._cameras.items()})
+        self._write_frames()
 
 
 MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1

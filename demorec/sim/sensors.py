@@ -1,0 +1,71 @@
+"""Sensors of a simulated arm beside its joints and its gripper: one row each.
+
+Recordings list each sensor as a feature with a stream, from which they are read, checked, shown and exported. So a new
+sensor is a row here, and its test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+from demorec.core.geometry import Array
+from demorec.episode.info import Feature, SensorStream, sensor_feature
+from demorec.robots.robot import RobotSpec
+from demorec.sim.arm import Arm
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sensor:
+    """A vector that is sensed at each frame.
+
+    Attributes:
+        quantity: Key in `Observation.sensed`; the feature is called "observation." and this, the topic "/" and this.
+        meaning: Description with units and coordinate frame.
+        elements: Name of each element -> its unit ("" for none), given the robot.
+        sense: Values at the end of the last physics step, (D,), given the PyBullet client and the robot in it.
+        layout: Message type, as in `SensorStream`.
+        frame: Link along whose axes the vectors of a wrench are, given the robot.
+    """
+
+    quantity: str
+    meaning: str
+    elements: Callable[[RobotSpec], Mapping[str, str]]
+    sense: Callable[[Any, Arm], Array]
+    layout: Literal["wrench", "array"] = "array"
+    frame: Callable[[RobotSpec], str] = lambda robot: ""
+
+    def feature(self, robot: RobotSpec) -> Feature:
+        """Describe the sensor of a robot."""
+        elements = self.elements(robot)
+        return Feature(
+            name=sensor_feature(self.quantity),
+            names=tuple(elements),
+            units=tuple(elements.values()),
+            source=self.meaning,
+            stream=SensorStream(topic=f"/{self.quantity}", layout=self.layout, frame=self.frame(robot)),
+        )
+
+
+_WRENCH = {
+    "hand.force.x": "N",
+    "hand.force.y": "N",
+    "hand.force.z": "N",
+    "hand.torque.x": "N m",
+    "hand.torque.y": "N m",
+    "hand.torque.z": "N m",
+}
+
+SENSORS: tuple[Sensor, ...] = (
+    # As measured by a force-torque sensor at the hand's mount: about the origin of the hand's link, nothing subtracted.
+    # The weight and the inertia of hand, fingers and what they hold are in it.
+    Sensor(
+        quantity="wrench",
+        meaning="force (N) and torque (N m) with which the arm holds the hand, along the axes of the hand's link",
+        elements=lambda robot: _WRENCH,
+        sense=lambda client, arm: arm.hand_wrench(),
+        layout="wrench",
+        frame=lambda robot: robot.hand_link,
+    ),
+)
