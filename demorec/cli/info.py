@@ -14,6 +14,7 @@ from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX
+from demorec.episode.simulated import simulation_facts
 from demorec.runs.find import Found, expect, find
 
 if TYPE_CHECKING:
@@ -121,10 +122,9 @@ def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]
     from demorec.mcap.summary import summarize
 
     plain = summarize(path, named)
-    is_simulated = plain["kind"] == "recording"
-    form = f"{'' if is_simulated else 'external, '}format {plain['format_version']}"
+    form = f"{'external, ' if plain['task'] is None else ''}format {plain['format_version']}"
     rate = f", {plain['rate']:.2f} Hz (nominal {plain['fps']} Hz)"
-    if is_simulated:
+    if plain["physics_hz"] is not None:
         rate = f" at {plain['fps']} Hz (physics {plain['physics_hz']} Hz)"
     facts = [
         ("recording", f"{path} ({size_in_words(plain['bytes'])}, {form})"),
@@ -132,14 +132,14 @@ def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]
         ("episode", _episode(plain)),
         ("outcome", _outcome(plain)),
         ("length", f"{plain['frames']} frames, {plain['seconds']:.2f} s{rate}"),
-        ("robot", plain["robot"] + (" (URDF known)" if plain["has_urdf"] and not is_simulated else "")),
+        ("robot", plain["robot"] + (" (URDF known)" if plain["has_urdf"] else "")),
     ]
-    if is_simulated:
+    if plain["task"] is not None:
         facts.append(("objects", ", ".join(plain["objects"]) or "none"))
     if origin := plain["origin"]:
         facts.append(("origin", origin if isinstance(origin, str) else _origin(origin)))
     facts += role_lines.recording_features(plain["features"])
-    facts += [(f"camera {camera['name']}", ", ".join(_camera(camera, is_simulated))) for camera in plain["cameras"]]
+    facts += [(f"camera {camera['name']}", ", ".join(_camera(camera))) for camera in plain["cameras"]]
     facts += [(f"dropped {what}", str(count)) for what, count in plain["drops"].items()]
     for check in plain["checks"]:
         verdict = "passed" if check["passed"] else "FAILED"
@@ -175,17 +175,14 @@ def _origin(origin: Mapping[str, Any]) -> str:
     return " ".join([origin["kind"], *(file["name"] for file in origin["files"])])
 
 
-def _camera(camera: Mapping[str, Any], is_simulated: bool) -> Iterator[str]:
+def _camera(camera: Mapping[str, Any]) -> Iterator[str]:
     video = camera["video"]
     yield f"{video['width']}x{video['height']} {video['codec']}{' as it came' if camera['is_kept'] else ''}"
-    if is_simulated:
-        yield (
-            f"quality {video['jpeg_quality']}"
-            if video["codec"] == "jpeg"
-            else f"GOP {video['gop']}, crf {video['crf']}"
-        )
-        yield from (name for name in ("depth", "segmentation") if camera[name])
-        return
+    if video["crf"] is not None:
+        yield f"GOP {video['gop']}, crf {video['crf']}"
+    elif video["jpeg_quality"] is not None:
+        yield f"quality {video['jpeg_quality']}"
+    yield from (name for name in ("depth", "segmentation") if camera[name])
     yield counted(camera["images"], "image")
     yield f"at most {1000 * camera['oldest']:.3g} ms old"
     if camera["frames_without"]:
@@ -377,9 +374,8 @@ def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
     for file in recordings:
         with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
-            task, seed = (
-                ("(external)", "") if info.simulation is None else (info.simulated.task, str(info.simulated.root_seed))
-            )
+            facts = simulation_facts(info)
+            task, seed = facts.get("task", "(external)"), str(facts.get("root_seed", ""))
             success = None if outcome is None else outcome.success
         items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
         word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]

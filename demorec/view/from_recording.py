@@ -15,13 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.episode import NO_IMAGE, Table, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import NO_NAMES, ROLES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.simulated import on_request
 from demorec.mcap import Recording, open_recording
 from demorec.mcap.channels import JOINT_STATES, description_topic
+from demorec.mcap.protocol import Episode
 from demorec.mcap.transforms import joint_places, joint_positions
 from demorec.runs.run_file import EPISODES, FAILED
 from demorec.view.episode import EFFORT_CURVES, Curves, PlayedEpisode, Video, simulated_curves, timed
@@ -74,9 +74,7 @@ def _with_simulation(episode: PlayedEpisode, recording: Recording) -> PlayedEpis
     )
 
 
-def played_episode(
-    recording: Recording | DatasetRecording, known: dict[str, Any], info: EpisodeInfo, roles: Roles
-) -> PlayedEpisode:
+def played_episode(recording: Episode, known: dict[str, Any], info: EpisodeInfo, roles: Roles) -> PlayedEpisode:
     """What every episode has: features and images; `info` may describe its robot. Curves are in the order of roles."""
     table = recording.table()
     time_ns = table.time_ns - (table.time_ns[0] if table.num_frames else 0)
@@ -121,7 +119,7 @@ def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[n
     return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
 
 
-def video_of(recording: Recording | DatasetRecording, camera: str, shown_at: NDArray[np.int64]) -> Video:
+def video_of(recording: Episode, camera: str, shown_at: NDArray[np.int64]) -> Video:
     """The coded images of a camera, each at its time (P,)."""
 
     def packets() -> Iterator[tuple[int, bytes, bool]]:

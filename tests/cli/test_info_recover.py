@@ -49,7 +49,7 @@ def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert rows["instruction"] == "pick up the red cube and place it on the green target"
     assert rows["outcome"] == "success"
     assert rows["length"] == "45 frames, 1.50 s at 30 Hz (physics 240 Hz)"
-    assert rows["camera front"] == "64x48 h264, GOP 2, crf 23, depth"
+    assert rows["camera front"] == "64x48 h264, GOP 2, crf 23, depth, 45 images, at most 0 ms old"
     assert rows["check distance_to_target"] == "passed: 0.004 m (limit 0.02)"
     streams = {line.split()[0]: line.split()[1:] for line in text.split("\n\n")[1].splitlines()}
     assert streams["/joint_states"] == ["45", "sensor_msgs/msg/JointState"]

@@ -125,7 +125,13 @@ class EditOne(Edit):
 
 def _changes(plan: Plan) -> list[str]:
     """Lines about what is done to episodes."""
+    from demorec.datasets.editing.plan import mistyped_features
+
     lines = []
+    for name in dict.fromkeys(name for source in plan.sources for name in mistyped_features(source)):
+        lines.append(
+            f"info.json says float32 of {name}, which the data files hold as float64: corrected in the result."
+        )
     if new := sum(bool(cut.task) for cut in plan.cuts):
         lines.append(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
     for cut in plan.cuts:

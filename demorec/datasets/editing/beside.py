@@ -38,7 +38,7 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "epi
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
-ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes")
+ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
 """Files that are copied from a single source."""
 _NAMED = 5
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.files import open_table, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -20,6 +21,22 @@ from demorec.datasets.lerobot.layout import (
     DatasetInfo,
 )
 from demorec.episode.features import ACTION, STATE
+
+
+def mistyped_features(source: LeRobotFolder) -> tuple[str, ...]:
+    """Find the features that info.json calls float32 and the data files hold as float64."""
+    tables = tables_in(source.root, "data")
+    if not tables:
+        return ()
+    schema = open_table(tables[0]).schema_arrow
+    return tuple(
+        name
+        for name, feature in source.info.features.items()
+        if feature.dtype == "float32"
+        and name not in AUTOMATIC_FEATURES
+        and name in schema.names
+        and "double" in str(schema.field(name).type)
+    )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -87,6 +104,7 @@ class Plan:
     def whole(cls, source: LeRobotFolder) -> Plan:
         """All of a dataset as it is."""
         own = {name: feature for name, feature in source.info.features.items() if name not in AUTOMATIC_FEATURES}
+        own |= {name: replace(own[name], dtype="float64") for name in mistyped_features(source)}
         spoken = {name: feature for name, feature in own.items() if feature.dtype == "language"}
         features = {**{k: v for k, v in own.items() if k not in spoken}, **AUTOMATIC_FEATURES, **spoken}
         info = replace(

@@ -21,7 +21,8 @@ from demorec.core.replacing import check_replaceable
 from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
 from demorec.datasets.editing.episode_records import episode_statistics
 from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
+from demorec.datasets.lerobot.episode_table import TIME_TOLERANCE_S, EpisodePlace
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -88,7 +89,7 @@ def write_plan(
     roots = [source.root for source in plan.sources]
     readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
     with (
-        DatasetWriter(folder, plan.info, _fact_types(plan)) as writer,
+        DatasetWriter(folder, plan.info, _fact_types(plan), kept_tasks(plan)) as writer,
         Beside(plan, folder) as beside,
     ):
         around = 0
@@ -126,7 +127,8 @@ class _Reader:
         info = self.source.info
         names = {mapping.feature for mapping in self._mappings.values()}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
-        self._rows = self.source.rows([*self._names, "task_index"])
+        self._rows = self.source.rows([*self._names, "task_index", "timestamp"])
+        self._task_numbers = new_task_numbers(plan, number) if reference_columns(info) else None
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
         tables = tables_in(self.source.root, "meta/episodes") if self.source.fact_types else ()
         self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
@@ -149,6 +151,10 @@ class _Reader:
             feature = self._features[name]
             if feature.dtype == "language":
                 language = self._language(rows, cut)
+                continue
+            if self._task_numbers is not None and mapping.feature in reference_columns(self.source.info):
+                values = column_numbers(self._column(rows, mapping, feature))
+                columns[name] = renumbered(values, self._task_numbers)
                 continue
             if feature.is_video:
                 stored = self.source.video(mapping.feature, place)
@@ -174,7 +180,21 @@ class _Reader:
             language=language,
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
+            timestamps=self._measured_timestamps(rows, cut),
         )
+
+    def _measured_timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[np.float32] | None:
+        """(T,) timestamps of a cut that were measured, which stay to the bit; None for those of the grid.
+
+        Of a cut that begins later the first one is subtracted in float64, and the result is rounded once.
+        """
+        stored = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
+        seconds = stored.astype(np.float64)
+        first = seconds[0] if cut.first else 0.0
+        off = np.abs(seconds - first - np.arange(len(seconds)) / self._fps)
+        if (off <= TIME_TOLERANCE_S).all():
+            return None
+        return stored.astype(np.float32) if not cut.first else (seconds - first).astype(np.float32)
 
     def _kept(self, place: EpisodePlace, key: str) -> Statistics | None:
         """The statistics that the source keeps of an episode, weighted by its frames; None where it has none."""
@@ -195,7 +215,11 @@ class _Reader:
         array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
         if not mapping.is_copy:
             return mapping.apply(column_numbers(array), feature.dtype)
-        if feature.dtype == "image":
+        if feature.dtype == "image" and not pa.types.is_struct(array.type):  # plain bytes, as LeRobot reads them too
+            array = pa.StructArray.from_arrays(
+                [array.cast(pa.binary()), pa.nulls(len(array), pa.string())], names=["bytes", "path"]
+            )
+        elif feature.dtype == "image":
             array = pa.StructArray.from_arrays(
                 [array.field("bytes"), array.field("path").cast(pa.string())], names=["bytes", "path"]
             )

@@ -22,6 +22,8 @@ from demorec.datasets.lerobot.layout import (
     FilePosition,
 )
 
+TIME_TOLERANCE_S = 1e-4
+"""Maximum distance of a row's timestamp from the grid, as in LeRobot."""
 _MAX_VALUE = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
 _VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")

@@ -22,7 +22,7 @@ def is_dataset(path: Path) -> bool:
 
 _NUMBERED = r"(file-\d+|episode_\d+)"
 _PARTS = re.compile(
-    r"meta/(info|stats|temporal_proportions_dense)\.json"
+    r"meta/(info|stats|modality|temporal_proportions_dense)\.json"
     r"|sarm_progress\.parquet"
     r"|meta/tasks\.parquet"
     r"|meta/(tasks|episodes|episodes_stats)\.jsonl"
@@ -37,7 +37,7 @@ _PARTS = re.compile(
     rf"|{SIDECAR_DIR}/(configs\.json|export\.json|README\.md)"
     r"|README\.md|\.gitattributes|\.cache/huggingface/.*"
 )
-"""Files of a dataset in LeRobot's formats 2.0 to 3.0, of ours, and of the Hub's."""
+"""Files of a dataset in LeRobot's formats 2.0 to 3.0, of ours, GR00T's, and of the Hub's."""
 
 
 def _is_dataset(folder: Path) -> bool:

@@ -15,26 +15,26 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
+from demorec.datasets.lerobot.episode_table import TIME_TOLERANCE_S
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
-from demorec.episode.episode import Outcome, Table, frame_time_ns
+from demorec.episode.episode import Event, Outcome, Table, frame_time_ns
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.roles import Roles
-from demorec.mcap.sampled_writer import MAX_SUBTASK
+from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
 _SUCCESS = "next.success"
-_TIME_TOLERANCE_S = 1e-4
-"""By which LeRobot lets a row's time be off the grid."""
 _UNNAMED_ROBOT = "unknown"
 _MAX_REASON = 10_000
 
 
 class DatasetRecording:
-    """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps.
+    """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps, or
+    where their timestamps were measured.
 
     One after the other they are read in one pass.
 
@@ -122,17 +122,42 @@ class DatasetRecording:
     @cached_property
     def _rows(self) -> Mapping[str, NDArray[Any]]:
         rows, info = self.dataset.recorded_rows.numbers(self.place), self.dataset.info
-        off = np.abs(rows["timestamp"][:, 0].astype(np.float64) - np.arange(self.num_frames) / int(info.fps))
-        if len(wrong := np.flatnonzero(~(off <= _TIME_TOLERANCE_S))):
-            raise ExportError(
-                f"Row {wrong[0]} of episode {self.place.episode_index} is at {rows['timestamp'][wrong[0], 0]:.4f} s, "
-                f"which is no multiple of 1/{info.fps} s: {self.path}"
-            )
         for feature in self.dataset.features:
-            found, claimed = rows[feature.name].dtype, info.features[feature.name].dtype
-            if self.num_frames and found != claimed:
+            found, claimed = rows[feature.name].dtype, np.dtype(info.features[feature.name].dtype)
+            are_floats = found.kind == claimed.kind == "f"  # read as info.json says, as LeRobot reads them
+            if self.num_frames and found != claimed and not are_floats:
                 raise ExportError(f"The column {feature.name} holds {found}, not {claimed}: {self.path}")
         return rows
+
+    @cached_property
+    def _measured_ns(self) -> NDArray[np.int64] | None:
+        """(T,) stamps of rows whose timestamps were measured; None for multiples of 1/fps."""
+        seconds, fps = self._rows["timestamp"][:, 0].astype(np.float64), int(self.dataset.info.fps)
+        if (np.abs(seconds - np.arange(self.num_frames) / fps) <= TIME_TOLERANCE_S).all():
+            return None
+        wrong = np.flatnonzero(
+            ~(np.diff(seconds, prepend=-1.0) > 0) | ~(seconds >= 0) | ~(seconds < MAX_STAMP_NS / 1e9)
+        )
+        if len(wrong):
+            raise ExportError(
+                f"Row {wrong[0]} of episode {self.place.episode_index} is at {seconds[wrong[0]]:.4f} s, timestamps "
+                f"must rise from 0 s or later: {self.path}"
+            )
+        return np.rint(seconds * 1e9).astype(np.int64)
+
+    @property
+    def time_ns(self) -> NDArray[np.int64]:
+        """(T,) stamps of the frames."""
+        return self.table().time_ns
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """No phases: datasets state none of each row."""
+        return ()
+
+    def events(self) -> Iterator[tuple[int, Event]]:
+        """No events: datasets have none."""
+        return iter(())
 
     def table(self) -> Table:
         """Read the features of every frame, each in the type that recordings hold it in."""
@@ -143,6 +168,8 @@ class DatasetRecording:
         leads = {name: self._lead(name) for name in self.dataset.keys}
         begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
         times = np.array([frame_time_ns(index, fps) for index in range(begin + self.num_frames)], dtype=np.int64)
+        if self._measured_ns is not None:  # behind the images that come before the first frame
+            times[begin:] = self._measured_ns + times[begin]
         features = {item.name: self._rows[item.name].astype(item.dtype) for item in self.dataset.features}
         return Table(
             time_ns=times[begin:],

@@ -44,7 +44,7 @@ class StoredImages:
         for column in columns:
             for item in column:
                 value = item.as_py()
-                data = value.get("bytes") if isinstance(value, dict) else None
+                data = value.get("bytes") if isinstance(value, dict) else value
                 try:
                     image = self._decoded(data or b"")
                     if shape not in (None, image.shape):
