@@ -63,6 +63,8 @@ class UrdfJoint:
         parent_from_joint: Pose of the joint frame (= child link frame at position 0).
         axis: Unit vector in the joint frame.
         lower, upper: Position limits, rad or m; infinite where the URDF has none.
+        damping: Viscous, N m s/rad or N s/m.
+        friction: Coulomb friction, N m or N.
     """
 
     name: str
@@ -73,6 +75,8 @@ class UrdfJoint:
     axis: tuple[float, float, float]
     lower: float
     upper: float
+    damping: float = 0.0
+    friction: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,6 +124,8 @@ class Urdf:
             raise ValueError("a joint of the URDF lacks something, its parent or its child") from error
         children = {joint.child for joint in joints}
         roots = [link for link in links if link not in children]
+        if not links and "xacro" in text:
+            raise ValueError("it is a xacro file or was made of one with nothing in it: xacro FILE.xacro > FILE.urdf makes a URDF")
         if len(roots) != 1:
             raise ValueError(f"a URDF needs one root link, found {len(roots)}: {', '.join(roots[:5])}")
         return cls(joints=joints, root=roots[0])
@@ -181,7 +187,18 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
         axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
         lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
         upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
+        damping=_dynamics(element, "damping"),
+        friction=_dynamics(element, "friction"),
     )
+
+
+def _dynamics(joint: ET.Element, name: str) -> float:
+    """One value of the <dynamics> of a joint, 0 where it has none; ValueError for a negative one."""
+    dynamics = joint.find("dynamics")
+    (value,) = read_numbers("0" if dynamics is None else dynamics.get(name, "0"), 1)
+    if value < 0:
+        raise ValueError(f"the {name} of the joint {joint.get('name')!r} is {value:g}, which would drive it; set 0 or more")
+    return value
 
 
 def quat_from_rpy(rpy: Sequence[float]) -> Array:
@@ -260,6 +277,20 @@ def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
         )
     except KeyError as error:
         raise ValueError(f"a link or shape of the URDF lacks its {error}") from error
+
+
+def mesh_names(text: str) -> tuple[str, ...]:
+    """The mesh files that the shapes of a URDF name, sorted; ValueError for what is not XML.
+
+    Other files that it names, such as plug-ins of Gazebo, belong to other programs.
+    """
+    return tuple(sorted({mesh.attrib["filename"] for mesh in mesh_elements(parse_xml(text))}))
+
+
+def mesh_elements(robot: ET.Element) -> list[ET.Element]:
+    """The <mesh> elements of the shapes of all links."""
+    shapes = [*robot.iterfind("link/visual"), *robot.iterfind("link/collision")]
+    return [mesh for shape in shapes for mesh in shape.iterfind("geometry/mesh") if mesh.get("filename")]
 
 
 def _shapes(link: ET.Element, tag: str, scale: float, colors: dict[str, Rgba]) -> tuple[UrdfShape, ...]:

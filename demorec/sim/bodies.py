@@ -21,7 +21,7 @@ from demorec.episode.scene import Body, Texture
 from demorec.render import Visual, VisualBody, VisualKind
 from demorec.robots.assets import asset_path, collision_file, mesh_path, surface_file
 from demorec.robots.inertials import check_masses, with_massless_frames
-from demorec.robots.urdf import parse_xml, read_links
+from demorec.robots.urdf import mesh_elements, parse_xml, read_links
 from demorec.sim.client import silence
 
 
@@ -161,7 +161,7 @@ def _without_visual_meshes(text: str, folder: Path) -> str:
     files.
     """
     robot = parse_xml(text)
-    meshes = {mesh: mesh_path(folder, mesh.attrib["filename"]) for mesh in robot.iter("mesh")}
+    meshes = {mesh: mesh_path(folder, mesh.attrib["filename"]) for mesh in mesh_elements(robot)}
     for mesh, path in meshes.items():
         mesh.set("filename", str(path))
     for geometry in robot.iterfind("link/visual/geometry"):
