@@ -62,13 +62,21 @@ def require_masses(text: str) -> None:
         )
 
 
-def with_massless_frames(text: str) -> str:
-    """The URDF, in which every link has an `<inertial>`: of no mass where it had none."""
+def for_simulator(text: str) -> str:
+    """Return the URDF of a robot as PyBullet shall have it.
+
+    Every link has an `<inertial>`, of no mass where it had none. No joint has `<dynamics>`: PyBullet refuses some, and
+    applies others wrongly (`demorec.sim.lossy_motors`).
+    """
     robot = parse_xml(text)
-    without = [link for link in robot.findall("link") if link.find("inertial") is None]
-    for link in without:
+    frames = [link for link in robot.findall("link") if link.find("inertial") is None]
+    for link in frames:
         link.append(ET.fromstring(_NOTHING))
-    return ET.tostring(robot, encoding="unicode") if without else text
+    lossy = [joint for joint in robot.findall("joint") if joint.find("dynamics") is not None]
+    for joint in lossy:
+        for dynamics in joint.findall("dynamics"):
+            joint.remove(dynamics)
+    return ET.tostring(robot, encoding="unicode") if frames or lossy else text
 
 
 def _mass(link: ET.Element, *, must_be_whole: bool, may_be_point: bool) -> float:

@@ -14,10 +14,14 @@ from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
+from demorec.sim import lossy_motors
 from demorec.sim.bodies import load_urdf
+from demorec.sim.lossy_motors import JointMotors
 
 FINGER_DAMPING = 1_000.0
 """Contact of the finger pads, N s/m (the value of panda.urdf)."""
+FINGER_GAIN = 0.1
+"""Share of the position error that a finger's motor corrects in a physics step (PyBullet's default)."""
 
 
 class Arm:
@@ -63,6 +67,7 @@ class Arm:
         self.kinematics = arm_kinematics(spec, scale=placement.scale)
         self._forces = list(spec.torque_limit)
         self._gains = [POSITION_GAIN] * len(self._arm)
+        self._lossy_motors = self._make_lossy_motors()
         self._make_gripper(finger_stiffness)
         self.place(np.array(placement.joint_position), placement.gripper_width)
         self.target = np.array(placement.joint_position, dtype=np.float64)
@@ -93,6 +98,22 @@ class Arm:
             )
             self._client.changeConstraint(gear, gearRatio=-ratio, erp=0.1, maxForce=50)
 
+    def _make_lossy_motors(self) -> JointMotors | None:
+        """The motors of all joints; None where the URDF gives none of them damping or friction."""
+        by_name = {joint.name: joint for joint in Urdf.load(asset_path(self.spec.urdf)).joints}
+        dynamics = [by_name[name] for name in self.spec.joint_names]
+        if not any(joint.damping or joint.friction for joint in dynamics):
+            return None
+        gripper, num_arm, num_fingers = self.spec.gripper, len(self._arm), len(self._fingers)
+        return JointMotors(
+            joints=(*self._arm, *self._fingers),
+            limit=np.array([*self.spec.torque_limit, *[gripper.force] * num_fingers]),
+            speed=np.array([np.inf] * num_arm + [gripper.joint_speed] * num_fingers),
+            gain=np.array([POSITION_GAIN] * num_arm + [FINGER_GAIN] * num_fingers),
+            damping=np.array([joint.damping for joint in dynamics]),
+            friction=np.array([joint.friction for joint in dynamics]),
+        )
+
     def _mounted_hand(self) -> int:
         """The hand's link, with a force-torque sensor on the joint that carries it."""
         hand: int = self.links.get(self.spec.hand_link, -1)
@@ -122,6 +143,9 @@ class Arm:
 
     def command_gripper(self, width: float) -> None:
         """Begin a control step: the gripper's motors are set to an opening, in metres, for all of it."""
+        self.gripper_target = width
+        if self._lossy_motors is not None:
+            return
         gripper = self.spec.gripper
         for joint, target in zip(self._fingers, gripper.joint_position(width).tolist(), strict=True):
             self._client.setJointMotorControl2(
@@ -132,10 +156,14 @@ class Arm:
                 force=gripper.force,
                 maxVelocity=gripper.joint_speed,
             )
-        self.gripper_target = width
 
     def drive(self, joint_target: Array) -> None:
         """Set the arm's motors to (n_arm,) targets for the next physics step."""
+        if self._lossy_motors is not None:
+            fingers = self.spec.gripper.joint_position(self.gripper_target)
+            targets = np.concatenate([joint_target, fingers])
+            lossy_motors.drive(self._client, self.body, self._lossy_motors, targets)
+            return
         self._client.setJointMotorControlArray(
             self.body,
             self._arm,
@@ -149,6 +177,8 @@ class Arm:
         """Positions, velocities and applied motor torques of all joints, each (n_joints,)."""
         states = self._client.getJointStates(self.body, self._arm + self._fingers)
         position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
+        if self._lossy_motors is not None:
+            effort = self._lossy_motors.effort(effort, velocity)
         return position, velocity, effort
 
     def hand_wrench(self) -> Array:
