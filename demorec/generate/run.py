@@ -18,6 +18,7 @@ from types import FrameType
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.core.processes import available_cores, handled
+from demorec.core.registry import split_name
 from demorec.core.tables import RENDERERS, load_robot
 from demorec.generate.contents import Inspector
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Made, Raised, Report
@@ -25,7 +26,6 @@ from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.robots.assets import allow_models
-from demorec.robots.inertials import check_masses
 from demorec.runs.recorded import inspect_recording
 from demorec.runs.run_file import UNFINISHED, Attempt, RunFile
 
@@ -66,17 +66,19 @@ def generate(
 
     Raises:
         MissingDependencyError: Ray is not installed.
-        ConfigError: The task cannot be loaded, a link of the robot does not say what it weighs, the Ray cluster cannot
-            be reached, or the folder is in use, holds another run or cannot be written to.
+        ConfigError: The task cannot be loaded, the robot does not fit its URDF, the Ray cluster cannot be reached,
+            or the folder is in use, holds another run or cannot be written to.
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     from demorec.loop import load_task
+    from demorec.sim.robot_check import check_robot
 
     progress = progress or RunObserver()
     load_task(config)  # these raise what the first worker would raise, before anything is written
     allow_models(config.modules)
-    check_masses(load_robot(config.robot, config.modules).urdf)
+    if split_name(config.robot) is not None:
+        check_robot(load_robot(config.robot, config.modules))
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected

@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -63,8 +63,6 @@ class UrdfJoint:
         parent_from_joint: Pose of the joint frame (= child link frame at position 0).
         axis: Unit vector in the joint frame.
         lower, upper: Position limits, rad or m; infinite where the URDF has none.
-        damping: Viscous, N m s/rad or N s/m.
-        friction: Coulomb friction, N m or N.
     """
 
     name: str
@@ -75,8 +73,6 @@ class UrdfJoint:
     axis: tuple[float, float, float]
     lower: float
     upper: float
-    damping: float = 0.0
-    friction: float = 0.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -125,7 +121,7 @@ class Urdf:
         children = {joint.child for joint in joints}
         roots = [link for link in links if link not in children]
         if not links and "xacro" in text:
-            raise ValueError("it is a xacro file or was made of one with nothing in it: xacro FILE.xacro > FILE.urdf makes a URDF")
+            raise ValueError("the file is a xacro file or an empty one; make a URDF by xacro FILE.xacro > FILE.urdf")
         if len(roots) != 1:
             raise ValueError(f"a URDF needs one root link, found {len(roots)}: {', '.join(roots[:5])}")
         return cls(joints=joints, root=roots[0])
@@ -187,18 +183,34 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
         axis=(1.0, 0.0, 0.0) if length == 0.0 else tuple(float(v) for v in axis / length),  # type: ignore[arg-type]
         lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
         upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
-        damping=_dynamics(element, "damping"),
-        friction=_dynamics(element, "friction"),
     )
 
 
-def _dynamics(joint: ET.Element, name: str) -> float:
-    """One value of the <dynamics> of a joint, 0 where it has none; ValueError for a negative one."""
-    dynamics = joint.find("dynamics")
-    (value,) = read_numbers("0" if dynamics is None else dynamics.get(name, "0"), 1)
-    if value < 0:
-        raise ValueError(f"the {name} of the joint {joint.get('name')!r} is {value:g}, which would drive it; set 0 or more")
-    return value
+class JointDynamics(NamedTuple):
+    """What a joint loses.
+
+    Attributes:
+        damping: Viscous, N m s/rad or N s/m.
+        friction: Coulomb friction, N m or N.
+    """
+
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+def read_dynamics(text: str) -> dict[str, JointDynamics]:
+    """Joint -> its <dynamics>, of the joints of a URDF that have one; ValueError for values below 0."""
+    found = {}
+    for joint in parse_xml(text).findall("joint"):
+        element = joint.find("dynamics")
+        if element is None:
+            continue
+        values = JointDynamics(*(read_numbers(element.get(name, "0"), 1)[0] for name in JointDynamics._fields))
+        name = joint.attrib["name"]
+        if min(values) < 0:
+            raise ValueError(f"the damping or friction of {name!r} is {min(values):g}; set it to 0 or more")
+        found[name] = values
+    return found
 
 
 def quat_from_rpy(rpy: Sequence[float]) -> Array:

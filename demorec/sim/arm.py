@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import SceneError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action
 from demorec.episode.scene import POSITION_GAIN, RobotPlacement
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.robot import RobotSpec
-from demorec.robots.urdf import Urdf
+from demorec.robots.spec_check import checked_urdf
+from demorec.robots.urdf import JointDynamics, read_dynamics
 from demorec.sim import lossy_motors
 from demorec.sim.bodies import load_urdf
 from demorec.sim.lossy_motors import JointMotors
@@ -41,30 +41,17 @@ class Arm:
         self.spec = spec
         self.world_from_base = placement.world_from_base
         self._client = client
-        num_fingers = 1 + len(spec.gripper.gear_ratios)
-        if len(spec.gripper.joints) != num_fingers:
-            raise SceneError(
-                f"The robot {spec.name!r} has {len(spec.gripper.joints)} finger joints; a gripper of its kind has "
-                f"{num_fingers}."
-            )
+        self.kinematics = arm_kinematics(spec, scale=placement.scale)  # checks the spec
         base, what = placement.world_from_base, f"robot {spec.name!r}"
         self.body = load_urdf(client, spec.urdf, base, scale=placement.scale, is_fixed=True, what=what, is_robot=True)
         info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
         self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
         by_name = {row[1].decode(): row[0] for row in info}
-        wanted = {*spec.arm_joints, *spec.gripper.joints} - by_name.keys()
-        wanted |= {spec.tcp_link, *spec.gripper.finger_links} - self.links.keys()
-        if wanted:
-            raise SceneError(
-                f"The robot {spec.name!r} has joints or links that its URDF {spec.urdf!r} lacks: "
-                f"{', '.join(sorted(wanted))}."
-            )
         self._arm = [by_name[name] for name in spec.arm_joints]
         self._fingers = [by_name[name] for name in spec.gripper.joints]
         self._tcp = self.links[spec.tcp_link]
         self.finger_links = tuple(self.links[name] for name in spec.gripper.finger_links)
         self._hand = self._mounted_hand()
-        self.kinematics = arm_kinematics(spec, scale=placement.scale)
         self._forces = list(spec.torque_limit)
         self._gains = [POSITION_GAIN] * len(self._arm)
         self._lossy_motors = self._make_lossy_motors()
@@ -100,9 +87,9 @@ class Arm:
 
     def _make_lossy_motors(self) -> JointMotors | None:
         """The motors of all joints; None where the URDF gives none of them damping or friction."""
-        by_name = {joint.name: joint for joint in Urdf.load(asset_path(self.spec.urdf)).joints}
-        dynamics = [by_name[name] for name in self.spec.joint_names]
-        if not any(joint.damping or joint.friction for joint in dynamics):
+        found = read_dynamics(asset_path(self.spec.urdf).read_text())
+        damping, friction = np.array([found.get(name, JointDynamics()) for name in self.spec.joint_names]).T
+        if not damping.any() and not friction.any():
             return None
         gripper, num_arm, num_fingers = self.spec.gripper, len(self._arm), len(self._fingers)
         return JointMotors(
@@ -110,18 +97,13 @@ class Arm:
             limit=np.array([*self.spec.torque_limit, *[gripper.force] * num_fingers]),
             speed=np.array([np.inf] * num_arm + [gripper.joint_speed] * num_fingers),
             gain=np.array([POSITION_GAIN] * num_arm + [FINGER_GAIN] * num_fingers),
-            damping=np.array([joint.damping for joint in dynamics]),
-            friction=np.array([joint.friction for joint in dynamics]),
+            damping=damping,
+            friction=friction,
         )
 
     def _mounted_hand(self) -> int:
         """The hand's link, with a force-torque sensor on the joint that carries it."""
-        hand: int = self.links.get(self.spec.hand_link, -1)
-        if hand < 0:
-            raise SceneError(
-                f"The robot {self.spec.name!r} has no joint that carries its hand_link {self.spec.hand_link!r}; its "
-                f"links on joints are {', '.join(name for name, link in self.links.items() if link >= 0)}."
-            )
+        hand = self.links[self.spec.hand_link]
         self._client.enableJointForceTorqueSensor(self.body, hand, True)
         # PyBullet tells the wrench along the axes of the link's inertia, not of the link.
         self._hand_from_inertia = Pose(quat_xyzw=np.array(self._client.getDynamicsInfo(self.body, hand)[4]))
@@ -202,9 +184,9 @@ class Arm:
 
 
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
-    """Kinematics of a robot from its URDF."""
+    """Kinematics of a robot from its URDF; errors as of `demorec.robots.spec_check.checked_urdf`."""
     return ArmKinematics(
-        Urdf.load(asset_path(spec.urdf), scale=scale),
+        checked_urdf(spec, scale=scale),
         arm_joints=spec.arm_joints,
         tcp_link=spec.tcp_link,
         lower=spec.position_lower,

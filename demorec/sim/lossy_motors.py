@@ -18,7 +18,7 @@ import numpy as np
 from demorec.core.geometry import Array
 
 SLOW_SPEED = 1e-3
-"""Below this speed, rad/s or m/s, a joint rests: friction there grows with the speed instead of jumping with its sign."""
+"""Below this speed, rad/s or m/s, a joint rests: friction there grows with the speed, instead of jumping."""
 
 
 class JointMotors(NamedTuple):

@@ -22,7 +22,7 @@ HZ = 240
 INERTIA = 1.0 * (0.2**2 + 0.2**2) / 12
 """kg m^2, of a cube of 1 kg and 20 cm about its axis."""
 CUBE = """<robot name="r">
-  <link name="base"><inertial><mass value="0"/><inertia ixx="0" iyy="0" izz="0" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <link name="base"/>
   <link name="cube">
     <inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>
     <collision><geometry><box size="0.2 0.2 0.2"/></geometry></collision>

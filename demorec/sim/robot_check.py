@@ -1,0 +1,95 @@
+"""Whether a robot of the user's own can do what tasks ask of it, as far as a second of computing tells."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from demorec.core.errors import ConfigError
+from demorec.core.geometry import Array
+from demorec.episode.scene import Physics, RobotPlacement
+from demorec.robots.inertials import check_masses
+from demorec.robots.robot import ParallelGripper, RobotSpec
+from demorec.robots.spec_check import checked_urdf
+from demorec.sim.arm import Arm, arm_kinematics
+from demorec.sim.client import connect
+
+MAX_DEPTH_ERROR_M = 0.01
+"""How far finger tips may be from where finger_depth says: a grasp of a 3 cm cube misses beyond it."""
+
+
+class FingerBoxes(NamedTuple):
+    """Boxes of the fingers along the axes of the TCP, the hand as far open as tasks open it.
+
+    PyBullet's boxes are some millimetres too large.
+
+    Attributes:
+        low, high: (n, 3) their corners, metres.
+    """
+
+    low: Array
+    high: Array
+
+    @property
+    def centres(self) -> Array:
+        """(n, 3) metres."""
+        return (self.low + self.high) / 2
+
+    @property
+    def depth(self) -> float:
+        """How far the tips are beyond the TCP, metres."""
+        return float(self.high[:, 2].max())
+
+
+def check_robot(spec: RobotSpec) -> None:
+    """Check a robot before anything is made with it.
+
+    Raises:
+        ConfigError: The spec does not fit the URDF, a link does not say what it weighs, or the TCP is not between the
+            finger tips; says what to change.
+        SceneError: The URDF or one of its meshes is missing or cannot be loaded.
+    """
+    checked_urdf(spec)
+    check_masses(spec.urdf)
+    if problem := finger_problem(spec, finger_boxes(spec)):
+        raise ConfigError(f"The TCP of the robot {spec.name!r} is not where tasks need it: {problem}: {spec.urdf}")
+
+
+def finger_boxes(spec: RobotSpec) -> FingerBoxes:
+    """Measure the fingers in the simulator."""
+    home = np.array(spec.home_q)
+    placement = RobotPlacement(
+        name=spec.name,
+        world_from_base=arm_kinematics(spec).forward(home).inverse(),  # so that the TCP is the world's frame
+        joint_position=spec.home_q,
+        gripper_width=spec.gripper.open_width,
+    )
+    client = connect()
+    try:
+        arm = Arm(client, spec, placement, finger_stiffness=Physics().finger_stiffness)
+        client.performCollisionDetection()
+        boxes = np.array([client.getAABB(arm.body, link) for link in arm.finger_links])
+    finally:
+        client.disconnect()
+    return FingerBoxes(low=boxes[:, 0], high=boxes[:, 1])
+
+
+def finger_problem(spec: RobotSpec, fingers: FingerBoxes) -> str:
+    """What is grossly wrong about the TCP, and what to change; "" for nothing."""
+    gripper = spec.gripper
+    across = np.abs(fingers.centres)
+    if isinstance(gripper, ParallelGripper) and (across[:, 0] > across[:, 1]).any():
+        return f"the fingers move along x of tcp_link {spec.tcp_link!r}; turn it about its z by 90 degrees"
+    error = fingers.depth - gripper.finger_depth
+    if abs(error) <= MAX_DEPTH_ERROR_M:
+        return ""
+    if fingers.depth <= 0:
+        return (
+            f"the fingers end {-fingers.depth:.3f} m before tcp_link {spec.tcp_link!r}; place it between the finger "
+            "tips, its z axis out of the hand"
+        )
+    return (
+        f"the finger tips are {fingers.depth:.3f} m beyond tcp_link {spec.tcp_link!r}, finger_depth is "
+        f"{gripper.finger_depth:g}; move tcp_link by {error:.3f} m along its z axis, or correct finger_depth"
+    )
