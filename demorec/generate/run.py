@@ -43,6 +43,8 @@ _REFUSED = {
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
 }
+_MISSING_FILE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR)
+"""What the user's own code meets where it names a file wrongly."""
 
 
 def generate(
@@ -236,7 +238,8 @@ class _Driver:
                 f"The output folder cannot take another episode: {_REFUSED[report.errno]}; mend that and run the same "
                 f"command again. {self._folder.kept}"
             )
-        if report.errno is not None and report.exit_code != ConfigError.exit_code:
+        is_own_bug = bool(report.own_line) and report.errno in _MISSING_FILE
+        if report.errno is not None and report.exit_code != ConfigError.exit_code and not is_own_bug:
             advice = _MORE_MEMORY if report.errno == errno.ENOMEM else _SOUND_STORAGE
             self._again(report.plan, report.message.rstrip(".") or report.kind, advice)
             return
@@ -249,6 +252,7 @@ class _Driver:
         raise GenerationError(
             f"Episode {report.plan.episode_index} raised {report.kind}: {report.message or 'no message'} "
             f"(the traceback is in {place}). {self._folder.kept}"
+            + (f"; it came up at {report.own_line}" if report.own_line else "")
         )
 
 
