@@ -144,8 +144,8 @@ def mesh_path(folder: Path | None, name: str) -> Path:
     repository of that package, and in the packages of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
 
     Args:
-        folder: Folder of the URDF; None for a URDF of unknown origin, for which only a path below pybullet_data or one
-            of ROS's packages is taken.
+        folder: Folder of the URDF; None for a URDF of unknown origin, whose names lead only into pybullet_data, the
+            current folder, the folders of modules that the user has allowed, and ROS's packages.
         name: As the URDF has it.
 
     Raises:
@@ -157,7 +157,7 @@ def mesh_path(folder: Path | None, name: str) -> Path:
     for candidate in _mesh_candidates(folder, relative, parts):
         if candidate.is_file():
             return candidate
-    fix = f"put the package {parts[0]!r} above the URDF or on ROS_PACKAGE_PATH" if parts else "put it there"
+    fix = f"put the package {parts[0]!r} beside it or on ROS_PACKAGE_PATH" if parts else "put it there"
     where = "" if folder is None else f": {folder}"
     raise SceneError(f"The mesh {name!r} is neither beside its URDF nor in pybullet_data, {fix}{where}")
 
@@ -167,14 +167,18 @@ def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...])
     if folder is not None:
         yield folder / relative
         yield folder.parent / relative
-    elif ".." in Path(relative).parts or Path(relative).is_absolute():
-        relative = ""  # text of unknown origin names no file outside of the packages
-    yield data_folder() / relative
+        yield data_folder() / relative
+        folders = [folder]
+    else:
+        folders = [Path.cwd(), *(module_file(module).parent for module in sorted(_modules_with_models))]
+        if not Path(relative).is_absolute() and ".." not in Path(relative).parts:
+            yield from (place / relative for place in (*folders, data_folder()))
     if not parts or ".." in parts:
         return
-    for above in [] if folder is None else [folder, *folder.parents][:_MAX_FOLDERS_ABOVE]:
-        yield above.joinpath(*parts)
-        yield above.joinpath(*parts[1:])  # a repository that is not called as its package is
+    for start in folders:
+        for above in [start, *start.parents][:_MAX_FOLDERS_ABOVE]:
+            yield above.joinpath(*parts)
+            yield above.joinpath(*parts[1:])  # a repository that is not called as its package is
     yield from (package.joinpath(*parts[1:]) for package in _ros_packages(parts[0]))
 
 

@@ -26,7 +26,7 @@ from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path
 from demorec.robots.collada import read_collada
-from demorec.robots.urdf import Urdf, UrdfShape, read_links
+from demorec.robots.urdf import Urdf, UrdfLink, UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""
@@ -84,7 +84,8 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
 
     Args:
         text: The URDF.
-        folder: Where it lay, to find its mesh files; None for one without mesh files.
+        folder: Where it lay, to find its mesh files; None for one of unknown origin, of which only files in the
+            packages of ROS or below the current folder are found.
         scale: Uniform scale.
 
     Raises:
@@ -93,10 +94,34 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
     """
     links = {}
     for link in read_links(text, scale=scale):
-        meshes = [mesh for shape in link.visuals if (mesh := _shape_mesh(shape, folder)) is not None]
-        if meshes:
-            links[link.name] = joined(meshes)
+        if (mesh := _link_mesh(link, folder)) is not None:
+            links[link.name] = mesh
     return links
+
+
+def found_meshes(text: str) -> tuple[dict[str, SurfaceMesh], list[DemorecError]]:
+    """As `urdf_meshes` of a URDF of unknown origin, without the links whose meshes are not found; and why they are not.
+
+    Raises:
+        ValueError: The text is no URDF.
+    """
+    links: dict[str, SurfaceMesh] = {}
+    errors: list[DemorecError] = []
+    for link in read_links(text):
+        try:
+            mesh = _link_mesh(link, None)
+        except DemorecError as error:
+            errors.append(error)
+            continue
+        if mesh is not None:
+            links[link.name] = mesh
+    return links, errors
+
+
+def _link_mesh(link: UrdfLink, folder: Path | None) -> SurfaceMesh | None:
+    shapes = [_shape_mesh(shape, folder) for shape in link.visuals]
+    meshes = [mesh for mesh in shapes if mesh is not None]
+    return joined(meshes) if meshes else None
 
 
 def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
@@ -114,8 +139,6 @@ def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
     scale: NDArray[np.float64] = np.ones(3)
     match shape.kind:
         case "mesh":
-            if folder is None:
-                raise RecordingError(f"The robot's mesh {shape.file!r} is named by its URDF, but is not kept with it")
             try:
                 path = mesh_path(folder, shape.file)
             except DemorecError as error:
