@@ -103,7 +103,7 @@ class Arm:
 
     def _mounted_hand(self) -> int:
         """The hand's link, with a force-torque sensor on the joint that carries it."""
-        hand = self.links[self.spec.hand_link]
+        hand: int = self.links[self.spec.hand_link]
         self._client.enableJointForceTorqueSensor(self.body, hand, True)
         # PyBullet tells the wrench along the axes of the link's inertia, not of the link.
         self._hand_from_inertia = Pose(quat_xyzw=np.array(self._client.getDynamicsInfo(self.body, hand)[4]))
