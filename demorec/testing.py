@@ -36,8 +36,8 @@ from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.robots.spec_check import spec_problems
 from demorec.robots.urdf import Urdf, read_dynamics
 from demorec.sim.arm import arm_kinematics
-from demorec.sim.robot_check import finger_boxes
 from demorec.tasks.grasping import hand_down, symmetric_yaws
+from demorec.tasks.robot_check import finger_boxes, unreachable_poses
 
 __all__ = ["RobotContract", "TaskContract"]
 
@@ -223,14 +223,8 @@ class RobotContract:
 
     def test_the_workspace_is_within_reach(self) -> None:
         """The hand down at one of a grasp's two yaws, wherever tasks put objects, up to 22 cm above the table."""
-        spec = self._spec()
-        arm, home = arm_kinematics(spec), np.array(spec.home_q)
-        places = itertools.product((0.35, 0.5, 0.65), (-0.25, 0.0, 0.25), (0.02, 0.15, 0.22), (-0.8, 0.0, 0.8))
-        for x, y, z, yaw in places:
-            poses = [hand_down(spec.task_scale * np.array([x, y, z]), either) for either in symmetric_yaws(yaw, 2)]
-            rest = arm.turned_towards(home, poses[0].position)
-            why = [arm.why_unreachable(wanted, start=rest, rest=rest) for wanted in poses]
-            assert not all(why), f"{poses[0].position.round(3).tolist()} m at yaw {yaw} is out of reach: {why[0]}"
+        unreachable = unreachable_poses(self._spec())
+        assert not unreachable, unreachable[0]
 
     def test_it_picks_and_places(self) -> None:
         """One episode of pick_place succeeds."""

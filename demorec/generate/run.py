@@ -74,13 +74,13 @@ def generate(
         KeyboardInterrupt: At the second Ctrl-C.
     """
     from demorec.loop import load_task
-    from demorec.sim.robot_check import check_robot
+    from demorec.tasks.robot_check import check_robot
 
     progress = progress or RunObserver()
     load_task(config)  # these raise what the first worker would raise, before anything is written
     allow_models(config.modules)
     if split_name(config.robot) is not None:
-        check_robot(load_robot(config.robot, config.modules))
+        check_robot(load_robot(config.robot, config.modules), uses_workspace=split_name(config.task) is None)
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected

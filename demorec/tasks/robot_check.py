@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +16,13 @@ from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.robots.spec_check import checked_urdf
 from demorec.sim.arm import Arm, arm_kinematics
 from demorec.sim.client import connect
+from demorec.tasks.grasping import hand_down, symmetric_yaws
 
+_WORKSPACE = ((0.35, 0.5, 0.65), (-0.25, 0.0, 0.25), (0.02, 0.15, 0.22), (-0.8, 0.0, 0.8))
+"""x, y and z of the TCP, metres, and yaws of the hand, rad."""
+NUM_POSES = math.prod(map(len, _WORKSPACE))
+MAX_UNREACHABLE_RATIO = 0.5
+"""Layouts that are out of reach are drawn again, which succeeds as long as most are within it."""
 MAX_DEPTH_ERROR_M = 0.01
 """How far finger tips may be from where finger_depth says: a grasp of a 3 cm cube misses beyond it."""
 
@@ -42,18 +50,53 @@ class FingerBoxes(NamedTuple):
         return float(self.high[:, 2].max())
 
 
-def check_robot(spec: RobotSpec) -> None:
+def check_robot(spec: RobotSpec, *, uses_workspace: bool) -> None:
     """Check a robot before anything is made with it.
 
+    Args:
+        spec: The robot.
+        uses_workspace: Whether objects will be placed all over the workspace of the included tasks.
+
     Raises:
-        ConfigError: The spec does not fit the URDF, a link does not say what it weighs, or the TCP is not between the
-            finger tips; says what to change.
+        ConfigError: The spec does not fit the URDF, a link does not say what it weighs, the TCP is not between the
+            finger tips, or most of the workspace is out of reach; says what to change.
         SceneError: The URDF or one of its meshes is missing or cannot be loaded.
     """
     checked_urdf(spec)
     check_masses(spec.urdf)
     if problem := finger_problem(spec, finger_boxes(spec)):
         raise ConfigError(f"The TCP of the robot {spec.name!r} is not where tasks need it: {problem}: {spec.urdf}")
+    if uses_workspace and (problem := reach_problem(spec)):
+        raise ConfigError(f"The robot {spec.name!r} does not reach what tasks place: {problem}: {spec.urdf}")
+
+
+def unreachable_poses(spec: RobotSpec) -> tuple[str, ...]:
+    """Say which of the poses of the workspace, `NUM_POSES` of them, the hand cannot take, and why not.
+
+    It points down at one of a grasp's two yaws, wherever tasks put objects, up to 22 cm above the table.
+    """
+    arm, home = arm_kinematics(spec), np.array(spec.home_q)
+    found = []
+    for x, y, z, yaw in itertools.product(*_WORKSPACE):
+        poses = [hand_down(spec.task_scale * np.array([x, y, z]), either) for either in symmetric_yaws(yaw, 2)]
+        rest = arm.turned_towards(home, poses[0].position)
+        why = [arm.why_unreachable(wanted, start=rest, rest=rest) for wanted in poses]
+        if all(why):
+            found.append(f"{poses[0].position.round(3).tolist()} m at yaw {yaw} is out of reach: {why[0]}")
+    return tuple(found)
+
+
+def reach_problem(spec: RobotSpec) -> str:
+    """What to change where most of the workspace is out of reach; "" for nothing."""
+    unreachable = unreachable_poses(spec)
+    if len(unreachable) <= MAX_UNREACHABLE_RATIO * NUM_POSES:
+        return ""
+    near, far, side = (spec.task_scale * value for value in (0.35, 0.65, 0.25))
+    return (
+        f"the hand, pointing down, takes {NUM_POSES - len(unreachable)} of {NUM_POSES} poses {near:.2f} to {far:.2f} m "
+        f"ahead of base_link and {side:.2f} m to both sides (with task_scale={spec.task_scale:g}), for instance "
+        f"{unreachable[0]}; choose another task_scale, or a base_link that is farther from the arm or nearer to it"
+    )
 
 
 def finger_boxes(spec: RobotSpec) -> FingerBoxes:
