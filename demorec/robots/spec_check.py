@@ -47,8 +47,8 @@ def spec_problems(spec: RobotSpec, urdf: Urdf, dynamics: Mapping[str, JointDynam
     yield from _wrong_counts(spec)
     by_name = {joint.name: joint for joint in urdf.joints}
     yield from _wrong_chain(spec, urdf)
-    yield from _arm_limits(spec, [by_name[name] for name in spec.arm_joints])
     yield from _gripper_joints(spec, [by_name[name] for name in spec.gripper.joints])
+    yield from _arm_limits(spec, [by_name[name] for name in spec.arm_joints])
     yield from _stuck_joints(spec, dynamics)
 
 

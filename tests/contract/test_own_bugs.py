@@ -7,6 +7,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from support.check import simulate
 from support.commands import exit_code
 
 from demorec.cli import generate_dataset_main
@@ -101,6 +102,19 @@ def test_a_module_that_cannot_be_imported_is_named_by_its_line(
     told = capsys.readouterr().err
     assert re.search(rf"cannot be imported \(.*\): mend left_tasks\.py:{line}: {re.escape(code)}[^\n]*\n$", told), told
     assert not (tmp_path / "run").exists()
+
+
+def test_other_commands_name_the_line_too(
+    module: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.syspath_prepend(tmp_path)
+    recording = simulate(tmp_path / "a.mcap", task="left_tasks:ToTheLeft", seed=3)
+    module.write_text(module.read_text() + EVALUATE)
+    monkeypatch.delitem(sys.modules, "left_tasks")
+    assert exit_code("replay", recording, "--allow", "left_tasks") == 1
+    told = capsys.readouterr().err
+    assert "demorec replay: KeyError: 'no such body' (the traceback is in " in told
+    assert re.search(r"; it came up at left_tasks\.py:\d+: return \(world\.pose\(\"no such body\"\),\)\n$", told)
 
 
 def test_a_layout_that_is_not_returned_is_said(
