@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import SceneError
 from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
 from demorec.robots.assets import asset_path
@@ -26,18 +26,17 @@ def checked_urdf(spec: RobotSpec, *, scale: float = 1.0) -> Urdf:
         scale: Uniform scale of the URDF.
 
     Raises:
-        ConfigError: The URDF cannot be read, or a robot like this cannot be simulated; says the first reason and what
-            to change.
-        SceneError: There is no such URDF.
+        SceneError: There is no such URDF, it cannot be read, or a robot like this cannot be simulated; says the first
+            reason and what to change.
     """
     path = asset_path(spec.urdf)
     try:
         text = path.read_text()
         urdf, dynamics = Urdf.parse(text, scale=scale), read_dynamics(text)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"The URDF of the robot {spec.name!r} cannot be used, since {error}: {spec.urdf}") from error
+        raise SceneError(f"The URDF of the robot {spec.name!r} cannot be used, since {error}: {spec.urdf}") from error
     for problem in spec_problems(spec, urdf, dynamics):
-        raise ConfigError(f"The robot {spec.name!r} does not fit its URDF: {problem}: {spec.urdf}")
+        raise SceneError(f"The robot {spec.name!r} does not fit its URDF: {problem}: {spec.urdf}")
     return urdf
 
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Array
 from demorec.episode.scene import Physics, RobotPlacement
 from demorec.robots.inertials import check_masses
@@ -60,9 +60,12 @@ def check_robot(spec: RobotSpec, *, uses_workspace: bool) -> None:
     Raises:
         ConfigError: The spec does not fit the URDF, a link does not say what it weighs, the TCP is not between the
             finger tips, or most of the workspace is out of reach; says what to change.
-        SceneError: The URDF or one of its meshes is missing or cannot be loaded.
+        SceneError: A mesh of the URDF is missing or cannot be loaded.
     """
-    checked_urdf(spec)
+    try:
+        checked_urdf(spec)
+    except SceneError as error:  # of a recording it says that the data are damaged, here that the request is wrong
+        raise ConfigError(str(error)) from error
     check_masses(spec.urdf)
     if problem := finger_problem(spec, finger_boxes(spec)):
         raise ConfigError(f"The TCP of the robot {spec.name!r} is not where tasks need it: {problem}: {spec.urdf}")

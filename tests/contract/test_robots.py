@@ -13,7 +13,7 @@ import pytest
 from support.present import present
 from support.sim import episode
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import SceneError
 from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action
 from demorec.robots.assets import asset_path, mesh_path
@@ -112,7 +112,7 @@ def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> 
     with (
         World(replace(spec, hand_link=name)) as world,
         pytest.raises(
-            ConfigError, match=f"hand_link .*'{name}'.*; name the link that|hand_link .*'{name}', which the URDF"
+            SceneError, match=f"hand_link .*'{name}'.*; name the link that|hand_link .*'{name}', which the URDF"
         ),
     ):
         world.reset(scene)
