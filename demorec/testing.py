@@ -32,10 +32,12 @@ from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prep
 from demorec.mcap import EpisodeWriter
 from demorec.replay import ReplayOptions, open_file, replay_all
 from demorec.robots.assets import allow_models, asset_path
-from demorec.robots.robot import JawGripper, RobotSpec
-from demorec.robots.urdf import Urdf
+from demorec.robots.robot import ParallelGripper, RobotSpec
+from demorec.robots.spec_check import spec_problems
+from demorec.robots.urdf import Urdf, read_dynamics
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down, symmetric_yaws
+from demorec.tasks.robot_check import finger_boxes, unreachable_poses
 
 __all__ = ["RobotContract", "TaskContract"]
 
@@ -186,33 +188,15 @@ class RobotContract:
     def test_the_spec_names_what_the_urdf_has(self) -> None:
         """Links and joints are there, of the right kinds, with limits within the URDF's."""
         spec = self._spec()
-        urdf = Urdf.load(asset_path(spec.urdf))
-        joints = {joint.name: joint for joint in urdf.joints}
-        links = {joint.child for joint in urdf.joints} | {urdf.root}
-        assert urdf.root == spec.base_link, f"base_link is {spec.base_link!r}, the root of the URDF {urdf.root!r}"
-        missing = {spec.tcp_link, spec.hand_link, *spec.gripper.finger_links} - links
-        missing |= {*spec.joint_names} - joints.keys()
-        assert not missing, f"the URDF lacks {', '.join(sorted(missing))}"
-        for name in (
-            "home_q",
-            "position_lower",
-            "position_upper",
-            "velocity_limit",
-            "acceleration_limit",
-            "torque_limit",
-        ):
-            count = len(getattr(spec, name))
-            assert count == len(spec.arm_joints), f"{name} has {count} numbers for {len(spec.arm_joints)} arm joints"
-        for name, low, high in zip(spec.arm_joints, spec.position_lower, spec.position_upper, strict=True):
-            assert joints[name].kind == "revolute", f"{name} is {joints[name].kind}, arms turn"
-            assert joints[name].lower - 1e-4 <= low < high <= joints[name].upper + 1e-4, f"limits of {name}"
-        widest = spec.gripper.joint_position(spec.gripper.max_width).tolist()
-        for name, position in zip(spec.gripper.joints, widest, strict=True):
-            assert joints[name].kind == spec.gripper.joint_kind, f"{name} is {joints[name].kind}"
-            is_there = math.isclose(joints[name].upper, position)  # a jaw may turn farther than it is used
-            if isinstance(spec.gripper, JawGripper):
-                is_there = all(joints[name].lower <= q <= joints[name].upper for q, _ in spec.gripper.opening)
-            assert is_there, f"{name} at full opening is {position}"
+        text = asset_path(spec.urdf).read_text()
+        urdf = Urdf.parse(text)
+        problem = next(spec_problems(spec, urdf, read_dynamics(text)), "")
+        assert not problem, problem
+        if isinstance(spec.gripper, ParallelGripper):
+            joints = {joint.name: joint for joint in urdf.joints}
+            widest = spec.gripper.joint_position(spec.gripper.max_width).tolist()
+            for name, position in zip(spec.gripper.joints, widest, strict=True):
+                assert math.isclose(joints[name].upper, position), f"{name} at full opening is {position}"
         assert from_json(to_json(spec), RobotSpec) == spec, "the spec is another when it is read back from a file"
 
     def test_home_points_the_hand_down_with_the_fingers_across(self) -> None:
@@ -226,36 +210,21 @@ class RobotContract:
 
     def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(self) -> None:
         """Their boxes in the simulator, opened as tasks open them."""
-        episode = self._episode()
-        robot, gripper = episode.info.simulated.robot, episode.info.simulated.robot.gripper
-        with make_world(episode.info) as world:
-            world.reset(episode.info.simulated.scene)
-            world.arm.place(np.array(robot.home_q), gripper.open_width)
-            tcp = world.arm.world_from_tcp()
-            tips = []
-            for link in world.arm.finger_links:
-                low, high = world.client.getAABB(world.arm.body, link)
-                tips.append(low[2])
-                centre = tcp.inverse().apply((np.array(low) + np.array(high)) / 2)
-                assert abs(centre[0]) < 0.01, "a finger is beside the TCP's y axis"
-                if isinstance(gripper, JawGripper):
-                    continue
-                half = gripper.open_width / 2
-                assert half - 0.005 < abs(centre[1]) < half + 0.025, f"a finger is {abs(centre[1]):.3f} m from the TCP"
-        depth = tcp.position[2] - min(tips)
+        spec = self._spec()
+        gripper, fingers = spec.gripper, finger_boxes(spec)
+        assert np.abs(fingers.centres[:, 0]).max() < 0.01, "a finger is beside the TCP's y axis"
+        if isinstance(gripper, ParallelGripper):
+            half = gripper.open_width / 2
+            for y in np.abs(fingers.centres[:, 1]):
+                assert half - 0.005 < y < half + 0.025, f"a finger is {y:.3f} m from the TCP"
         # PyBullet's boxes are some millimetres too large.
+        depth = fingers.depth
         assert abs(depth - gripper.finger_depth) < 0.005, f"the finger tips reach {depth:.3f} m beyond the TCP"
 
     def test_the_workspace_is_within_reach(self) -> None:
         """The hand down at one of a grasp's two yaws, wherever tasks put objects, up to 22 cm above the table."""
-        spec = self._spec()
-        arm, home = arm_kinematics(spec), np.array(spec.home_q)
-        places = itertools.product((0.35, 0.5, 0.65), (-0.25, 0.0, 0.25), (0.02, 0.15, 0.22), (-0.8, 0.0, 0.8))
-        for x, y, z, yaw in places:
-            poses = [hand_down(spec.task_scale * np.array([x, y, z]), either) for either in symmetric_yaws(yaw, 2)]
-            rest = arm.turned_towards(home, poses[0].position)
-            why = [arm.why_unreachable(wanted, start=rest, rest=rest) for wanted in poses]
-            assert not all(why), f"{poses[0].position.round(3).tolist()} m at yaw {yaw} is out of reach: {why[0]}"
+        unreachable = unreachable_poses(self._spec())
+        assert not unreachable, unreachable[0]
 
     def test_it_picks_and_places(self) -> None:
         """One episode of pick_place succeeds."""
@@ -266,9 +235,6 @@ class RobotContract:
         allowed = modules_of([self.robot])
         allow_models(allowed)
         return load_robot(self.robot, allowed)
-
-    def _episode(self) -> PreparedEpisode:
-        return prepare(plan_of("pick_place", self.robot, self.seed, 0))
 
 
 def plan_of(task: str, robot: str, seed: int, index: int) -> EpisodePlan:

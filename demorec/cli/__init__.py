@@ -19,6 +19,7 @@ from typing import Protocol
 from demorec.cli.shared.flags import parse, terminal_width
 from demorec.cli.shared.output import PrintableFormatter, say, tell
 from demorec.core.errors import DemorecError, MissingDependencyError, OptionError, resource_error
+from demorec.core.own_code import own_line
 from demorec.core.registry import Registry, nearest_match
 
 
@@ -128,6 +129,10 @@ def _reported(prog: str, run: Callable[[], int]) -> int:
         return 1
     except Exception as error:
         lack = resource_error(error) or _missing_package(error)  # memory and files may run out in any line
+        if lack is None and (line := own_line(error)):
+            kind = f"{type(error).__name__}: {error}".rstrip(": ")
+            tell(f"{prog}: {_shortened(kind)} (the traceback is in {_keep_traceback()}); it came up at {line}")
+            return 1
         if lack is None:
             tell(f"{prog}: unexpected {type(error).__name__}, please report it with this file: {_keep_traceback()}")
             return 1

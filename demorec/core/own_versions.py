@@ -9,16 +9,16 @@ from __future__ import annotations
 import functools
 import hashlib
 import importlib.metadata
-import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import DemorecError
+from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.registry import import_root, is_allowed, module_file, split_name
 from demorec.core.tables import load_robot
 from demorec.robots.assets import allow_models, asset_path, mesh_path
+from demorec.robots.urdf import mesh_names
 
 SOURCE = "source of "
 """Prefix of a digest's name among versions: "source of my_tasks"."""
@@ -32,7 +32,7 @@ def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
         robot: Name of the robot; one of the user's own counts with its model, too.
 
     Raises:
-        ConfigError: A module or the robot cannot be found or loaded.
+        ConfigError: A module or the robot cannot be found or loaded, or its model is not a URDF.
         SceneError: The robot's model or one of its meshes is missing.
     """
     versions: dict[str, str] = {}
@@ -151,7 +151,10 @@ def _is_left_out(name: str) -> bool:
 def _model_digest(urdf: Path) -> str:
     """Of a URDF and of the meshes that it names."""
     content = urdf.read_bytes()
-    names = sorted(set(re.findall(r'filename="([^"]+)"', content.decode(errors="replace"))))
+    try:
+        names = mesh_names(content.decode(errors="replace"))
+    except ValueError as error:
+        raise ConfigError(f"The robot's model cannot be read ({error}): {urdf}") from error
     return _digest([("", content), *((name, mesh_path(urdf.parent, name).read_bytes()) for name in names)])
 
 

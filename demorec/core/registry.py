@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any, cast
 
 from demorec.core.errors import ConfigError, NotAllowedError
+from demorec.core.own_code import own_line
 
 _LONGEST = 100
 """Characters of names that are compared with others, which takes the product of both and of how many there are."""
@@ -161,6 +162,8 @@ def import_object(kind: str, name: str) -> object:
             return getattr(module, attribute)
     except (Exception, SystemExit) as error:  # the user's code may raise anything
         reason = str(error) if isinstance(error, ImportError | AttributeError) else f"{type(error).__name__}: {error}"
+        if line := own_line(error):
+            raise ConfigError(f"The {kind} {name!r} cannot be imported ({reason}): mend {line}") from error
         raise ConfigError(
             f"The {kind} {name!r} cannot be imported ({reason}): give it as package.module:Name, with the package "
             "installed, its folder on PYTHONPATH, or the module in the current folder."

@@ -16,6 +16,7 @@ import psutil
 
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, error_chain
+from demorec.core.own_code import own_line
 from demorec.runs.run_file import Attempt
 
 Maker = Callable[[EpisodePlan, Path], Attempt]
@@ -47,7 +48,7 @@ class Raised:
     """An attempt raised an exception. Told in words: an exception of somebody's task may not survive pickling.
 
     `errno` is that of the operating system's error in the chain, if any (ENOMEM for a MemoryError); `exit_code` that of
-    a DemorecError, else 0.
+    a DemorecError, else 0; `own_line` the line of the user's own code, as `demorec.core.own_code.own_line`.
     """
 
     plan: EpisodePlan
@@ -56,6 +57,7 @@ class Raised:
     traceback: str = ""
     errno: int | None
     exit_code: int = 0
+    own_line: str = ""
 
     def error(self, sentence: str) -> DemorecError:
         """What the driver raises for it."""
@@ -162,6 +164,7 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
             traceback=traceback.format_exc(),
             errno=number,
             exit_code=error.exit_code if isinstance(error, DemorecError) else 0,
+            own_line=own_line(error),
         )
     return Made(plan=plan, attempt=attempt, peak_bytes=peak_memory())
 

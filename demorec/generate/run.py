@@ -18,6 +18,7 @@ from types import FrameType
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.core.processes import available_cores, handled
+from demorec.core.registry import split_name
 from demorec.core.tables import RENDERERS, load_robot
 from demorec.generate.contents import Inspector
 from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Made, Raised, Report
@@ -25,7 +26,6 @@ from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.robots.assets import allow_models
-from demorec.robots.inertials import check_masses
 from demorec.runs.recorded import inspect_recording
 from demorec.runs.run_file import UNFINISHED, Attempt, RunFile
 
@@ -43,6 +43,8 @@ _REFUSED = {
     errno.EACCES: "permission is denied",
     errno.EPERM: "permission is denied",
 }
+_MISSING_FILE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR)
+"""What the user's own code meets where it names a file wrongly."""
 
 
 def generate(
@@ -66,17 +68,19 @@ def generate(
 
     Raises:
         MissingDependencyError: Ray is not installed.
-        ConfigError: The task cannot be loaded, a link of the robot does not say what it weighs, the Ray cluster cannot
-            be reached, or the folder is in use, holds another run or cannot be written to.
+        ConfigError: The task cannot be loaded, the robot does not fit its URDF, the Ray cluster cannot be reached,
+            or the folder is in use, holds another run or cannot be written to.
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     from demorec.loop import load_task
+    from demorec.tasks.robot_check import check_robot
 
     progress = progress or RunObserver()
     load_task(config)  # these raise what the first worker would raise, before anything is written
     allow_models(config.modules)
-    check_masses(load_robot(config.robot, config.modules).urdf)
+    if split_name(config.robot) is not None:
+        check_robot(load_robot(config.robot, config.modules), uses_workspace=split_name(config.task) is None)
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected
@@ -234,7 +238,8 @@ class _Driver:
                 f"The output folder cannot take another episode: {_REFUSED[report.errno]}; mend that and run the same "
                 f"command again. {self._folder.kept}"
             )
-        if report.errno is not None and report.exit_code != ConfigError.exit_code:
+        is_own_bug = bool(report.own_line) and report.errno in _MISSING_FILE
+        if report.errno is not None and report.exit_code != ConfigError.exit_code and not is_own_bug:
             advice = _MORE_MEMORY if report.errno == errno.ENOMEM else _SOUND_STORAGE
             self._again(report.plan, report.message.rstrip(".") or report.kind, advice)
             return
@@ -247,6 +252,7 @@ class _Driver:
         raise GenerationError(
             f"Episode {report.plan.episode_index} raised {report.kind}: {report.message or 'no message'} "
             f"(the traceback is in {place}). {self._folder.kept}"
+            + (f"; it came up at {report.own_line}" if report.own_line else "")
         )
 
 

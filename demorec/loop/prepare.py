@@ -150,6 +150,10 @@ def _layout(plan: EpisodePlan, robot: RobotSpec, ranges: Ranges, task: Task, beh
     config, sampler = plan.config, _sampler(plan, ranges, task)
     for _ in range(MAX_LAYOUTS):
         scene = task.sample_scene(robot, sampler)
+        if not isinstance(scene, Scene):
+            raise ConfigError(
+                f"sample_scene of the task {config.task!r} returned {type(scene).__name__}; return a Scene at its end."
+            )
         for module in modules_of([config.task]):
             scene = _with_model_names(scene, module)
         scene = replace(scene, physics=replace(scene.physics, hz=config.physics_hz))

@@ -20,6 +20,7 @@ from demorec.core.errors import SceneError, describe_error
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Rgba
 from demorec.robots.assets import asset_path, mesh_path, surface_file
+from demorec.robots.collada import read_collada
 from demorec.robots.obj import read_obj
 from demorec.robots.urdf import UrdfShape, parse_xml, read_links
 
@@ -128,12 +129,14 @@ def _bounding_box(path: Path, scale: tuple[float, ...]) -> Primitive:
             if not len(found.faces):
                 raise ValueError("no triangles")
             vertices = found.points
+        elif path.suffix.lower() == ".dae":  # trimesh needs another package for it
+            vertices = read_collada(path).points
         else:
             import trimesh  # takes a second to load, and the usual robot needs it for nothing
 
             vertices = np.asarray(trimesh.load(path, force="mesh", process=False).vertices, dtype=np.float64)
         low, high = vertices.min(axis=0), vertices.max(axis=0)
-    except (OSError, ValueError, IndexError) as error:
+    except (OSError, ValueError, LookupError, ET.ParseError) as error:
         raise SceneError(f"A mesh of the scene cannot be read ({describe_error(error)}): {path}") from error
     x, y, z = ((low + high) / 2 * scale).tolist()
     sides = np.maximum((high - low) * np.abs(scale), _MIN_SIDE_M)

@@ -11,7 +11,7 @@ import functools
 import hashlib
 import importlib.util
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from demorec.core.cache import cache_folder, write_whole
@@ -21,6 +21,12 @@ from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Shape
 
 OWN_PREFIX = "demorec:"
+
+_PACKAGE_SCHEMES = ("package", "model")
+"""Of ROS and of Gazebo: the first part of the path is the name of a package or model."""
+_MAX_FOLDERS_ABOVE = 6
+"""Folders above a URDF, its own included, that are looked through: PACKAGE/robots/ARM/urdf/arm.urdf is the deepest
+usual layout, and the workspace has one more."""
 
 _modules_with_models: set[str] = set()
 """Of this process, as `sys.path` is: models are looked up deep below whatever reads or draws a recording."""
@@ -130,17 +136,69 @@ def model_name(file: str | Path, module: str) -> str:
     )
 
 
-def mesh_path(folder: Path, name: str) -> Path:
-    """Absolute path of a mesh that a URDF in `folder` names: beside it, or below pybullet_data for our own URDFs.
+def mesh_path(folder: Path | None, name: str) -> Path:
+    """Absolute path of a mesh that a URDF names.
+
+    A name is looked up beside the URDF and below pybullet_data. A ROS name ("package://PACKAGE/meshes/base.stl", or a
+    "file://" path into an installed package) is also looked up in the folders above the URDF, as in a workspace or a
+    repository of that package, and in the packages of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
+
+    Args:
+        folder: Folder of the URDF; None for a URDF of unknown origin, whose names lead only into pybullet_data, the
+            current folder, the folders of modules that the user has allowed, and ROS's packages.
+        name: As the URDF has it.
 
     Raises:
         SceneError: There is no such file.
     """
-    relative = name.removeprefix("package://").removeprefix("file://")
-    for candidate in (folder / relative, folder.parent / relative, data_folder() / relative):
+    scheme, separator, path = name.rpartition("://")
+    relative = path if separator else name
+    parts = _package_path(scheme, relative)
+    for candidate in _mesh_candidates(folder, relative, parts):
         if candidate.is_file():
             return candidate
-    raise SceneError(f"The mesh {name!r} is neither beside its URDF nor in pybullet_data: {folder}")
+    fix = f"put the package {parts[0]!r} beside it or on ROS_PACKAGE_PATH" if parts else "put it there"
+    where = "" if folder is None else f": {folder}"
+    raise SceneError(f"The mesh {name!r} is neither beside its URDF nor in pybullet_data, {fix}{where}")
+
+
+def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...]) -> Iterator[Path]:
+    """The places of a mesh, most likely first; `parts` as of `_package_path`."""
+    if folder is not None:
+        yield folder / relative
+        yield folder.parent / relative
+        yield data_folder() / relative
+        folders = [folder]
+    else:
+        folders = [Path.cwd(), *(module_file(module).parent for module in sorted(_modules_with_models))]
+        if not Path(relative).is_absolute() and ".." not in Path(relative).parts:
+            yield from (place / relative for place in (*folders, data_folder()))
+    if not parts or ".." in parts:
+        return
+    for start in folders:
+        for above in [start, *start.parents][:_MAX_FOLDERS_ABOVE]:
+            yield above.joinpath(*parts)
+            yield above.joinpath(*parts[1:])  # a repository that is not called as its package is
+    yield from (package.joinpath(*parts[1:]) for package in _ros_packages(parts[0]))
+
+
+def _package_path(scheme: str, path: str) -> tuple[str, ...]:
+    """The package, then the parts of the path in it, of a ROS name; () for a name of another kind."""
+    if scheme == "file":
+        *_, path = path.rpartition("/share/")
+        scheme = "" if path.startswith("/") else "package"  # of a path that leads into no installed package
+    parts = Path(path).parts if scheme in _PACKAGE_SCHEMES else ()
+    return parts if len(parts) > 1 else ()
+
+
+def _ros_packages(name: str) -> Iterator[Path]:
+    """The folders that ROS 1 and ROS 2 on this machine would take for a package."""
+    for entry in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
+        yield Path(entry) / name
+        if Path(entry).name == name:
+            yield Path(entry)
+    for entry in filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep)):
+        yield Path(entry) / "share" / name
 
 
 def _top_folder(module: str) -> Path:

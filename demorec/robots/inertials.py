@@ -39,11 +39,13 @@ def require_masses(text: str) -> None:
     """Link -> the link that it is rigidly one with, which hangs on a joint that moves, or the root."""
     for joint in urdf.depth_first():
         carrier[joint.child] = carrier[joint.parent] if joint.kind == "fixed" else joint.child
+    moving = {joint.child for joint in urdf.joints if joint.kind != "fixed"}
     masses: dict[str, float] = {}
     wrong: dict[str, str] = {}
-    for name, link in links.items():
+    for name, link in sorted(links.items(), key=lambda item: item[0] not in moving):  # what moves carries the rest
+        is_carried = name not in moving and bool(masses.get(carrier[name]))
         try:
-            masses[name] = _mass(link, must_be_whole=carrier[name] != urdf.root)
+            masses[name] = _mass(link, must_be_whole=carrier[name] != urdf.root, may_be_point=is_carried)
         except ValueError as error:
             wrong[name] = str(error)
     carried = dict.fromkeys(carrier.values(), 0.0)
@@ -60,17 +62,34 @@ def require_masses(text: str) -> None:
         )
 
 
-def with_massless_frames(text: str) -> str:
-    """The URDF, in which every link has an `<inertial>`: of no mass where it had none."""
+def for_simulator(text: str) -> str:
+    """Return the URDF of a robot as PyBullet shall have it.
+
+    Every link has an `<inertial>`, of no mass where it had none. No joint has `<dynamics>`: PyBullet refuses some, and
+    applies others wrongly (`demorec.sim.lossy_motors`).
+    """
     robot = parse_xml(text)
-    without = [link for link in robot.findall("link") if link.find("inertial") is None]
-    for link in without:
+    frames = [link for link in robot.findall("link") if link.find("inertial") is None]
+    for link in frames:
         link.append(ET.fromstring(_NOTHING))
-    return ET.tostring(robot, encoding="unicode") if without else text
+    lossy = [joint for joint in robot.findall("joint") if joint.find("dynamics") is not None]
+    for joint in lossy:
+        for dynamics in joint.findall("dynamics"):
+            joint.remove(dynamics)
+    return ET.tostring(robot, encoding="unicode") if frames or lossy else text
 
 
-def _mass(link: ET.Element, *, must_be_whole: bool) -> float:
-    """kg of one link; ValueError, with what is wrong, unless a body can have it and `must_be_whole` holds."""
+def _mass(link: ET.Element, *, must_be_whole: bool, may_be_point: bool) -> float:
+    """Mass of one link, kg.
+
+    Args:
+        link: Of the URDF.
+        must_be_whole: Whether its mass and inertia matter, and a shape needs them.
+        may_be_point: Whether it may have mass without inertia, as it is fixed to a body that has both.
+
+    Raises:
+        ValueError: No body can have such a mass and inertia.
+    """
     inertial = link.find("inertial")
     if inertial is None:
         if must_be_whole and (link.find("visual") is not None or link.find("collision") is not None):
@@ -84,7 +103,7 @@ def _mass(link: ET.Element, *, must_be_whole: bool) -> float:
     if not 0 <= mass <= MAX_MASS:
         raise ValueError(f"a mass of {mass:g} kg")
     least, *_, most = np.linalg.eigvalsh(inertia)
-    if mass and must_be_whole and not least > 0:
+    if mass and must_be_whole and not (least > 0 or (may_be_point and least == 0)):
         raise ValueError(f"an inertia whose smallest principal value is {least:.3g} kg m^2")
     if most > MAX_GYRATION**2 * max(mass, 1.0) or least < -1e-9:
         raise ValueError(f"principal inertias of {least:.3g} to {most:.3g} kg m^2 for {mass:g} kg")

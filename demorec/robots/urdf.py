@@ -12,7 +12,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Literal, cast, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
 import numpy as np
 
@@ -120,6 +120,8 @@ class Urdf:
             raise ValueError("a joint of the URDF lacks something, its parent or its child") from error
         children = {joint.child for joint in joints}
         roots = [link for link in links if link not in children]
+        if not links and "xacro" in text:
+            raise ValueError("the file is a xacro file or an empty one; make a URDF by xacro FILE.xacro > FILE.urdf")
         if len(roots) != 1:
             raise ValueError(f"a URDF needs one root link, found {len(roots)}: {', '.join(roots[:5])}")
         return cls(joints=joints, root=roots[0])
@@ -182,6 +184,33 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
         lower=unit * float(cast(ET.Element, limit).get("lower", 0)) if bounded else -math.inf,
         upper=unit * float(cast(ET.Element, limit).get("upper", 0)) if bounded else math.inf,
     )
+
+
+class JointDynamics(NamedTuple):
+    """What a joint loses.
+
+    Attributes:
+        damping: Viscous, N m s/rad or N s/m.
+        friction: Coulomb friction, N m or N.
+    """
+
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+def read_dynamics(text: str) -> dict[str, JointDynamics]:
+    """Joint -> its <dynamics>, of the joints of a URDF that have one; ValueError for values below 0."""
+    found = {}
+    for joint in parse_xml(text).findall("joint"):
+        element = joint.find("dynamics")
+        if element is None:
+            continue
+        values = JointDynamics(*(read_numbers(element.get(name, "0"), 1)[0] for name in JointDynamics._fields))
+        name = joint.attrib["name"]
+        if min(values) < 0:
+            raise ValueError(f"the damping or friction of {name!r} is {min(values):g}; set it to 0 or more")
+        found[name] = values
+    return found
 
 
 def quat_from_rpy(rpy: Sequence[float]) -> Array:
@@ -260,6 +289,20 @@ def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
         )
     except KeyError as error:
         raise ValueError(f"a link or shape of the URDF lacks its {error}") from error
+
+
+def mesh_names(text: str) -> tuple[str, ...]:
+    """The mesh files that the shapes of a URDF name, sorted; ValueError for what is not XML.
+
+    Other files that it names, such as plug-ins of Gazebo, belong to other programs.
+    """
+    return tuple(sorted({mesh.attrib["filename"] for mesh in mesh_elements(parse_xml(text))}))
+
+
+def mesh_elements(robot: ET.Element) -> list[ET.Element]:
+    """The <mesh> elements of the shapes of all links."""
+    shapes = [*robot.iterfind("link/visual"), *robot.iterfind("link/collision")]
+    return [mesh for shape in shapes for mesh in shape.iterfind("geometry/mesh") if mesh.get("filename")]
 
 
 def _shapes(link: ET.Element, tag: str, scale: float, colors: dict[str, Rgba]) -> tuple[UrdfShape, ...]:

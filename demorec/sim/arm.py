@@ -6,18 +6,22 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.errors import SceneError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action
 from demorec.episode.scene import POSITION_GAIN, RobotPlacement
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
 from demorec.robots.robot import RobotSpec
-from demorec.robots.urdf import Urdf
+from demorec.robots.spec_check import checked_urdf
+from demorec.robots.urdf import JointDynamics, read_dynamics
+from demorec.sim import lossy_motors
 from demorec.sim.bodies import load_urdf
+from demorec.sim.lossy_motors import JointMotors
 
 FINGER_DAMPING = 1_000.0
 """Contact of the finger pads, N s/m (the value of panda.urdf)."""
+FINGER_GAIN = 0.1
+"""Share of the position error that a finger's motor corrects in a physics step (PyBullet's default)."""
 
 
 class Arm:
@@ -37,32 +41,20 @@ class Arm:
         self.spec = spec
         self.world_from_base = placement.world_from_base
         self._client = client
-        num_fingers = 1 + len(spec.gripper.gear_ratios)
-        if len(spec.gripper.joints) != num_fingers:
-            raise SceneError(
-                f"The robot {spec.name!r} has {len(spec.gripper.joints)} finger joints; a gripper of its kind has "
-                f"{num_fingers}."
-            )
+        self.kinematics = arm_kinematics(spec, scale=placement.scale)  # checks the spec
         base, what = placement.world_from_base, f"robot {spec.name!r}"
         self.body = load_urdf(client, spec.urdf, base, scale=placement.scale, is_fixed=True, what=what, is_robot=True)
         info = [client.getJointInfo(self.body, i) for i in range(client.getNumJoints(self.body))]
         self.links = {spec.base_link: -1} | {row[12].decode(): row[0] for row in info}
         by_name = {row[1].decode(): row[0] for row in info}
-        wanted = {*spec.arm_joints, *spec.gripper.joints} - by_name.keys()
-        wanted |= {spec.tcp_link, *spec.gripper.finger_links} - self.links.keys()
-        if wanted:
-            raise SceneError(
-                f"The robot {spec.name!r} has joints or links that its URDF {spec.urdf!r} lacks: "
-                f"{', '.join(sorted(wanted))}."
-            )
         self._arm = [by_name[name] for name in spec.arm_joints]
         self._fingers = [by_name[name] for name in spec.gripper.joints]
         self._tcp = self.links[spec.tcp_link]
         self.finger_links = tuple(self.links[name] for name in spec.gripper.finger_links)
         self._hand = self._mounted_hand()
-        self.kinematics = arm_kinematics(spec, scale=placement.scale)
         self._forces = list(spec.torque_limit)
         self._gains = [POSITION_GAIN] * len(self._arm)
+        self._lossy_motors = self._make_lossy_motors()
         self._make_gripper(finger_stiffness)
         self.place(np.array(placement.joint_position), placement.gripper_width)
         self.target = np.array(placement.joint_position, dtype=np.float64)
@@ -93,14 +85,25 @@ class Arm:
             )
             self._client.changeConstraint(gear, gearRatio=-ratio, erp=0.1, maxForce=50)
 
+    def _make_lossy_motors(self) -> JointMotors | None:
+        """The motors of all joints; None where the URDF gives none of them damping or friction."""
+        found = read_dynamics(asset_path(self.spec.urdf).read_text())
+        damping, friction = np.array([found.get(name, JointDynamics()) for name in self.spec.joint_names]).T
+        if not damping.any() and not friction.any():
+            return None
+        gripper, num_arm, num_fingers = self.spec.gripper, len(self._arm), len(self._fingers)
+        return JointMotors(
+            joints=(*self._arm, *self._fingers),
+            limit=np.array([*self.spec.torque_limit, *[gripper.force] * num_fingers]),
+            speed=np.array([np.inf] * num_arm + [gripper.joint_speed] * num_fingers),
+            gain=np.array([POSITION_GAIN] * num_arm + [FINGER_GAIN] * num_fingers),
+            damping=damping,
+            friction=friction,
+        )
+
     def _mounted_hand(self) -> int:
         """The hand's link, with a force-torque sensor on the joint that carries it."""
-        hand: int = self.links.get(self.spec.hand_link, -1)
-        if hand < 0:
-            raise SceneError(
-                f"The robot {self.spec.name!r} has no joint that carries its hand_link {self.spec.hand_link!r}; its "
-                f"links on joints are {', '.join(name for name, link in self.links.items() if link >= 0)}."
-            )
+        hand: int = self.links[self.spec.hand_link]
         self._client.enableJointForceTorqueSensor(self.body, hand, True)
         # PyBullet tells the wrench along the axes of the link's inertia, not of the link.
         self._hand_from_inertia = Pose(quat_xyzw=np.array(self._client.getDynamicsInfo(self.body, hand)[4]))
@@ -122,6 +125,9 @@ class Arm:
 
     def command_gripper(self, width: float) -> None:
         """Begin a control step: the gripper's motors are set to an opening, in metres, for all of it."""
+        self.gripper_target = width
+        if self._lossy_motors is not None:
+            return
         gripper = self.spec.gripper
         for joint, target in zip(self._fingers, gripper.joint_position(width).tolist(), strict=True):
             self._client.setJointMotorControl2(
@@ -132,10 +138,14 @@ class Arm:
                 force=gripper.force,
                 maxVelocity=gripper.joint_speed,
             )
-        self.gripper_target = width
 
     def drive(self, joint_target: Array) -> None:
         """Set the arm's motors to (n_arm,) targets for the next physics step."""
+        if self._lossy_motors is not None:
+            fingers = self.spec.gripper.joint_position(self.gripper_target)
+            targets = np.concatenate([joint_target, fingers])
+            lossy_motors.drive(self._client, self.body, self._lossy_motors, targets)
+            return
         self._client.setJointMotorControlArray(
             self.body,
             self._arm,
@@ -149,6 +159,8 @@ class Arm:
         """Positions, velocities and applied motor torques of all joints, each (n_joints,)."""
         states = self._client.getJointStates(self.body, self._arm + self._fingers)
         position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
+        if self._lossy_motors is not None:
+            effort = self._lossy_motors.effort(effort, velocity)
         return position, velocity, effort
 
     def hand_wrench(self) -> Array:
@@ -172,9 +184,9 @@ class Arm:
 
 
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
-    """Kinematics of a robot from its URDF."""
+    """Kinematics of a robot from its URDF; errors as of `demorec.robots.spec_check.checked_urdf`."""
     return ArmKinematics(
-        Urdf.load(asset_path(spec.urdf), scale=scale),
+        checked_urdf(spec, scale=scale),
         arm_joints=spec.arm_joints,
         tcp_link=spec.tcp_link,
         lower=spec.position_lower,

@@ -20,8 +20,8 @@ from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Texture
 from demorec.render import Visual, VisualBody, VisualKind
 from demorec.robots.assets import asset_path, collision_file, mesh_path, surface_file
-from demorec.robots.inertials import check_masses, with_massless_frames
-from demorec.robots.urdf import parse_xml, read_links
+from demorec.robots.inertials import check_masses, for_simulator
+from demorec.robots.urdf import mesh_elements, parse_xml, read_links
 from demorec.sim.client import silence
 
 
@@ -122,7 +122,7 @@ def load_urdf(
     if is_robot:
         check_masses(name)
     try:
-        with urdf_file(name, has_frames=is_robot) as path, silence():
+        with urdf_file(name, is_robot=is_robot) as path, silence():
             place = pose.position.tolist(), pose.quat_xyzw.tolist()
             return int(client.loadURDF(path, *place, useFixedBase=is_fixed, globalScaling=scale))
     except DemorecError:
@@ -132,12 +132,12 @@ def load_urdf(
 
 
 @contextmanager
-def urdf_file(name: str, *, has_frames: bool = False) -> Iterator[str]:
+def urdf_file(name: str, *, is_robot: bool = False) -> Iterator[str]:
     """A file that PyBullet can load while the context lasts.
 
     Args:
         name: As in `demorec.robots.assets.asset_path`.
-        has_frames: Whether links without `<inertial>` are frames of no mass.
+        is_robot: Whether links without `<inertial>` are frames of no mass, and damping is not PyBullet's affair.
 
     Raises:
         SceneError: The URDF or one of its meshes is missing.
@@ -147,7 +147,7 @@ def urdf_file(name: str, *, has_frames: bool = False) -> Iterator[str]:
     descriptor, copy = tempfile.mkstemp(suffix=".urdf", prefix="demorec_")
     try:
         with os.fdopen(descriptor, "w") as file:
-            file.write(_without_visual_meshes(with_massless_frames(text) if has_frames else text, path.parent))
+            file.write(_without_visual_meshes(for_simulator(text) if is_robot else text, path.parent))
         yield copy
     finally:
         Path(copy).unlink()
@@ -161,7 +161,7 @@ def _without_visual_meshes(text: str, folder: Path) -> str:
     files.
     """
     robot = parse_xml(text)
-    meshes = {mesh: mesh_path(folder, mesh.attrib["filename"]) for mesh in robot.iter("mesh")}
+    meshes = {mesh: mesh_path(folder, mesh.attrib["filename"]) for mesh in mesh_elements(robot)}
     for mesh, path in meshes.items():
         mesh.set("filename", str(path))
     for geometry in robot.iterfind("link/visual/geometry"):

@@ -19,6 +19,7 @@ from demorec.episode.episode import Outcome, Sample, SampledFrame, Vector, frame
 from demorec.episode.features import STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
 from demorec.mcap import SampledWriter
+from demorec.robots.known_models import remember_model
 from demorec.robots.urdf import Urdf
 from demorec.runs.external import ExternalFolder, episode_path
 from demorec.sources.fields import FieldError
@@ -125,7 +126,9 @@ def urdf_text(mapping: SourceMapping, mapping_path: Path) -> str | None:
         return None
     path = mapping_path.parent / mapping.robot.urdf
     try:
-        return read_text_limited(path, _MAX_URDF_BYTES) or None
+        text = read_text_limited(path, _MAX_URDF_BYTES)
+        remember_model(text, path)
+        return text or None
     except (OSError, ValueError) as error:  # no text, or NUL in the name
         raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
 

@@ -13,14 +13,25 @@ import trimesh
 from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, as_reason
+from demorec.core.files import read_text_limited
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
 from demorec.mcap.transforms import MovingJoints
 from demorec.render.procedural import texture_pixels
 from demorec.robots.assets import asset_path, surface_file
-from demorec.robots.urdf import Urdf
+from demorec.robots.known_models import known_model
+from demorec.robots.urdf import MAX_BYTES, Urdf
 from demorec.view.episode import PlayedEpisode
-from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, skeleton_meshes, sphere_mesh, urdf_meshes
+from demorec.view.meshes import (
+    SurfaceMesh,
+    found_meshes,
+    joined,
+    mesh_file,
+    of_trimesh,
+    skeleton_meshes,
+    sphere_mesh,
+    urdf_meshes,
+)
 from demorec.view.paths import Paths, log_pose, send_poses
 from demorec.view.style import GOAL
 
@@ -154,8 +165,7 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
     if episode.scene is not None:
         urdf, meshes = robot_model(info.simulated.robot.urdf, episode.scene.robot.scale, description)
     elif description is not None:
-        urdf = Urdf.parse(description)
-        meshes = _meshes_or_rods(description, urdf)
+        urdf, meshes = _external_model(description)
     else:
         return
     entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
@@ -172,13 +182,27 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
         recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
 
 
-def _meshes_or_rods(text: str, urdf: Urdf) -> Mapping[str, SurfaceMesh]:
-    """Link -> what it looks like; rods between the joints where the URDF names files that are not here."""
-    try:
-        return urdf_meshes(text, None)
-    except (DemorecError, OSError, ValueError) as error:
-        log.warning("The robot is drawn as rods between its joints, since %s.", as_reason(error))
-        return skeleton_meshes(urdf)
+def _external_model(text: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
+    """The joint tree of a robot that was not simulated, and its links' meshes as far as they are found.
+
+    The file that the text comes from counts where it is known and has the same joints. Otherwise a link whose mesh is
+    not found is drawn as rods to the joints that it carries.
+    """
+    urdf, path = Urdf.parse(text), known_model(text)
+    if path is not None:
+        try:
+            original = read_text_limited(path, MAX_BYTES)
+            if _same_joints(Urdf.parse(original), urdf):
+                return urdf, urdf_meshes(original, path.parent)
+        except (DemorecError, OSError, ValueError):  # the recording has a description of its own
+            log.debug("%s has changed since the robot was recorded.", path)
+    meshes, reasons = found_meshes(text)
+    if not reasons:
+        return urdf, meshes
+    log.warning(
+        "The robot is drawn as rods between its joints where its meshes are not found, since %s.", as_reason(reasons[0])
+    )
+    return urdf, {**skeleton_meshes(urdf), **meshes}
 
 
 def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:

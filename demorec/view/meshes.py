@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import hashlib
+import xml.etree.ElementTree as ElementTree
 import zipfile
 from contextlib import suppress
 from dataclasses import dataclass
@@ -24,7 +25,8 @@ from demorec.core.errors import DemorecError, RecordingError, describe_error
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path
-from demorec.robots.urdf import Urdf, UrdfShape, read_links
+from demorec.robots.collada import read_collada
+from demorec.robots.urdf import Urdf, UrdfLink, UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Of one mesh file."""
@@ -32,7 +34,7 @@ _CREASE = np.radians(35.0)
 """Edges sharper than this stay sharp when a surface is shaded."""
 _ROD_RADIUS, _SHORTEST_ROD = 0.015, 1e-3
 """Metres."""
-_CACHE_VERSION = b"2"
+_CACHE_VERSION = b"3"
 _ARRAYS = ("vertices", "normals", "triangles", "colors")
 
 
@@ -82,7 +84,8 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
 
     Args:
         text: The URDF.
-        folder: Where it lay, to find its mesh files; None for one without mesh files.
+        folder: Where it lay, to find its mesh files; None for one of unknown origin, of which only files in the
+            packages of ROS or below the current folder are found.
         scale: Uniform scale.
 
     Raises:
@@ -91,10 +94,34 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
     """
     links = {}
     for link in read_links(text, scale=scale):
-        meshes = [mesh for shape in link.visuals if (mesh := _shape_mesh(shape, folder)) is not None]
-        if meshes:
-            links[link.name] = joined(meshes)
+        if (mesh := _link_mesh(link, folder)) is not None:
+            links[link.name] = mesh
     return links
+
+
+def found_meshes(text: str) -> tuple[dict[str, SurfaceMesh], list[DemorecError]]:
+    """As `urdf_meshes` of a URDF of unknown origin, without the links whose meshes are not found; and why they are not.
+
+    Raises:
+        ValueError: The text is no URDF.
+    """
+    links: dict[str, SurfaceMesh] = {}
+    errors: list[DemorecError] = []
+    for link in read_links(text):
+        try:
+            mesh = _link_mesh(link, None)
+        except DemorecError as error:
+            errors.append(error)
+            continue
+        if mesh is not None:
+            links[link.name] = mesh
+    return links, errors
+
+
+def _link_mesh(link: UrdfLink, folder: Path | None) -> SurfaceMesh | None:
+    shapes = [_shape_mesh(shape, folder) for shape in link.visuals]
+    meshes = [mesh for mesh in shapes if mesh is not None]
+    return joined(meshes) if meshes else None
 
 
 def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
@@ -112,8 +139,6 @@ def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
     scale: NDArray[np.float64] = np.ones(3)
     match shape.kind:
         case "mesh":
-            if folder is None:
-                raise RecordingError(f"The robot's mesh {shape.file!r} is named by its URDF, but is not kept with it")
             try:
                 path = mesh_path(folder, shape.file)
             except DemorecError as error:
@@ -150,7 +175,7 @@ def mesh_file(path: Path) -> SurfaceMesh:
         with suppress(OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile), np.load(cached) as arrays:
             return SurfaceMesh(**{name: arrays[name] for name in _ARRAYS})
         mesh = _read_mesh_file(path)
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise RecordingError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
     with suppress(OSError):  # a folder that cannot be written only costs time
         write_whole(cached, lambda file: np.savez(file, **{name: getattr(mesh, name) for name in _ARRAYS}))
@@ -158,7 +183,11 @@ def mesh_file(path: Path) -> SurfaceMesh:
 
 
 def _read_mesh_file(path: Path) -> SurfaceMesh:
-    loaded = trimesh.load(path, process=False)
+    if path.suffix.lower() == ".dae":  # trimesh needs another package for it
+        points = read_collada(path).points
+        loaded = trimesh.Trimesh(vertices=points, faces=np.arange(len(points)).reshape(-1, 3), process=False)
+    else:
+        loaded = trimesh.load(path, process=False)
     parts: list[Any] = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     total = sum(len(part.faces) for part in parts)
     is_obj = path.suffix.lower() == ".obj"
@@ -191,7 +220,7 @@ def _color(part: Any) -> NDArray[np.uint8] | None:
         mean: NDArray[np.float64] = np.average(colors, axis=0, weights=part.area_faces)
         return np.rint(mean).astype(np.uint8)
     color = getattr(getattr(part.visual, "material", None), "diffuse", None)
-    if color is None:
+    if color is None and part.visual.defined:  # else trimesh would answer grey
         color = getattr(part.visual, "main_color", None)
     return None if color is None else np.array(color, dtype=np.uint8)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
@@ -108,6 +109,137 @@ def test_a_link_without_a_mass_is_refused_before_anything_is_made(
         told.err,
     )
     assert not (tmp_path / "run").exists()
+
+
+def edited(path: Path, *changes: tuple[str, str]) -> None:
+    text = path.read_text()
+    for old, new in changes:
+        assert old in text, old
+        text = text.replace(old, new)
+    path.write_text(text)
+
+
+@pytest.mark.parametrize(
+    ("file", "changes", "words"),
+    [
+        (
+            "my_robots.py",
+            [('tcp_link="tcp"', 'tcp_link="tpc"')],
+            r"does not fit its URDF: tcp_link names the link 'tpc', which the URDF lacks. Did you mean 'tcp'\?",
+        ),
+        ("my_robots.py", [('base_link="stand"', 'base_link="base"')], "the URDF's root is 'stand'; name that one"),
+        (
+            "my_robots.py",
+            [('"joint6"', '"joint7"')],
+            "arm_joints names 'joint7', which is not a moving joint .*'joint6'",
+        ),
+        ("my_robots.py", [('"joint5", "joint6"', '"joint6", "joint5"')], "name just these, in this order"),
+        ("my_robots.py", [("50.0, 50.0, 32.0", "50.0, 32.0")], "torque_limit has 5 numbers for 6 arm joints"),
+        ("my_robots.py", [("home_q=(0.0", "home_q=(9.0")], "home_q of joint1 is 9 rad; choose one within its limits"),
+        ("my_robots.py", [("max_width=0.10", "max_width=0.20")], "set max_width to twice its stroke"),
+        (
+            "my_robots.py",
+            [("urdf=", "task_scale=0.2,\n    urdf=")],
+            "pointing down, takes .* of 81 poses 0.07 to 0.13 m",
+        ),
+        ("my_robots.py", [("finger_depth=0.010", "finger_depth=0.050")], "correct finger_depth"),
+        (
+            "xarm6.urdf",
+            [('"prismatic"', '"revolute"')],
+            r"'gripper_left_joint' is revolute, a ParallelGripper has two prismatic joints; docs/robots.md",
+        ),
+        ("xarm6.urdf", [('name="joint2" type="revolute"', 'name="joint2" type="prismatic"')], "joints that turn"),
+        (
+            "xarm6.urdf",
+            [('type="revolute">', 'type="revolute"><dynamics friction="90"/>')],
+            "the friction of joint1 is 90",
+        ),
+        (
+            "xarm6.urdf",
+            [('type="revolute">', 'type="revolute"><dynamics damping="-1"/>')],
+            "'joint1' is -1; set it to 0",
+        ),
+    ],
+)
+def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
+    file: str,
+    changes: list[tuple[str, str]],
+    words: str,
+    folder: Path,
+    tmp_path: Path,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    edited(folder / file, *changes)
+    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
+    assert exit_code(*flags, program=generate_dataset_main) == 2
+    told = capfd.readouterr()
+    assert told.out == ""
+    assert re.fullmatch(rf"generate-dataset: The .*{words}.*: my_robots:xarm6.urdf\n", told.err)
+    assert not (tmp_path / "run").exists()
+
+
+def fixed_to_the_tool(origin: str) -> str:
+    """A tcp that is moved or turned against where the example has it."""
+    joint = f'<parent link="true"/><child link="tcp"/><origin {origin}/>'
+    return f'<link name="true"/><joint name="t" type="fixed">{joint}</joint>'
+
+
+@pytest.mark.parametrize(
+    ("origin", "words"),
+    [
+        ("0 0 -0.06", r"the finger tips are 0\.0\d\d m beyond tcp_link 'tcp', finger_depth is 0.01; move tcp_link by"),
+        ("0 0 0.1", r"the fingers end 0\.0\d\d m before tcp_link 'tcp'; place it between the finger tips"),
+    ],
+)
+def test_a_tcp_that_is_not_between_the_finger_tips_is_refused(
+    origin: str, words: str, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    moved = fixed_to_the_tool(f'xyz="{origin}"')
+    edited(folder / "xarm6.urdf", ('<child link="tcp"/>', '<child link="true"/>'), ("</robot>", f"{moved}</robot>"))
+    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
+    assert exit_code(*flags, program=generate_dataset_main) == 2
+    assert re.search(words, capfd.readouterr().err)
+    assert not (tmp_path / "run").exists()
+
+
+def test_fingers_that_move_along_x_of_the_tcp_are_refused(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    turn = fixed_to_the_tool('rpy="0 0 1.5708"')
+    edited(folder / "xarm6.urdf", ('<child link="tcp"/>', '<child link="true"/>'), ("</robot>", f"{turn}</robot>"))
+    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
+    assert exit_code(*flags, program=generate_dataset_main) == 2
+    assert "the fingers move along x of tcp_link 'tcp'; turn it about its z by 90 degrees" in capfd.readouterr().err
+
+
+def test_a_plug_in_of_gazebo_is_not_a_mesh_and_ros_names_lead_to_the_package(folder: Path, tmp_path: Path) -> None:
+    """As a vendor lays it out: my_arm_description/urdf/arm.urdf beside my_arm_description/meshes."""
+    from demorec.robots.assets import data_folder
+
+    package = tmp_path / "my_arm_description"
+    shutil.copytree(data_folder() / "xarm/xarm_description/meshes/xarm6", package / "meshes")
+    (package / "urdf").mkdir()
+    for name in ("my_robots.py", "xarm6.urdf"):
+        shutil.move(folder / name, package / "urdf" / name)
+    plugin = '<gazebo><plugin name="p" filename="libgazebo_ros_control.so"/></gazebo>'
+    edited(
+        package / "urdf" / "xarm6.urdf",
+        (
+            'mesh filename="xarm/xarm_description/meshes/xarm6/',
+            'mesh scale="1 1 1" filename=\'package://my_arm_description/meshes/',
+        ),
+        ('.obj"', ".obj'"),
+        ('.stl"', ".stl'"),
+        ("</robot>", f"<!-- <mesh filename='old.stl'/> -->{plugin}</robot>"),
+    )
+    os.chdir(package / "urdf")
+    config = GenerateConfig(robot=XARM6, cameras=())
+    before = deciding_versions(config)
+    options = RunOptions(out=tmp_path / "run", num_episodes=1, workers=1)
+    assert len(generate(config, options).run.successes) == 1
+    mesh = package / "meshes" / "visual" / "base.stl"
+    mesh.write_bytes(mesh.read_bytes() + b" ")
+    assert before != deciding_versions(config), "a mesh is part of the model"
 
 
 def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:

@@ -244,7 +244,7 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
         writer.finish(outcome)
     assert exit_code("replay", tmp_path / "e.mcap") == 1
     said = capsys.readouterr().err
-    assert "has 0 finger joints" in said
+    assert "the gripper has 0 joints, a ParallelGripper has 2" in said
     assert len([line for line in said.splitlines() if not line.startswith("Note: ")]) == 1
 
 

@@ -62,18 +62,19 @@ def test_the_documented_three_lines_test_the_documented_task(tmp_path: Path, mon
 
 
 SPEC = RobotContract.test_the_spec_names_what_the_urdf_has
+REACH = RobotContract.test_the_workspace_is_within_reach
 HOME = RobotContract.test_home_points_the_hand_down_with_the_fingers_across
 
 
 @pytest.mark.parametrize(
     ("change", "test", "words"),
     [
-        ({"tcp_link": "no_such_link"}, SPEC, "the URDF lacks no_such_link"),
+        ({"tcp_link": "no_such_link"}, SPEC, "tcp_link names the link 'no_such_link', which the URDF lacks"),
         ({"velocity_limit": (1.0, 2.0)}, SPEC, "velocity_limit has 2 numbers for 7 arm joints"),
-        ({"position_upper": (9.0,) * 7}, SPEC, "limits of panda_joint1"),
-        ({"home_q": (0.0,) * 7}, HOME, "at home_q is turned"),
+        ({"position_upper": (9.0,) * 7}, SPEC, "the limits of panda_joint1 are -2.8973 to 9 rad"),
+        ({"home_q": (0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0)}, HOME, "at home_q is turned"),
         ({"home_q": (0.5, -0.785, 0.0, -2.356, 0.0, 1.571, 1.285)}, HOME, "to the side"),
-        ({"position_upper": (0.0,) * 7}, RobotContract.test_the_workspace_is_within_reach, "out of reach"),
+        ({"position_upper": (2.8, -0.5, 2.8, -0.1, 2.8, 3.7, 2.8)}, REACH, "out of reach"),
     ],
 )
 def test_each_fault_of_a_robot_is_found(

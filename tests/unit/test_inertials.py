@@ -52,6 +52,7 @@ def test_models_of_pybullet_and_ours_say_what_they_weigh(model: str) -> None:
         arm(tool=inertial(mass="0")),  # as in franka_panda/panda.urdf
         arm(tool=inertial(mass="0", moments=("0", "0", "0"))),
         arm(arm="", tool=BOX + inertial()),  # one body of two links
+        arm(tool=BOX + inertial(mass="1e-9", moments=("0", "0", "0"))),  # as in SO-101's own URDF
     ],
 )
 def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
@@ -82,6 +83,8 @@ def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
             r"principal inertias of 5e\+03 to 5e\+03 kg m\^2 for 2 kg",
         ),
         (arm(arm=BOX, tool=BOX), "'arm' .*, 'tool' "),
+        (arm(arm="", tool=BOX + inertial(moments=("0", "0", "0"))), "'tool' .*smallest principal value is 0 kg"),
+        (arm(tool=BOX + inertial(moments=("0.01", "-0.01", "0.01"))), "'tool' .*smallest principal value is -0.01"),
     ],
 )
 def test_a_link_that_no_body_can_be_is_named(tmp_path: Path, text: str, sentence: str) -> None:

@@ -21,6 +21,7 @@ from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import Feature
 from demorec.mcap.description import robot_description, self_contained
+from demorec.robots.known_models import remember_model
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
 
@@ -185,6 +186,7 @@ def _described(text: str, path: Path | None) -> RobotFacts:
         name = parse_xml(text).get("name") or "robot"
         if path is not None:
             text = self_contained(text, path.parent)
+            remember_model(text, path)
     except (ValueError, SceneError) as error:
         raise ConfigError(f"The robot's URDF cannot be used ({describe_error(error)}){where}") from error
     moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")

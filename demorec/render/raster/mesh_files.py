@@ -6,10 +6,10 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.errors import RenderError, describe_error
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
+from demorec.robots.collada import read_collada
 from demorec.robots.obj import ObjMaterial, read_obj
 
 FORMATS = (".obj", ".stl", ".dae")
@@ -84,113 +84,6 @@ def load_stl(path: Path) -> RasterMesh:
 
 def load_collada(path: Path) -> RasterMesh:
     """The triangles and polygons of a COLLADA file, placed by the nodes of its scene, in metres."""
-    scene = _ColladaScene(ElementTree.parse(path).getroot())
-    if not scene.points:
-        raise ValueError("no visual scene with triangles")
-    corners = np.concatenate(scene.points)
-    corner_normals = np.concatenate(scene.normals)
-    complete = len(corner_normals) == len(corners)
-    return make_mesh(
-        corners,
-        np.arange(len(corners)).reshape(-1, 3),
-        normals=corner_normals.reshape(-1, 3, 3) if complete else None,
-    )
-
-
-class _ColladaScene:
-    """The triangles of the visual scenes of a COLLADA document.
-
-    Attributes:
-        points, normals: (3 n, 3) of the corners of each part's triangles; no normals where the part has none.
-    """
-
-    def __init__(self, root: ElementTree.Element) -> None:
-        self.points: list[Floats] = []
-        self.normals: list[Floats] = []
-        self._tag = root.tag.removesuffix("COLLADA")
-        self._by_id = {"#" + node.attrib["id"]: node for node in root.iter() if "id" in node.attrib}
-        asset = root.find(f"{self._tag}asset")
-        unit = None if asset is None else asset.find(f"{self._tag}unit")
-        scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
-        # PyBullet heeds the unit but not up_axis; shapes must lie as its physics has them.
-        axes = np.diag([scale, scale, scale, 1.0])
-        for scene in self._all_of(root, "visual_scene"):
-            for node in scene.findall(f"{self._tag}node"):
-                self._visit(node, axes)
-
-    def _all_of(self, node: ElementTree.Element, name: str) -> list[ElementTree.Element]:
-        return node.findall(f".//{self._tag}{name}")
-
-    def _visit(self, node: ElementTree.Element, matrix: Floats) -> None:
-        """Take in a node and all below it; (4, 4) is the transform of what the node hangs on."""
-        for child in node:
-            name = child.tag.removeprefix(self._tag)
-            if name in _TRANSFORMS:
-                matrix = matrix @ _transform(name, np.array((child.text or "").split(), dtype=np.float64))
-        for instance in node.findall(f"{self._tag}instance_geometry"):
-            for kind in ("triangles", "polylist", "polygons"):
-                for part in self._all_of(self._by_id[instance.attrib["url"]], kind):
-                    self._add(part, kind, matrix)
-        for child in node.findall(f"{self._tag}node"):
-            self._visit(child, matrix)
-
-    def _add(self, part: ElementTree.Element, kind: str, matrix: Floats) -> None:
-        inputs = {i.attrib["semantic"]: i for i in part.findall(f"{self._tag}input")}
-        stride = 1 + max(int(i.attrib.get("offset", 0)) for i in part.findall(f"{self._tag}input"))
-        index = self._fans(part, kind, stride)
-        if not len(index):
-            return
-        linear = matrix[:3, :3]
-        self.points.append(self._values(inputs["VERTEX"], index) @ linear.T + matrix[:3, 3])
-        if "NORMAL" in inputs:
-            self.normals.append(self._values(inputs["NORMAL"], index) @ np.linalg.inv(linear))
-        else:
-            self.normals.append(np.zeros((0, 3)))
-
-    def _fans(self, part: ElementTree.Element, kind: str, stride: int) -> NDArray[np.int64]:
-        """(3 n, stride) numbers of the inputs at the corners of a part's triangles, polygons being cut into fans."""
-        rows: list[NDArray[np.int64]] = [
-            np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride) for p in part.findall(f"{self._tag}p")
-        ]
-        if kind == "polylist":
-            counts = [int(v) for v in (part.findtext(f"{self._tag}vcount") or "").split()]
-            rows = np.split(rows[0], np.cumsum(counts)[:-1]) if rows and counts else []
-        elif kind == "triangles":
-            rows = list(rows[0].reshape(-1, 3, stride)) if rows else []
-        fans = [row[[0, i, i + 1]] for row in rows for i in range(1, len(row) - 1)]
-        return np.concatenate(fans) if fans else np.zeros((0, stride), dtype=np.int64)
-
-    def _values(self, source: ElementTree.Element, index: NDArray[np.int64]) -> Floats:
-        """(3 n, 3) what an input has at the corners."""
-        return self._resolve(source.attrib["source"])[index[:, int(source.attrib.get("offset", 0))]]
-
-    def _resolve(self, reference: str) -> Floats:
-        node = self._by_id[reference]
-        if node.tag == f"{self._tag}vertices":
-            position = next(i for i in node.findall(f"{self._tag}input") if i.attrib["semantic"] == "POSITION")
-            return self._resolve(position.attrib["source"])
-        array = node.find(f"{self._tag}float_array")
-        accessor = node.find(f".//{self._tag}accessor")
-        width = 3 if accessor is None else int(accessor.attrib.get("stride", 3))
-        values = [] if array is None or array.text is None else array.text.split()
-        return np.array(values, dtype=np.float64).reshape(-1, width)[:, :3]
-
-
-_TRANSFORMS = ("matrix", "translate", "scale", "rotate")
-
-
-def _transform(name: str, value: Floats) -> Floats:
-    """(4, 4) matrix of one COLLADA transform element."""
-    if name == "matrix":
-        return value.reshape(4, 4)
-    m = np.eye(4)
-    if name == "translate":
-        m[:3, 3] = value
-    elif name == "scale":
-        m[:3, :3] = np.diag(value)
-    else:
-        axis = value[:3] / np.sqrt((value[:3] ** 2).sum())
-        angle = np.radians(value[3])
-        cross = np.array([[0, -axis[2], axis[1]], [axis[2], 0, -axis[0]], [-axis[1], axis[0], 0]])
-        m[:3, :3] = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)
-    return m
+    points, normals = read_collada(path)
+    corner_normals = None if normals is None else normals.reshape(-1, 3, 3)
+    return make_mesh(points, np.arange(len(points)).reshape(-1, 3), normals=corner_normals)

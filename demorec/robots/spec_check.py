@@ -1,0 +1,144 @@
+"""Whether a robot's spec fits its URDF, judged from both texts before a simulator is started."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+
+from demorec.core.errors import SceneError
+from demorec.core.plain import listed
+from demorec.core.registry import nearest_match
+from demorec.robots.assets import asset_path
+from demorec.robots.robot import JawGripper, RobotSpec
+from demorec.robots.urdf import JointDynamics, Urdf, UrdfJoint, read_dynamics
+
+LIMIT_TOLERANCE = 1e-4
+"""How far a spec's position limit may be beyond the URDF's, rad or m: both are rounded."""
+_PER_ARM_JOINT = ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
+_MAX_NAMES = 30
+_LINKAGES = 'docs/robots.md, "Grippers with linkages", says what to do'
+
+
+def checked_urdf(spec: RobotSpec, *, scale: float = 1.0) -> Urdf:
+    """Read the URDF of a robot, and check that the spec fits it.
+
+    Args:
+        spec: The robot; its gripper's lengths are scaled already.
+        scale: Uniform scale of the URDF.
+
+    Raises:
+        SceneError: There is no such URDF, it cannot be read, or a robot like this cannot be simulated; says the first
+            reason and what to change.
+    """
+    path = asset_path(spec.urdf)
+    try:
+        text = path.read_text()
+        urdf, dynamics = Urdf.parse(text, scale=scale), read_dynamics(text)
+    except (OSError, ValueError) as error:
+        raise SceneError(f"The URDF of the robot {spec.name!r} cannot be used, since {error}: {spec.urdf}") from error
+    for problem in spec_problems(spec, urdf, dynamics):
+        raise SceneError(f"The robot {spec.name!r} does not fit its URDF: {problem}: {spec.urdf}")
+    return urdf
+
+
+def spec_problems(spec: RobotSpec, urdf: Urdf, dynamics: Mapping[str, JointDynamics]) -> Iterator[str]:
+    """What is wrong with a spec and what to change; each problem assumes that there were none before."""
+    yield from _unknown_names(spec, urdf)
+    yield from _wrong_counts(spec)
+    by_name = {joint.name: joint for joint in urdf.joints}
+    yield from _wrong_chain(spec, urdf)
+    yield from _gripper_joints(spec, [by_name[name] for name in spec.gripper.joints])
+    yield from _arm_limits(spec, [by_name[name] for name in spec.arm_joints])
+    yield from _stuck_joints(spec, dynamics)
+
+
+def _unknown_names(spec: RobotSpec, urdf: Urdf) -> Iterator[str]:
+    links = [urdf.root, *(joint.child for joint in urdf.joints)]
+    if spec.base_link != urdf.root:
+        yield f"base_link is {spec.base_link!r}, but the URDF's root is {urdf.root!r}; name that one"
+    named = [("tcp_link", spec.tcp_link), ("hand_link", spec.hand_link)]
+    named += [("finger_links", link) for link in spec.gripper.finger_links]
+    for field, name in named:
+        if name not in links:
+            yield f"{field} names the link {name!r}, which the URDF lacks.{_choices('links', name, links)}"
+    joints = [joint.name for joint in urdf.joints if joint.kind != "fixed"]
+    named = [("arm_joints", name) for name in spec.arm_joints] + [("joints", name) for name in spec.gripper.joints]
+    for field, name in named:
+        if name not in joints:
+            of = "the gripper's " if field == "joints" else ""
+            lacking = f"{of}{field} names {name!r}, which is not a moving joint of the URDF"
+            yield f"{lacking}.{_choices('moving joints', name, joints)}"
+
+
+def _choices(what: str, name: str, names: Iterable[str]) -> str:
+    names = sorted(names)
+    return f"{nearest_match(name, names)} Its {what} are {listed(names, _MAX_NAMES, ', ')}"
+
+
+def _wrong_counts(spec: RobotSpec) -> Iterator[str]:
+    for field in _PER_ARM_JOINT:
+        count = len(getattr(spec, field))
+        if count != len(spec.arm_joints):
+            yield f"{field} has {count} numbers for {len(spec.arm_joints)} arm joints; give one for each joint"
+    gripper, wanted = spec.gripper, 1 + len(spec.gripper.gear_ratios)
+    if len(gripper.joints) != wanted:
+        kind = type(gripper).__name__
+        yield f"the gripper has {len(gripper.joints)} joints, a {kind} has {wanted}; {_LINKAGES}"
+    if len(gripper.finger_links) != 2:
+        yield f"finger_links names {len(gripper.finger_links)} links; name the two that touch an object"
+
+
+def _wrong_chain(spec: RobotSpec, urdf: Urdf) -> Iterator[str]:
+    """The joints on the way to the TCP; then those on the way to the hand and to the fingers."""
+    chain = [joint.name for joint in urdf.path_to(spec.tcp_link) if joint.kind != "fixed"]
+    if chain != list(spec.arm_joints):
+        yield (
+            f"the joints that move tcp_link {spec.tcp_link!r} are {', '.join(chain) or 'none'}, but arm_joints is "
+            f"{', '.join(spec.arm_joints)}; name just these, in this order, or fix the others in the URDF"
+        )
+    if not urdf.path_to(spec.hand_link):
+        yield f"hand_link {spec.hand_link!r} is the root; name the link that carries the fingers"
+
+
+def _arm_limits(spec: RobotSpec, joints: list[UrdfJoint]) -> Iterator[str]:
+    rows = zip(joints, spec.position_lower, spec.position_upper, spec.home_q, strict=True)
+    for joint, low, high, home in rows:
+        if joint.kind not in ("revolute", "continuous"):
+            yield f"the arm joint {joint.name!r} is {joint.kind}; only joints that turn can be in arm_joints"
+        elif not joint.lower - LIMIT_TOLERANCE <= low < high <= joint.upper + LIMIT_TOLERANCE:
+            yield (
+                f"the limits of {joint.name} are {low:g} to {high:g} rad; give two that rise, within the URDF's "
+                f"{joint.lower:g} to {joint.upper:g}"
+            )
+        elif not low <= home <= high:
+            yield f"home_q of {joint.name} is {home:g} rad; choose one within its limits, {low:g} to {high:g}"
+
+
+def _gripper_joints(spec: RobotSpec, joints: list[UrdfJoint]) -> Iterator[str]:
+    gripper = spec.gripper
+    is_jaw = isinstance(gripper, JawGripper)
+    for joint in joints:
+        if (joint.kind == "prismatic") == is_jaw:
+            needs = "one joint that turns" if is_jaw else "two prismatic joints"
+            found = f"the gripper's joint {joint.name!r} is {joint.kind}"
+            yield f"{found}, a {type(gripper).__name__} has {needs}; {_LINKAGES}"
+    if isinstance(gripper, JawGripper):
+        needed = [position for position, _ in gripper.opening]
+    else:
+        needed = [0.0, float(gripper.joint_position(gripper.max_width)[0])]
+    low, high = min(needed), max(needed)
+    for joint in joints:
+        if low < joint.lower - LIMIT_TOLERANCE or high > joint.upper + LIMIT_TOLERANCE:
+            fix = "shorten the table" if is_jaw else "set max_width to twice its stroke, and turn an axis that closes"
+            yield (
+                f"the opening of the gripper moves {joint.name} from {low:g} to {high:g}, the URDF allows "
+                f"{joint.lower:g} to {joint.upper:g}; {fix}"
+            )
+
+
+def _stuck_joints(spec: RobotSpec, dynamics: Mapping[str, JointDynamics]) -> Iterator[str]:
+    forces = [spec.gripper.force] * len(spec.gripper.joints)
+    for name, limit in zip(spec.joint_names, (*spec.torque_limit, *forces), strict=True):
+        friction = dynamics.get(name, JointDynamics()).friction
+        if friction >= limit:
+            field = "torque_limit" if name in spec.arm_joints else "the gripper's force"
+            yield f"the friction of {name} is {friction:g}, more than {field}, {limit:g}, leaves; correct one of them"

@@ -1,0 +1,141 @@
+"""Whether a robot of the user's own can do what tasks ask of it, as far as a second of computing tells."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.geometry import Array
+from demorec.episode.scene import Physics, RobotPlacement
+from demorec.robots.inertials import check_masses
+from demorec.robots.robot import ParallelGripper, RobotSpec
+from demorec.robots.spec_check import checked_urdf
+from demorec.sim.arm import Arm, arm_kinematics
+from demorec.sim.client import connect
+from demorec.tasks.grasping import hand_down, symmetric_yaws
+
+_WORKSPACE = ((0.35, 0.5, 0.65), (-0.25, 0.0, 0.25), (0.02, 0.15, 0.22), (-0.8, 0.0, 0.8))
+"""x, y and z of the TCP, metres, and yaws of the hand, rad."""
+NUM_POSES = math.prod(map(len, _WORKSPACE))
+MAX_UNREACHABLE_RATIO = 0.5
+"""Layouts that are out of reach are drawn again, which succeeds as long as most are within it."""
+MAX_DEPTH_ERROR_M = 0.01
+"""How far finger tips may be from where finger_depth says: a grasp of a 3 cm cube misses beyond it."""
+
+
+class FingerBoxes(NamedTuple):
+    """Boxes of the fingers along the axes of the TCP, the hand as far open as tasks open it.
+
+    PyBullet's boxes are some millimetres too large.
+
+    Attributes:
+        low, high: (n, 3) their corners, metres.
+    """
+
+    low: Array
+    high: Array
+
+    @property
+    def centres(self) -> Array:
+        """(n, 3) metres."""
+        return (self.low + self.high) / 2
+
+    @property
+    def depth(self) -> float:
+        """How far the tips are beyond the TCP, metres."""
+        return float(self.high[:, 2].max())
+
+
+def check_robot(spec: RobotSpec, *, uses_workspace: bool) -> None:
+    """Check a robot before anything is made with it.
+
+    Args:
+        spec: The robot.
+        uses_workspace: Whether objects will be placed all over the workspace of the included tasks.
+
+    Raises:
+        ConfigError: The spec does not fit the URDF, a link does not say what it weighs, the TCP is not between the
+            finger tips, or most of the workspace is out of reach; says what to change.
+        SceneError: A mesh of the URDF is missing or cannot be loaded.
+    """
+    try:
+        checked_urdf(spec)
+    except SceneError as error:  # of a recording it says that the data are damaged, here that the request is wrong
+        raise ConfigError(str(error)) from error
+    check_masses(spec.urdf)
+    if problem := finger_problem(spec, finger_boxes(spec)):
+        raise ConfigError(f"The TCP of the robot {spec.name!r} is not where tasks need it: {problem}: {spec.urdf}")
+    if uses_workspace and (problem := reach_problem(spec)):
+        raise ConfigError(f"The robot {spec.name!r} does not reach what tasks place: {problem}: {spec.urdf}")
+
+
+def unreachable_poses(spec: RobotSpec) -> tuple[str, ...]:
+    """Say which of the poses of the workspace, `NUM_POSES` of them, the hand cannot take, and why not.
+
+    It points down at one of a grasp's two yaws, wherever tasks put objects, up to 22 cm above the table.
+    """
+    arm, home = arm_kinematics(spec), np.array(spec.home_q)
+    found = []
+    for x, y, z, yaw in itertools.product(*_WORKSPACE):
+        poses = [hand_down(spec.task_scale * np.array([x, y, z]), either) for either in symmetric_yaws(yaw, 2)]
+        rest = arm.turned_towards(home, poses[0].position)
+        why = [arm.why_unreachable(wanted, start=rest, rest=rest) for wanted in poses]
+        if all(why):
+            found.append(f"{poses[0].position.round(3).tolist()} m at yaw {yaw} is out of reach: {why[0]}")
+    return tuple(found)
+
+
+def reach_problem(spec: RobotSpec) -> str:
+    """What to change where most of the workspace is out of reach; "" for nothing."""
+    unreachable = unreachable_poses(spec)
+    if len(unreachable) <= MAX_UNREACHABLE_RATIO * NUM_POSES:
+        return ""
+    near, far, side = (spec.task_scale * value for value in (0.35, 0.65, 0.25))
+    return (
+        f"the hand, pointing down, takes {NUM_POSES - len(unreachable)} of {NUM_POSES} poses {near:.2f} to {far:.2f} m "
+        f"ahead of base_link and {side:.2f} m to both sides (with task_scale={spec.task_scale:g}), for instance "
+        f"{unreachable[0]}; choose another task_scale, or a base_link that is farther from the arm or nearer to it"
+    )
+
+
+def finger_boxes(spec: RobotSpec) -> FingerBoxes:
+    """Measure the fingers in the simulator."""
+    home = np.array(spec.home_q)
+    placement = RobotPlacement(
+        name=spec.name,
+        world_from_base=arm_kinematics(spec).forward(home).inverse(),  # so that the TCP is the world's frame
+        joint_position=spec.home_q,
+        gripper_width=spec.gripper.open_width,
+    )
+    client = connect()
+    try:
+        arm = Arm(client, spec, placement, finger_stiffness=Physics().finger_stiffness)
+        client.performCollisionDetection()
+        boxes = np.array([client.getAABB(arm.body, link) for link in arm.finger_links])
+    finally:
+        client.disconnect()
+    return FingerBoxes(low=boxes[:, 0], high=boxes[:, 1])
+
+
+def finger_problem(spec: RobotSpec, fingers: FingerBoxes) -> str:
+    """What is grossly wrong about the TCP, and what to change; "" for nothing."""
+    gripper = spec.gripper
+    across = np.abs(fingers.centres)
+    if isinstance(gripper, ParallelGripper) and (across[:, 0] > across[:, 1]).any():
+        return f"the fingers move along x of tcp_link {spec.tcp_link!r}; turn it about its z by 90 degrees"
+    error = fingers.depth - gripper.finger_depth
+    if abs(error) <= MAX_DEPTH_ERROR_M:
+        return ""
+    if fingers.depth <= 0:
+        return (
+            f"the fingers end {-fingers.depth:.3f} m before tcp_link {spec.tcp_link!r}; place it between the finger "
+            "tips, its z axis out of the hand"
+        )
+    return (
+        f"the finger tips are {fingers.depth:.3f} m beyond tcp_link {spec.tcp_link!r}, finger_depth is "
+        f"{gripper.finger_depth:g}; move tcp_link by {error:.3f} m along its z axis, or correct finger_depth"
+    )
