@@ -213,7 +213,17 @@ def _write(
     frames = ({name: values[row] for name, values in columns.features.items()} for row in rows)
     images = {camera.name: _images(recording, camera) for camera in info.cameras}
     leads = {camera.name: int(columns.images[camera.name][0]) for camera in info.cameras if camera.kept}
-    write_frames(folder, info, frames, images, outcome=recording.outcome, video=video, leads=leads, subtasks=subtasks)
+    write_frames(
+        folder,
+        info,
+        frames,
+        images,
+        outcome=recording.outcome,
+        video=video,
+        leads=leads,
+        subtasks=subtasks,
+        times_ns=recording.measured_ns,
+    )
     return True
 
 

@@ -143,8 +143,9 @@ def write_frames(
     video: VideoConfig,
     leads: Mapping[str, int] | None = None,
     subtasks: Mapping[int, str] | None = None,
+    times_ns: NDArray[np.int64] | None = None,
 ) -> None:
-    """Record an episode of a run at `info.fps`: whole, or not at all.
+    """Record an episode of a run: whole, or not at all.
 
     Args:
         folder: The run.
@@ -155,6 +156,7 @@ def write_frames(
         video: How pixels are encoded.
         leads: Camera -> how many of its images come before the first frame; 0 where not given.
         subtasks: Frame -> what the robot begins to do with it.
+        times_ns: (T,) stamps of the frames, behind the images that come before them; None for `info.fps`.
 
     Raises:
         ConfigError: The run holds episodes of another kind.
@@ -171,7 +173,10 @@ def write_frames(
                 writer.image(name, frame_time_ns(number, info.fps), next(images[name]))
         count = 0
         for vectors in frames:
-            time_ns = frame_time_ns(begin + count, info.fps)
+            if times_ns is None:
+                time_ns = frame_time_ns(begin + count, info.fps)
+            else:
+                time_ns = frame_time_ns(begin, info.fps) + int(times_ns[count])
             shown = {name: writer.image(name, time_ns, next(stream)) for name, stream in images.items()}
             samples = {name: Sample(stamp_ns=time_ns, vector=vector) for name, vector in vectors.items()}
             subtask = (subtasks or {}).get(count, "")

@@ -130,7 +130,7 @@ class DatasetRecording:
         return rows
 
     @cached_property
-    def _measured_ns(self) -> NDArray[np.int64] | None:
+    def measured_ns(self) -> NDArray[np.int64] | None:
         """(T,) stamps of rows whose timestamps were measured; None for multiples of 1/fps."""
         seconds, fps = self._rows["timestamp"][:, 0].astype(np.float64), int(self.dataset.info.fps)
         if (np.abs(seconds - np.arange(self.num_frames) / fps) <= TIME_TOLERANCE_S).all():
@@ -168,8 +168,8 @@ class DatasetRecording:
         leads = {name: self._lead(name) for name in self.dataset.keys}
         begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
         times = np.array([frame_time_ns(index, fps) for index in range(begin + self.num_frames)], dtype=np.int64)
-        if self._measured_ns is not None:  # behind the images that come before the first frame
-            times[begin:] = self._measured_ns + times[begin]
+        if self.measured_ns is not None:  # behind the images that come before the first frame
+            times[begin:] = self.measured_ns + times[begin]
         features = {item.name: self._rows[item.name].astype(item.dtype) for item in self.dataset.features}
         return Table(
             time_ns=times[begin:],
