@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Form
 from demorec.check.episode import CheckedEpisode
-from demorec.check.evidence import Motions, motion_vector, motions_of_dataset
+from demorec.check.evidence import Motion, motion_vector, motions_of_dataset
 from demorec.check.films import CameraFilms, films_of_dataset
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.core.geometry import Array
@@ -123,18 +123,9 @@ class CheckedDataset:
         return rows
 
     @cached_property
-    def motions(self) -> Motions:
+    def motions(self) -> list[Motion]:
         """The motions of its episodes."""
-        arms = self._arms
-        found = motions_of_dataset(
-            self.info,
-            self.roles,
-            list(self.rows.values()),
-            {position: arms[number] for position, number in enumerate(self.rows) if number in arms},
-            self.urdf,
-        )
-        numbered = zip(self.rows, found, strict=False)
-        return Motions([replace(motion, where=f"episode {number}") for number, motion in numbered])
+        return list(motions_of_dataset(self.info, self.roles, self.rows, self._arms, self.urdf))
 
     @property
     def _arms(self) -> dict[int, DatasetRobot]:
@@ -163,12 +154,11 @@ class CheckedDataset:
         """The rows that demorec keeps of each episode; empty for a dataset of another writer."""
         return self.folder.sidecar([name for name in EPISODE_SCHEMA.names if name != "episode_index"])
 
-    def courses(self) -> tuple[list[str], list[Array]]:
-        """Names of the episodes and their motions."""
+    def courses(self) -> dict[str, Array]:
+        """Name of each episode -> its motion."""
         state = self.roles.state
         rows = self.rows if state else {}
-        motions = [motion_vector(np.hstack([each[part] for part in state])) for each in rows.values()]
-        return [f"episode {number}" for number in rows], motions
+        return {f"episode {n}": motion_vector(np.hstack([each[part] for part in state])) for n, each in rows.items()}
 
     def check_simulated(self) -> None:
         """Raise ConfigError for a dataset of external episodes, which no simulator can make or replay."""

@@ -24,14 +24,15 @@ MAX_DISTANCE = 1e-4
 )
 def duplicates(subject: CheckedRun | CheckedDataset) -> Found:
     """Compare the states of all episodes at 32 moments each."""
-    names, motions = subject.courses()
-    if len(names) < 2:
+    motions = subject.courses()
+    if len(motions) < 2:
         return NotMeasured(why="it needs two episodes")
     if subject.has_equal_starts:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    copies = _copies(motions)
-    detail = f"{len(names)} different motions"
+    copies = _copies(list(motions.values()))
+    detail = f"{len(motions)} different motions"
     if copies:
+        names = list(motions)
         later, earlier = min(copies.items())
         detail = f"{names[later]} is like {names[earlier]}"
     return Measurement(value=len(copies), detail=detail)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Form
-from demorec.check.evidence import Motion, Motions, motion_of_features, motion_of_simulated
+from demorec.check.evidence import Motion, motion_of_features, motion_of_simulated
 from demorec.check.films import CameraFilms, film_of_recording
 from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError
@@ -95,19 +95,16 @@ class CheckedEpisode(ExitStack):
         return self.enter_context(closing(Container(self.path)))
 
     @cached_property
-    def motions(self) -> Motions:
+    def motions(self) -> list[Motion]:
         """The one of its robot, if it has a state."""
-        motion = self._motion()
-        return Motions([] if motion is None else [motion])
-
-    def _motion(self) -> Motion | None:
         info = self.info
         if self.form == "external":
             table, urdf = self.table, self._named_urdf or info.urdf
-            return motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns, named=self._named)
+            motion = motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns, named=self._named)
+            return [] if motion is None else [motion]
         if not self.num_frames:
-            return None
-        return motion_of_simulated(info, self.recording.trajectory(), Urdf.parse(self.recording.description()))
+            return []
+        return [motion_of_simulated(info, self.recording.trajectory(), Urdf.parse(self.recording.description()))]
 
     def numbers(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """(name, (T, ...) table) of all floating-point numbers."""

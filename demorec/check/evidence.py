@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -31,9 +30,6 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 MIN_FRAMES = 30
 """Frames below which an episode is too short to judge its lag or its kinematics."""
-MIN_TARGET_CORRELATION = 0.5
-"""Correlation with its own element above which an action is a target of the state: at least 0.97 in demonstrations of
-Panda and iiwa, where increments and poses have at most 0.3."""
 MIN_RANGE = 1e-3
 """Range, rad or m, below which an element does not move."""
 
@@ -80,55 +76,6 @@ class Motion:
     def joint_position(self) -> dict[str, Array]:
         """Joint of the URDF -> (T,)."""
         return {joint: column for joint, column in zip(self.joints, self.state.T, strict=False) if joint}
-
-
-class Motions:
-    """All motions of a dataset, or the one of a recording.
-
-    Attributes:
-        all: Of every episode that has a state.
-    """
-
-    def __init__(self, motions: Sequence[Motion]) -> None:
-        self.all = motions
-
-    @cached_property
-    def moving(self) -> Flags:
-        """(D,) elements that have an action, and of which state and action change in some episode."""
-        moves = [
-            (_range(motion.state) > MIN_RANGE) & (_range(motion.action) > MIN_RANGE)
-            for motion in self.all
-            if motion.action is not None
-        ]
-        return np.asarray(np.any(moves, axis=0)) if moves else np.zeros(0, dtype=np.bool_)
-
-    @cached_property
-    def targets(self) -> list[tuple[Array, Array]]:
-        """(T, K) states and actions of each episode, of the K elements that have an action and move.
-
-        They are without gaps, less their means, and in units of the state's deviation. Empty where the action is not a
-        target of the state.
-        """
-        kept = self.moving
-        found = []
-        for motion in self.all if kept.any() else ():
-            if motion.action is not None and len(motion.state) >= MIN_FRAMES:
-                state = without_gaps(motion.state[:, kept])
-                action = without_gaps(motion.action[:, kept])
-                deviation = np.maximum(state.std(axis=0), MIN_RANGE)
-                found.append(((state - state.mean(axis=0)) / deviation, (action - action.mean(axis=0)) / deviation))
-        if not found:
-            return []
-        states = np.concatenate([state for state, _ in found])
-        actions = np.concatenate([action for _, action in found])
-        sizes = np.sqrt((states**2).sum(axis=0) * (actions**2).sum(axis=0))
-        correlations = (states * actions).sum(axis=0) / np.maximum(sizes, 1e-12)
-        return found if float(np.median(correlations)) > MIN_TARGET_CORRELATION else []
-
-
-def _range(values: Array) -> Array:
-    """(D,) range of each column of (T, D); 0 for one without numbers."""
-    return np.asarray(np.ptp(np.nan_to_num(without_gaps(values)), axis=0))
 
 
 def without_gaps(values: Array) -> Array:
@@ -222,7 +169,7 @@ def motion_of_features(
 def motions_of_dataset(
     info: DatasetInfo,
     roles: Roles,
-    rows_of: Sequence[Mapping[str, NDArray[Any]]],
+    rows_of: Mapping[int, Mapping[str, NDArray[Any]]],
     robots: Mapping[int, DatasetRobot],
     urdf: str,
 ) -> Iterator[Motion]:
@@ -231,7 +178,7 @@ def motions_of_dataset(
         return
     described = {name: Feature(name=name, names=item.elements) for name, item in roles.columns.items() if item.elements}
     unnamed: _Arm | None = None  # recognising a robot takes time
-    for number, rows in enumerate(rows_of):
+    for number, rows in rows_of.items():
         robot = robots.get(number)
         where = f"episode {number}"
         if robot is None:

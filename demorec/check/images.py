@@ -49,7 +49,7 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
 
     Cameras that show the same in many other moving frames do not see the robot, and are not judged.
     """
-    motions = {motion.where: motion for motion in subject.motions.all}
+    motions = {motion.where: motion for motion in subject.motions}
     for camera, (films, _) in subject.films.items():
         found: list[Found] = []
         blind = others = 0

@@ -42,7 +42,7 @@ def forward_kinematics(subject: Episodes) -> Iterator[Found]:
     Catches exchanged joints, other units and orders of a quaternion, and joint offsets. Where it is not known which
     link the pose is of, a fixed base, a fixed tool and the robot's size are fitted to each episode.
     """
-    motions = subject.motions.all
+    motions = subject.motions
     every = max(1, len(motions) // MAX_FITTED_EPISODES)
     for number, motion in enumerate(motions):
         if motion.ee_pose is None or motion.urdf is None:

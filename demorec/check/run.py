@@ -80,21 +80,19 @@ class CheckedRun:
         """Whether every episode starts alike because that was asked for."""
         return self.form == "run" and self.run.config.fixed
 
-    def courses(self) -> tuple[list[str], list[Array]]:
-        """Names of the recordings in episodes/ that can be read and have a state, and their motions."""
-        motions = dict(self._motions())
-        return list(motions), list(motions.values())
-
-    def _motions(self) -> Iterator[tuple[str, Array]]:
+    def courses(self) -> dict[str, Array]:
+        """Name of each recording in episodes/ that can be read and has a state -> its motion."""
+        found: dict[str, Array] = {}
         for path in sorted((self.path / EPISODES).glob("*.mcap")):
             try:
                 with open_recording(path) as recording:
                     features = recording.table().features
                     state = roles_of_recording(recording.info, self._named).state
                     if state:
-                        yield path.name, motion_vector(np.hstack([features[part] for part in state]))
+                        found[path.name] = motion_vector(np.hstack([features[part] for part in state]))
             except (RecordingError, OSError):
                 continue  # reported by the checks of that recording
+        return found
 
 
 @run_check(measures="files missing, changed since they were made, or not in run.json", on=_ANY_RUN, needs="a run")

@@ -243,7 +243,7 @@ def dataset_demonstrations(
     if bad := [problem for number, problem in dataset.unreadable.items() if wanted(number)]:
         raise ExportError(f"{bad[0]}, in {path}")
     if options.robot is not None:
-        for number, motion in zip(dataset.rows, dataset.motions.all, strict=False):
+        for number, motion in zip(dataset.rows, dataset.motions, strict=False):
             if not wanted(number):
                 continue
             name = f"{path.name}_episode_{number:06d}"

@@ -19,7 +19,7 @@ from demorec.core.files import Closing, sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import EpisodeSlice, Plan
-from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter, StoredBoxes
+from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -120,11 +120,7 @@ class Beside(Closing):
         self._poses = [IndexedRows(source.sidecar_tables("camera_poses"), rows=_ROWS_AT_ONCE) for source in with_poses]
         self._boxes = BoxWriter(folder, fps=plan.info.fps)
         self._stored_boxes = [
-            {
-                name: StoredBoxes(path, [place.from_index for place in source.places])
-                for name, mapping in mappings.items()
-                if (path := source.root / BOXES_DIR / f"{mapping.feature}.json").is_file()
-            }
+            {name: boxes for name, mapping in mappings.items() if (boxes := source.boxes(mapping.feature)) is not None}
             for source, mappings in zip(plan.sources, plan.mappings, strict=True)
         ]
 

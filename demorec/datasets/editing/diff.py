@@ -15,7 +15,7 @@ from demorec.datasets.editing.compare import LEVELS, DiffEntry, EpisodeComparer,
 from demorec.datasets.editing.content import TASK, ContentReader, EpisodeContent, Shared, matched
 from demorec.datasets.editing.episode_records import episode_columns, episode_facts
 from demorec.datasets.editing.statistics import episode_statistics_differences, renamed, statistics_differences
-from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera, StoredBoxes
+from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.options import ProgressCallback
@@ -239,20 +239,15 @@ def _facts(
 def _boxes(sources: Folders, shared: Shared, pairs: Mapping[int, int]) -> Iterator[DiffEntry]:
     """What stands in the files of boxes about episodes of one length."""
     for name in shared.cameras:
-        paths = [source.root / BOXES_DIR / f"{shared.own(side, name)}.json" for side, source in enumerate(sources)]
-        there = [path.is_file() for path in paths]
-        if there[0] != there[1]:
-            text = f"boxes of {name} are not in {'BA'[there[1]]}"
+        one, other = (source.boxes(shared.own(side, name)) for side, source in enumerate(sources))
+        if (one is None) != (other is None):
+            text = f"boxes of {name} are not in {'AB'[other is None]}"
             yield DiffEntry(level="features", name=f"boxes of {name}", text=text)
-        if not all(there):
+        if one is None or other is None:
             continue
-        files = [
-            StoredBoxes(path, [place.from_index for place in source.places])
-            for path, source in zip(paths, sources, strict=True)
-        ]
         for n, m in pairs.items():
             lengths = [source.places[number].length for source, number in zip(sources, (n, m), strict=True)]
-            seen = [file.read(number, 0, lengths[0]) for file, number in zip(files, (n, m), strict=True)]
+            seen = [one.read(n, 0, lengths[0]), other.read(m, 0, lengths[0])]
             if lengths[0] == lengths[1] and seen[0] != seen[1]:
                 frames = [frame for frame in range(lengths[0]) if _seen_at(seen[0], frame) != _seen_at(seen[1], frame)]
                 where = f" in {len(frames)} of {lengths[0]} frames, first in frame {frames[0]}" if frames else ""

@@ -17,32 +17,10 @@ from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
-
-
 SeenByCamera = tuple[int, int, tuple[BoxEntry, ...]]
 """Width and height of a camera's images in an episode, px, and what is seen in them, row by row."""
-
-
-ReadBox = tuple[int, str, tuple[float, float, float, float]]
-"""`index` of the row in the dataset, name of the body, (x, y, width, height) px."""
-
-
-def read_boxes(path: Path) -> Iterator[ReadBox]:
-    """What is in a file of ours, line by line, so that it may be as large as it likes.
-
-    Raises:
-        ExportError: It is missing, or no such file.
-    """
-    with _box_errors(path), open_regular(path) as file:
-        for raw in file:
-            line = _line(raw)
-            if line == "]":
-                return
-            if line.startswith('{"id"'):
-                item = parse_json(line)
-                x, y, width, height = (float(number) for number in item["bbox"])
-                yield int(item["image_id"]), str(item["object"]), (x, y, width, height)
-        raise ValueError("its end is missing")
+Box = tuple[int, str, tuple[float, float, float, float]]
+"""Frame, name of the body, (x, y, width, height) px."""
 
 
 def _line(raw: bytes) -> str:
@@ -109,6 +87,14 @@ class StoredBoxes:
                     del item["id"]
                     kept.append((row, noun, item))
         return width, height, tuple(kept)
+
+    def drawn(self, episode: int, num_frames: int) -> Iterator[Box]:
+        """Yield every box of an episode, frame by frame."""
+        seen = self.read(episode, 0, num_frames)
+        for frame, _, values in () if seen is None else seen[2]:
+            with _box_errors(self._path):
+                x, y, width, height = (float(number) for number in values["bbox"])
+                yield frame, str(values["object"]), (x, y, width, height)
 
 
 class BoxWriter(Closing):

@@ -31,6 +31,7 @@ from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 # What reads videos, images, robots and the sidecar takes longer to load than to read the numbers of most datasets.
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.attempts import Attempts
+    from demorec.datasets.lerobot.boxes import StoredBoxes
     from demorec.datasets.lerobot.robots import DatasetRobot
     from demorec.datasets.lerobot.stored_images import StoredImages
     from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
@@ -70,6 +71,7 @@ class LeRobotFolder:
         self.open_video = lru_cache(maxsize=_MAX_OPEN_VIDEOS)(self._video_file)
         self._cameras: dict[str, Camera] = {}
         self._robots: dict[str, DatasetRobot] = {}
+        self._boxes: dict[str, StoredBoxes | None] = {}
 
     def _video_file(self, path: Path) -> VideoFile:
         from demorec.datasets.lerobot.videos import VideoFile
@@ -192,6 +194,16 @@ class LeRobotFolder:
         from demorec.datasets.lerobot.attempts import Attempts
 
         return Attempts(self.sidecar_tables("attempts"))
+
+    def boxes(self, key: str) -> StoredBoxes | None:
+        """Open the boxes of a camera feature; None if the dataset has none."""
+        from demorec.datasets.lerobot.boxes import BOXES_DIR, StoredBoxes
+
+        if key not in self._boxes:
+            path = self.root / BOXES_DIR / f"{key}.json"
+            starts = [place.from_index for place in self.places]
+            self._boxes[key] = StoredBoxes(path, starts) if path.is_file() else None
+        return self._boxes[key]
 
     @cached_property
     def fact_types(self) -> Mapping[str, pa.DataType]:

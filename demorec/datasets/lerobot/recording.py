@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
-from demorec.datasets.lerobot.boxes import BOXES_DIR, ReadBox, read_boxes
+from demorec.datasets.lerobot.boxes import Box
 from demorec.datasets.lerobot.episode_table import TIME_TOLERANCE_S
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
@@ -53,7 +53,7 @@ class DatasetRecording:
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         self.place = place = dataset.places[number]
-        self.path, self.dataset = dataset.root, dataset
+        self.path, self.dataset, self._number = dataset.root, dataset, number
         self.num_frames = place.length
         self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
         is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
@@ -259,12 +259,10 @@ class DatasetRecording:
                 texts[round(frame)] = text
         return texts, left_out
 
-    def boxes(self, camera: str) -> Iterator[ReadBox]:
-        """What a camera sees, with frames in place of rows, of a dataset with boxes beside it."""
-        path = self.path / BOXES_DIR / f"{self.dataset.keys[camera]}.json"
-        for index, name, box in read_boxes(path) if path.exists() else ():
-            if 0 <= (frame := index - self.place.from_index) < self.num_frames:
-                yield frame, name, box
+    def boxes(self, camera: str) -> Iterator[Box]:
+        """What a camera sees, frame by frame, of a dataset with boxes beside it."""
+        stored = self.dataset.boxes(self.dataset.keys[camera])
+        return iter(()) if stored is None else stored.drawn(self._number, self.num_frames)
 
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
