@@ -22,7 +22,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.check.rows import matrices
+from demorec.check.kinematics import matrices
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array

@@ -213,7 +213,7 @@ def check(
     return wrap
 
 
-file_check = partial(check, group="file")
+file_check = partial(check, group="file", on=("simulated", "external"), needs="a recording")
 time_check = partial(check, group="time")
 external_check = partial(check, on=("external",), needs="own timestamps of each sample")
 run_check = partial(check, group="run", on=("run",), needs="a run of simulated episodes")
@@ -235,12 +235,12 @@ def worst(*found: Found) -> Found:
     return replace(largest, detail="; ".join([largest.detail, *(f"not measured: {why}" for why in reasons)]))
 
 
-def worst_frame(error: Array, detail: str = "", *, first: int = 0) -> Measurement | None:
-    """The largest of (T,) values and its frame, the first of which is `first`; None without a value that is not NaN."""
+def worst_frame(error: Array, detail: str) -> Measurement | None:
+    """The largest of (T,) values and its frame; None without a value that is not NaN."""
     if not np.isfinite(error).any():
         return None
-    row = int(np.nanargmax(error))
-    return Measurement(value=float(error[row]), frame=row + first, detail=detail)
+    frame = int(np.nanargmax(error))
+    return Measurement(value=float(error[frame]), frame=frame, detail=detail)
 
 
 def counted(wrong: Sequence[str], good: str = "") -> Measurement:

@@ -87,11 +87,6 @@ class CheckedDataset:
         return self.folder.info
 
     @property
-    def places(self) -> tuple[EpisodePlace, ...]:
-        """The episodes' table, whatever info.json counts."""
-        return self.folder.listed
-
-    @property
     def rows(self) -> Mapping[int, Rows]:
         """Number of an episode -> feature -> (T, D), of the episodes whose rows can be read."""
         return self._rows_and_errors[0]
@@ -106,7 +101,7 @@ class CheckedDataset:
         reader = self.folder.rows(self.folder.columns)
         rows: dict[int, Rows] = {}
         errors: dict[int, str] = {}
-        for number, place in enumerate(self.places):
+        for number, place in enumerate(self.folder.listed):
             problems: list[str] = []
             with noted(problems, self.path):
                 rows[number] = self._usable(place, reader.numbers(place))
@@ -131,7 +126,7 @@ class CheckedDataset:
     def _arms(self) -> dict[int, DatasetRobot]:
         """Episode -> its arm, where the sidecar has it or the user has named its servos."""
         if self.motors is not None and self.roles.elements(self.roles.state) == self.motors.names:
-            return dict.fromkeys(range(len(self.places)), robot_of_motors(self.motors))
+            return dict.fromkeys(range(len(self.folder.listed)), robot_of_motors(self.motors))
         named = {row["episode_index"]: row["robot_digest"] for row in self.sidecar if row["robot_digest"]}
         return {number: self.folder.robot(digest) for number, digest in named.items()}
 
@@ -173,7 +168,7 @@ class CheckedDataset:
             DescribedEpisode(
                 number=number,
                 rows=self.rows[number],
-                tasks=self.places[number].tasks,
+                tasks=self.folder.listed[number].tasks,
                 kept=row,
                 info=self._info_of(row),
             )

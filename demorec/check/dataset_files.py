@@ -34,7 +34,7 @@ _RATE_TOLERANCE = 0.01
 def dataset_readable(dataset: CheckedDataset) -> Measurement:
     """Read info.json, the tables and every row."""
     tasks = dataset.folder.tasks
-    frames = sum(dataset.places[number].length for number in dataset.rows)
+    frames = sum(dataset.folder.listed[number].length for number in dataset.rows)
     good = f"{len(dataset.rows)} episodes, {frames} frames, {len(tasks)} tasks"
     return counted(list(dict.fromkeys(dataset.unreadable.values())), good)
 
@@ -44,13 +44,13 @@ def dataset_counts(dataset: CheckedDataset) -> Measurement:
     """Compare totals with the tables; indices count up without a gap, timestamps are frame_index / fps."""
     info, tasks, wrong = dataset.info, dataset.folder.tasks, []
     totals = {
-        "total_episodes": (info.total_episodes, len(dataset.places)),
-        "total_frames": (info.total_frames, sum(place.length for place in dataset.places)),
+        "total_episodes": (info.total_episodes, len(dataset.folder.listed)),
+        "total_frames": (info.total_frames, sum(place.length for place in dataset.folder.listed)),
         "total_tasks": (info.total_tasks, len(tasks)),
     }
     wrong += [f"{name} is {said}, found {found}" for name, (said, found) in totals.items() if said != found]
     start = 0
-    for number, place in enumerate(dataset.places):
+    for number, place in enumerate(dataset.folder.listed):
         rows = dataset.rows.get(number)
         if place.episode_index != number or place.from_index != start:
             wrong.append(f"the place of episode {number}")
@@ -110,7 +110,7 @@ def dataset_strays(dataset: CheckedDataset) -> Measurement | None:
     """Find mp4 files without an episode, as merges, deleted episodes and renamed cameras leave them."""
     if dataset.info.is_old:
         return None
-    used = {path for place in dataset.places for path, _ in place.videos.values()}
+    used = {path for place in dataset.folder.listed for path, _ in place.videos.values()}
     found = sorted(set((dataset.path / "videos").rglob("*.mp4")) - used)
     return counted([path.relative_to(dataset.path).as_posix() for path in found])
 
@@ -126,7 +126,7 @@ def dataset_videos(dataset: CheckedDataset) -> Measurement | None:
     wrong: list[str] = []
     for key in dataset.info.video_keys:
         ends: dict[Path, int] = {}
-        for place in dataset.places:
+        for place in dataset.folder.listed:
             path, first = place.videos[key]
             end, ends[path] = ends.get(path, 0), first + place.length
             with noted(wrong, dataset.path):
@@ -141,7 +141,7 @@ def dataset_sidecar(dataset: CheckedDataset) -> Measurement | NotMeasured:
     """Compare instruction, outcome and content digest of each episode with the sidecar."""
     if not dataset.sidecar:
         return NotMeasured(why="it needs the sidecar that demorec keeps")
-    count = len(dataset.places)
+    count = len(dataset.folder.listed)
     known = [row["episode_index"] for row in dataset.sidecar]
     if sorted(set(known)) != known or not set(known) <= set(range(count)):
         return Measurement(value=1, detail=f"its rows are of the episodes {reprlib.repr(known)}, there are {count}")
@@ -153,7 +153,7 @@ def dataset_sidecar(dataset: CheckedDataset) -> Measurement | NotMeasured:
         number = row["episode_index"]
         if (rows := dataset.rows.get(number)) is None:
             continue
-        if number in infos and dataset.places[number].tasks != (infos[number].instruction,):
+        if number in infos and dataset.folder.listed[number].tasks != (infos[number].instruction,):
             wrong.append(f"episode {number} has another instruction")
         elif SUCCESS in rows and bool(rows[SUCCESS][-1, 0]) != row["success"]:
             wrong.append(f"episode {number} has another outcome")
@@ -208,7 +208,7 @@ def _videos(dataset: CheckedDataset) -> Iterator[str]:
         said: dict[str, Any] = {"height": height, "width": width}
         said |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
         said |= {"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {}
-        for path in dict.fromkeys(place.videos[key][0] for place in dataset.places):
+        for path in dict.fromkeys(place.videos[key][0] for place in dataset.folder.listed):
             found: dict[str, Any] = {}
             rate = float(dataset.info.fps)
             # A video that cannot be read is a finding of `dataset_videos`.

@@ -41,7 +41,7 @@ def dataset_statistics(dataset: CheckedDataset) -> Iterator[Found]:
     stats = dataset.folder.statistics
     features = dataset.info.features
     names = [name for name, feature in features.items() if feature.is_numeric and name not in _NUMBERING]
-    num_rows = sum(place.length for place in dataset.places)
+    num_rows = sum(place.length for place in dataset.folder.listed)
     if dataset.unreadable:
         yield NotMeasured(why=f"the whole dataset, since {len(dataset.unreadable)} of its episodes cannot be read")
     for name in names if not dataset.unreadable else ():

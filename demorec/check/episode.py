@@ -19,7 +19,6 @@ from demorec.core.errors import RecordingError
 from demorec.episode.episode import Table, Trajectory, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
-from demorec.episode.scene import SceneCamera
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
@@ -74,15 +73,10 @@ class CheckedEpisode(ExitStack):
         """Features of every frame."""
         return self.recording.table()
 
-    @property
-    def num_frames(self) -> int:
-        """T."""
-        return self.recording.num_frames
-
     @cached_property
     def frame_times(self) -> NDArray[np.int64]:
         """(T,) ns: when each frame ought to be."""
-        return np.array([frame_time_ns(t, self.info.fps) for t in range(self.num_frames)], dtype=np.int64)
+        return np.array([frame_time_ns(t, self.info.fps) for t in range(self.recording.num_frames)], dtype=np.int64)
 
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
@@ -102,7 +96,7 @@ class CheckedEpisode(ExitStack):
             table, urdf = self.table, self._named_urdf or info.urdf
             motion = motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns, named=self._named)
             return [] if motion is None else [motion]
-        if not self.num_frames:
+        if not self.recording.num_frames:
             return []
         return [motion_of_simulated(info, self.recording.trajectory(), Urdf.parse(self.recording.description()))]
 
@@ -115,11 +109,6 @@ class CheckedEpisode(ExitStack):
             for key, table in tables:
                 if isinstance(table, np.ndarray) and table.dtype.kind == "f":
                     yield key, table
-
-    @property
-    def cameras(self) -> tuple[SceneCamera, ...]:
-        """Of the scene."""
-        return self.info.simulated.scene.cameras
 
     @cached_property
     def films(self) -> dict[str, CameraFilms]:

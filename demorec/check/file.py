@@ -6,15 +6,13 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.check.base import Found, Measurement, counted, file_check, time_check, worst_frame
+from demorec.check.base import Found, Measurement, check, counted, file_check, time_check, worst_frame
 from demorec.check.episode import CheckedEpisode
 from demorec.mcap import channels, messages
 
 
 @file_check(
     measures="recordings that cannot be opened (index, metadata, format version)",
-    on=("simulated", "external"),
-    needs="a recording",
 )
 def opens(episode: CheckedEpisode) -> Measurement:
     """Verify the checksums of index and metadata, and the format version."""
@@ -23,8 +21,6 @@ def opens(episode: CheckedEpisode) -> Measurement:
 
 @file_check(
     measures="topics whose message count differs from the index; every chunk passes its CRC",
-    on=("simulated", "external"),
-    needs="a recording",
 )
 def checksums(episode: CheckedEpisode) -> Measurement:
     """Verify the checksum of every chunk and attachment, and the counts of the index."""
@@ -37,16 +33,18 @@ def checksums(episode: CheckedEpisode) -> Measurement:
     return counted(wrong, f"{sum(counts.values())} messages")
 
 
-@file_check(
+@check(
+    group="file",
     measures="topics that are missing, of another type or not one message a frame",
 )
 def topics(episode: CheckedEpisode) -> Measurement:
     """Find the streams that the metadata lists: each of its type, with one message for each frame."""
+    num_frames = episode.recording.num_frames
     expected: dict[str, tuple[str, int | None]] = {}
     for stream in episode.recording.streams:
-        expected[stream.topic] = (stream.schema, episode.num_frames)
-    for camera in episode.cameras:
-        expected |= {topic: (schema, episode.num_frames) for topic, schema in _image_streams(episode, camera.name)}
+        expected[stream.topic] = (stream.schema, num_frames)
+    for camera in episode.info.simulated.scene.cameras:
+        expected |= {topic: (schema, num_frames) for topic, schema in _image_streams(episode, camera.name)}
         expected[channels.camera_topic(camera.name, "camera_info")] = (messages.CAMERA_INFO, None)
     wrong = []
     for topic, (schema, count) in expected.items():
@@ -57,7 +55,7 @@ def topics(episode: CheckedEpisode) -> Measurement:
             wrong.append(f"{topic} is {found.schema}, expected {schema}")
         elif topic == channels.JOINT_STATES:
             # There may be more joint states than frames, but one at each frame.
-            missing = episode.num_frames - len(set(found.time_ns.tolist()) & set(episode.frame_times.tolist()))
+            missing = num_frames - len(set(found.time_ns.tolist()) & set(episode.frame_times.tolist()))
             if missing:
                 wrong.append(f"{topic} lacks {missing} frames")
         elif count is not None and len(found.time_ns) != count:
@@ -82,8 +80,6 @@ def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, 
 
 @file_check(
     measures="streams that do not decode into numbers",
-    on=("simulated", "external"),
-    needs="a recording",
 )
 def readable(episode: CheckedEpisode) -> Measurement:
     """Decode every message by the layout in the metadata, at its frame's time."""
@@ -94,8 +90,6 @@ def readable(episode: CheckedEpisode) -> Measurement:
 @file_check(
     measures="recordings that a crash cut off (recovered, without an outcome)",
     fail=1,
-    on=("simulated", "external"),
-    needs="a recording",
 )
 def complete(episode: CheckedEpisode) -> Measurement:
     """Look for the outcome that ends a recording."""
@@ -139,7 +133,7 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Count the encoded images of each camera: one a frame, at the frame's time, with a keyframe in every GOP."""
     expected = episode.frame_times
-    for camera in episode.cameras:
+    for camera in episode.info.simulated.scene.cameras:
         settings = episode.recording.video_settings(camera.name)
         topic = channels.video_topic(camera.name, settings.codec)
         scan = episode.scan.get(topic)

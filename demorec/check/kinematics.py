@@ -1,9 +1,12 @@
-"""The recorded EE pose against forward kinematics of the joints."""
+"""The recorded EE pose against forward kinematics of the joints, of all frames at once.
+
+Independent of `demorec.robots.kinematics` on purpose: that code made the recorded poses, this one judges them.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,8 +14,8 @@ from numpy.typing import NDArray
 from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, check
 from demorec.check.dataset import Episodes
 from demorec.check.evidence import MIN_FRAMES, Motion
-from demorec.check.rows import LinkMatrices, displacement, matrices
 from demorec.core.geometry import Array
+from demorec.robots.urdf import Urdf, UrdfJoint
 
 EE_POSES = "EE poses, and a robot whose URDF is known (--urdf FILE)"
 KNOWN_LINK_TOLERANCE_M = 1e-3
@@ -70,8 +73,8 @@ def _known_link_error(motion: Motion, frames: NDArray[np.intp]) -> Array:
     assert motion.urdf is not None
     assert motion.ee_pose is not None
     joints = {name: column[frames] for name, column in motion.joint_position.items()}
-    hand = LinkMatrices(motion.urdf, joints, len(frames))[motion.tcp_link]
-    return displacement(matrices(motion.ee_pose[frames]), hand, lever_m=LEVER_M)
+    hand = _LinkMatrices(motion.urdf, joints, len(frames))[motion.tcp_link]
+    return _displacement(matrices(motion.ee_pose[frames]), hand)
 
 
 def _fitted_error(motion: Motion, frames: NDArray[np.intp]) -> Array:
@@ -80,10 +83,10 @@ def _fitted_error(motion: Motion, frames: NDArray[np.intp]) -> Array:
     assert motion.ee_pose is not None
     joints = {name: column[frames] for name, column in motion.joint_position.items()}
     last = [joint.child for joint in motion.urdf.depth_first() if joint.name in joints][-1]
-    links = LinkMatrices(motion.urdf, joints, len(frames))[last]
+    links = _LinkMatrices(motion.urdf, joints, len(frames))[last]
     poses = matrices(motion.ee_pose[frames])
     rows = np.unique(np.linspace(0, len(frames) - 1, min(MAX_FITTED_FRAMES, len(frames))).astype(int))
-    return displacement(_placed(_fit(links[rows], poses[rows]), links), poses, lever_m=LEVER_M)
+    return _displacement(_placed(_fit(links[rows], poses[rows]), links), poses)
 
 
 def _transform(numbers: Array) -> Array:
@@ -123,3 +126,66 @@ def _fit(links: Array, poses: Array) -> Array:
             break
     assert best is not None
     return np.asarray(best.x)
+
+
+def matrices(poses: Array) -> Array:
+    """(T, 4, 4) of poses (T, 7): position, quaternion xyzw (need not be of unit length)."""
+    quat = poses[:, 3:] / np.maximum(np.linalg.norm(poses[:, 3:], axis=1, keepdims=True), 1e-12)
+    x, y, z, w = quat.T
+    out = np.zeros((len(poses), 4, 4))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    out[:, :3, 3] = poses[:, :3]
+    out[:, 3, 3] = 1.0
+    return out
+
+
+class _LinkMatrices:
+    """Forward kinematics of some joint positions: each link's poses are computed once, when they are asked for.
+
+    Args:
+        urdf: The joint tree.
+        joint_position: Joint name -> (T,) positions, rad or m; joints left out are at 0.
+        count: T.
+    """
+
+    def __init__(self, urdf: Urdf, joint_position: Mapping[str, Array], count: int) -> None:
+        self._joint_position = joint_position
+        self._above = {joint.child: joint for joint in urdf.joints}
+        self._known = {urdf.root: np.broadcast_to(np.eye(4), (count, 4, 4))}
+
+    def __getitem__(self, link: str) -> Array:
+        """(T, 4, 4) base_from_link; KeyError when there is no such link."""
+        if link not in self._known:
+            joint = self._above[link]
+            self._known[link] = self[joint.parent] @ self._parent_from_child(joint)
+        return self._known[link]
+
+    def _parent_from_child(self, joint: UrdfJoint) -> Array:
+        """(T, 4, 4), or (4, 4) where a joint does not move."""
+        position = self._joint_position.get(joint.name)
+        if position is None or joint.kind == "fixed":
+            return joint.parent_from_joint.matrix()
+        return _joint_matrices(joint, position)
+
+
+def _joint_matrices(joint: UrdfJoint, position: Array) -> Array:
+    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m); turns are by Rodrigues' formula."""
+    at_zero, along = joint.parent_from_joint.matrix(), position[:, None, None]
+    x, y, z = joint.axis
+    if joint.kind == "prismatic":
+        way = np.zeros((4, 4))
+        way[:3, 3] = joint.axis
+        return np.asarray(at_zero + along * (at_zero @ way))
+    cross = np.array([[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]])
+    turned = at_zero @ cross
+    return np.asarray(at_zero + np.sin(along) * turned + (1 - np.cos(along)) * (turned @ cross))
+
+
+def _displacement(a: Array, b: Array) -> Array:
+    """(T,) metres between two transforms (T, 4, 4): of the origins, plus what the rotation moves at `LEVER_M`."""
+    # |R - S| (Frobenius) = 2 sqrt(2) sin(angle / 2): exact for small angles, unlike the arc cosine of the trace.
+    chord = np.sqrt(((a[:, :3, :3] - b[:, :3, :3]) ** 2).sum(axis=(1, 2)))
+    angle = 2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0))
+    return np.asarray(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1) + LEVER_M * angle)

@@ -11,7 +11,6 @@ from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, che
 from demorec.check.dataset import Episodes
 from demorec.check.evidence import MIN_FRAMES, MIN_RANGE, Flags, Motion, without_gaps
 from demorec.check.rest import longest_rest, moves_of
-from demorec.check.rows import finest_lag
 from demorec.core.geometry import Array
 
 URDF = "a robot whose URDF is known (--urdf FILE)"
@@ -207,7 +206,7 @@ def action_lag(subject: Episodes) -> Found:
     judged = np.flatnonzero((error.min(axis=0) < MIN_LAG_GAIN * np.minimum(error[0], error[-1])) & is_arm)
     if not len(judged):
         return NotMeasured(why="state and action of the arm move too little to tell which of them is first")
-    lag = float(np.median([finest_lag(lags, error[:, element].tolist()) for element in judged]))
+    lag = float(np.median([_finest_lag(lags, error[:, element].tolist()) for element in judged]))
     return Measurement(value=max(1 - lag, lag - MAX_LAG_S * fps, 0.0), detail=f"the state follows by {lag:+.2f} frames")
 
 
@@ -246,3 +245,13 @@ def _targets(motions: Sequence[Motion], kept: Flags) -> list[tuple[Array, Array]
     sizes = np.sqrt((states**2).sum(axis=0) * (actions**2).sum(axis=0))
     correlations = (states * actions).sum(axis=0) / np.maximum(sizes, 1e-12)
     return found if float(np.median(correlations)) > MIN_TARGET_CORRELATION else []
+
+
+def _finest_lag(lags: Sequence[int], errors: Sequence[float]) -> float:
+    """The lag of the least error: the best of whole lags, and a parabola through it and its neighbours."""
+    best = int(np.argmin(errors))
+    if best in (0, len(errors) - 1):
+        return float(lags[best])
+    low, middle, high = errors[best - 1 : best + 2]
+    bend = low - 2 * middle + high
+    return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)

@@ -53,7 +53,7 @@ def with_videos(dataset: CheckedDataset) -> Iterator[tuple[DescribedEpisode, Map
     """Every simulated episode that the sidecar knows, in order, and of each camera feature SHA-256 (hex) of its coded
     images; ExportError when a file cannot be read."""
     for each in sorted(dataset.described(), key=lambda each: each.number):
-        yield each, video_digests(dataset.folder, dataset.places[each.number])
+        yield each, video_digests(dataset.folder, dataset.folder.listed[each.number])
 
 
 def export_options(dataset: Path) -> ExportOptions:

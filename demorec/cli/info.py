@@ -340,7 +340,7 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
 def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
     """What the tables say beyond info.json, where demorec understands them, and what is wrong with the dataset."""
     from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_problems, folder_digest, has_digest
+    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_digest, dataset_problems, without_digest
 
     facts: list[tuple[str, str]] = []
     problems: list[str] = []
@@ -356,8 +356,8 @@ def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
             return facts, problems
         if (counts := attempt_counts(folder)) is not None:
             facts.insert(0, ("successes", f"{counts[0]}, of {counts[1]} attempts"))
-        if has_digest(folder.info):
-            facts.append(("digest", folder_digest(folder)))
+        if not without_digest(folder.info):
+            facts.append(("digest", dataset_digest(path)))
     except ExportError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error

@@ -55,11 +55,6 @@ def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
     return Pose(position=position, quat_xyzw=np.array([*turn, math.sqrt(1.0 - size * size)]))
 
 
-def true_camera(recorded: SceneCamera, true_from_recorded: Pose) -> SceneCamera:
-    """The camera where it truly was."""
-    return replace(recorded, mount_from_camera=recorded.mount_from_camera @ true_from_recorded.inverse())
-
-
 def true_cameras(
     recorded: Sequence[SceneCamera], behaviour: Mapping[str, float]
 ) -> tuple[tuple[SceneCamera, ...], dict[str, Pose]]:
@@ -73,6 +68,6 @@ def true_cameras(
         error = stated_error(camera.name, behaviour)
         if error is not None:
             errors[camera.name] = error
-            camera = true_camera(camera, error)
+            camera = replace(camera, mount_from_camera=camera.mount_from_camera @ error.inverse())
         cameras.append(camera)
     return tuple(cameras), errors

@@ -113,14 +113,6 @@ class NamedRoles:
     def __bool__(self) -> bool:
         return bool(self.state or self.action or self.gripper)
 
-    def role_of(self, feature: str) -> RecordedRole:
-        """The role that the user names for a feature, "" for none."""
-        if feature in self.state:
-            return "state"
-        if feature in self.action:
-            return "action"
-        return "gripper" if feature in self.gripper else ""
-
 
 NO_NAMES = NamedRoles()
 """Where the user says nothing."""
@@ -231,7 +223,8 @@ def roles_of_recording(info: EpisodeInfo, named: NamedRoles) -> Roles:
 def roles_of_features(features: Iterable[Feature], named: NamedRoles) -> Roles:
     """The roles of features as recordings describe them; errors as `find_roles`."""
     features = tuple(features)
-    free = [feature for feature in features if not named.role_of(feature.name)]
+    taken = {*named.state, *named.action, *named.gripper}
+    free = [feature for feature in features if feature.name not in taken]
     recorded = {
         role: tuple(feature.name for feature in free if feature.role == role) for role in ("state", "action", "gripper")
     }

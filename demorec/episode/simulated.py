@@ -37,7 +37,6 @@ def simulated_info(
     instruction: str,
     fps: int,
     attempt: int = 0,
-    origin: str = "",
     versions: Mapping[str, str] | None = None,
 ) -> EpisodeInfo:
     """Describe an episode that demorec simulates.
@@ -55,7 +54,6 @@ def simulated_info(
         fps=fps,
         features=simulated_features(simulation, sensors),
         cameras=simulated_cameras(simulation.scene),
-        origin=origin,
         versions=versions or {},
         simulation=simulation,
     )

@@ -10,16 +10,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from demorec.check.run_dataset import export_options
 from demorec.core.config import GenerateConfig, parse_config
 from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.datasets.lerobot.files import read_json, read_table
+from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
-from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run
@@ -30,6 +28,8 @@ from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
 
 Key = tuple[int, int]
 """(episode of the run, attempt)."""
+_COLUMNS = ("run_episode_index", "attempt", "origin", "episode_info")
+"""Columns of the sidecar that tell what made a dataset."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,7 +59,7 @@ def compare(original: Original, result: RunResult) -> dict[Key, bool]:
     """Compare a finished run with the original; episode and attempt -> whether it has the same content bit for bit."""
     made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
     if original.export is not None:
-        made = _dataset_digests(result.folder / DATASET)
+        made = _digests(LeRobotFolder(result.folder / DATASET))
     return {key: made.get(key) == value for key, value in original.digests.items()}
 
 
@@ -154,7 +154,8 @@ def _read_recording(source: Path) -> Original:
 def _read_dataset(source: Path) -> Original:
     try:
         configs = read_json(source / CONFIGS_PATH)
-        rows = _rows(source)
+        folder = LeRobotFolder(source)
+        rows = folder.sidecar(_COLUMNS)
         if any(row["episode_info"] is None for row in rows):
             raise ConfigError(
                 f"The episodes of this dataset were recorded by another robot or program, not generated: {source}"
@@ -173,7 +174,7 @@ def _read_dataset(source: Path) -> Original:
             config=original,
             num_episodes=1 + max(row["run_episode_index"] for row in rows),
             versions=(read_episode_info(rows[0]["episode_info"]).versions,),
-            digests=_digests(source, rows),
+            digests=_digests(folder),
             export=replace(export_options(source), episodes=read_json(source / EXPORT_PATH)["episodes"]),
         )
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
@@ -182,20 +183,9 @@ def _read_dataset(source: Path) -> Original:
         ) from error
 
 
-def _dataset_digests(dataset: Path) -> dict[Key, str]:
-    return _digests(dataset, _rows(dataset))
-
-
-def _digests(dataset: Path, rows: list[dict[str, Any]]) -> dict[Key, str]:
-    """Of what the tables and videos hold."""
-    digests = episode_digests(LeRobotFolder(dataset))
+def _digests(folder: LeRobotFolder) -> dict[Key, str]:
+    """Digests of what the tables and videos of a dataset hold."""
+    rows, digests = folder.sidecar(_COLUMNS), episode_digests(folder)
     if len(digests) != len(rows):
-        raise ConfigError(f"The dataset has {len(digests)} episodes, its sidecar tells of {len(rows)}: {dataset}")
+        raise ConfigError(f"The dataset has {len(digests)} episodes, its sidecar tells of {len(rows)}: {folder.root}")
     return {(row["run_episode_index"], row["attempt"]): found for row, found in zip(rows, digests, strict=True)}
-
-
-def _rows(dataset: Path) -> list[dict[str, Any]]:
-    """The sidecar's table of episodes."""
-    files = sorted((dataset / SIDECAR_DIR / "episodes").rglob("*.parquet"))
-    columns = ["run_episode_index", "attempt", "origin", "content_digest", "episode_info"]
-    return [row for file in files for row in read_table(file, columns).to_pylist()]

@@ -19,7 +19,7 @@ from support.recording import make_episode
 
 import demorec.datasets.lerobot.parquet
 from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
-from demorec.datasets.lerobot.depth import code_values, quantised
+from demorec.datasets.lerobot.depth import DepthScale, quantised
 from demorec.mcap import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
@@ -159,7 +159,7 @@ def test_depth_is_read_as_metres(tmp_path: Path) -> None:
 
     depth = np.random.default_rng(0).uniform(0, 12, (48, 64)).astype(np.float32)
     assert np.array_equal(quantised(depth), quantize_depth(depth, video_backend=None, input_unit="m"))
-    values = code_values()
+    values = DepthScale().values()
     assert found.meta.stats["observation.images.front_depth"]["min"].reshape(-1)[0] == pytest.approx(values[0])
 
 

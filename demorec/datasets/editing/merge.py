@@ -132,7 +132,7 @@ def _converted(
     if "elements" in item:
         elements = tuple(own.elements.index(text) for text in item["elements"])
         if model is None:
-            target = own.with_elements(tuple(item["elements"]))
+            target = replace(own, shape=(len(elements),), names=tuple(item["elements"]), written_names=None)
     width = own.shape[0] if elements is None else len(elements)
     if width != target.shape[0]:
         raise ValueError(f"it gives another number of elements than {target.shape[0]}")

@@ -80,11 +80,6 @@ def _is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1e6
 
 
-def code_values() -> Array:
-    """(4096,) distance in metres that each code of ours stands for."""
-    return DepthScale().values()
-
-
 def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[EncodedVideo, PixelHistogram]:
     """Code depth images (H, W) in metres; also count their codes for the statistics."""
     context: av.VideoCodecContext | None = None
@@ -107,7 +102,7 @@ def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[Enc
     data = [bytes(packet) for packet in packets]
     video = EncodedVideo.of_access_units("hevc", width, height, b"".join(data), [len(unit) for unit in data])
     video = replace(video, is_keyframe=np.array([packet.is_keyframe for packet in packets], dtype=np.bool_))
-    histogram = PixelHistogram(counts=counts[np.newaxis], level_values=code_values(), num_images=number)
+    histogram = PixelHistogram(counts=counts[np.newaxis], level_values=DepthScale().values(), num_images=number)
     return video, histogram
 
 

@@ -17,7 +17,7 @@ import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH
-from demorec.datasets.lerobot.files import read_json
+from demorec.datasets.lerobot.files import open_table, read_json, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -66,7 +66,8 @@ def open_existing(root: Path) -> Existing:
             f"{CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
         )
     episodes, frames = len(folder.places), sum(place.length for place in folder.places)
-    if (rows := folder.count_rows()) != frames:
+    rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
+    if rows != frames:
         raise ExportError(f"The dataset is not whole: its episodes have {frames} frames, its data files {rows}: {root}")
     try:
         tasks = tuple(folder.tasks) if info.total_tasks else ()

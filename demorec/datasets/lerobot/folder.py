@@ -134,10 +134,6 @@ class LeRobotFolder:
             found[place.data] = found.get(place.data, 0) + place.length
         return found
 
-    def count_rows(self) -> int:
-        """Count the rows of all data files, by their footers."""
-        return sum(open_table(path).metadata.num_rows for path in tables_in(self.root, "data"))
-
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
         return DataRows(self.info.features, self.num_rows, names)

@@ -75,12 +75,8 @@ def noted(problems: list[str], root: Path) -> Iterator[None]:
         problems.append(without_path(error, root).replace(f"{root}/", ""))
 
 
-def has_digest(info: DatasetInfo) -> bool:
-    """Whether the content has a digest: all of it is video, numbers or text, that of language columns included."""
-    return not _without_digest(info)
-
-
-def _without_digest(info: DatasetInfo) -> list[str]:
+def without_digest(info: DatasetInfo) -> list[str]:
+    """Features whose content has no digest: what is not video, numbers or text, that of language columns included."""
     return [name for name, feature in info.features.items() if feature.dtype == "image"]
 
 
@@ -106,17 +102,13 @@ def dataset_digest(path: Path) -> str:
     Raises:
         ExportError: The dataset is damaged.
     """
-    return folder_digest(LeRobotFolder(path))
-
-
-def folder_digest(folder: LeRobotFolder) -> str:
-    """As `dataset_digest`, of an open dataset."""
+    folder = LeRobotFolder(path)
     return combined_digest(folder.info, episode_digests(folder))
 
 
 def episode_digests(folder: LeRobotFolder, numbers: Sequence[int] | None = None) -> list[str]:
     """Compute the digest of some episodes, all by default, in order, read back from all files."""
-    if unknown := _without_digest(folder.info):
+    if unknown := without_digest(folder.info):
         raise ExportError(
             f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {folder.root}"
         )

@@ -99,10 +99,6 @@ class DatasetFeature:
         is_vector = self.is_numeric and len(self.shape) == 1
         return Column(self.dtype, self.elements if is_vector else ())
 
-    def with_elements(self, names: tuple[str, ...]) -> DatasetFeature:
-        """The vector with other elements."""
-        return replace(self, shape=(len(names),), names=names, written_names=None)
-
     @property
     def is_video(self) -> bool:
         """Whether its frames are in mp4 files rather than in the data table."""

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import DemorecError, ExportError, describe_error, resource_error
 from demorec.core.processes import SPAWN, exit_silently
 from demorec.datasets.episode import ExportCamera
-from demorec.datasets.lerobot.depth import code_values, quantised
+from demorec.datasets.lerobot.depth import DepthScale, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
 from demorec.datasets.lerobot.motor_units import export_episode
 from demorec.datasets.lerobot.options import ExportOptions
@@ -194,4 +194,4 @@ def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
     """Whether distances from LeRobot, mm, differ from the recorded ones (H, W), m, beyond the codes' resolution."""
     found = tensor.numpy()
     found = found.reshape(found.shape[-2:]) / 1000
-    return bool(np.abs(found - code_values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
+    return bool(np.abs(found - DepthScale().values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
