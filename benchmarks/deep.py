@@ -19,7 +19,7 @@ from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
-from demorec.replay.deep import deep_check
+from demorec.replay.deep.check import deep_check
 
 
 def generate(path: Path, config: GenerateConfig, index: int, simulators: SimulatorCache) -> None:

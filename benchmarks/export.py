@@ -34,7 +34,8 @@ from mcap.records import Chunk
 from mcap.stream_reader import StreamReader
 from numpy.typing import NDArray
 
-from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
@@ -201,7 +202,8 @@ def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
     program = (
         "import resource, sys, time\n"
         "from pathlib import Path\n"
-        "from demorec.datasets.lerobot import ExportOptions, export_lerobot\n"
+        "from demorec.datasets.lerobot.export import export_lerobot\n"
+        "from demorec.datasets.lerobot.options import ExportOptions\n"
         "files = sorted(Path(sys.argv[1]).glob('*.mcap'))[: int(sys.argv[2])]\n"
         "export_lerobot(files[:1], Path(sys.argv[3] + '.warm'), ExportOptions(verify=False))\n"
         "cpu = time.process_time()\n"

@@ -113,7 +113,8 @@ def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
 
     import_bags(bags_, mapping, out / "run")
     if exports:
-        from demorec.datasets.lerobot import ExportOptions, export_lerobot
+        from demorec.datasets.lerobot.export import export_lerobot
+        from demorec.datasets.lerobot.options import ExportOptions
 
         export_lerobot([out / "run"], out / "dataset", ExportOptions(verify=False))
 

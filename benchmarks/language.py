@@ -23,7 +23,8 @@ import time
 from pathlib import Path
 from typing import Any
 
-from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 

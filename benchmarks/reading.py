@@ -47,7 +47,8 @@ def images_of(args: argparse.Namespace, size: int, episode: int) -> Images:
 
 
 def written_by_demorec(folder: Path, args: argparse.Namespace, size: int) -> Path:
-    from demorec.datasets.lerobot import ExportOptions, export_lerobot
+    from demorec.datasets.lerobot.export import export_lerobot
+    from demorec.datasets.lerobot.options import ExportOptions
 
     (folder / "run" / "episodes").mkdir(parents=True)
     for episode in range(args.episodes):
@@ -83,7 +84,8 @@ def without_images(folder: Path, args: argparse.Namespace) -> Path:
     """The numbers of demorec's default features, 13 columns, of as many episodes as a training has."""
     from support.recording import write_episode
 
-    from demorec.datasets.lerobot import ExportOptions, export_lerobot
+    from demorec.datasets.lerobot.export import export_lerobot
+    from demorec.datasets.lerobot.options import ExportOptions
 
     (folder / "run" / "episodes").mkdir(parents=True)
     for episode in range(10 * args.episodes):

@@ -22,7 +22,8 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.render.painter import WarmRenderer
-from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.replay.demonstration import ReplayOptions, open_file
+from demorec.replay.drive import replay_all
 from demorec.replay.rerender import RerenderOptions, rerender
 
 

@@ -30,7 +30,8 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.mcap import EpisodeWriter
-from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.replay.demonstration import ReplayOptions, open_file
+from demorec.replay.drive import replay_all
 from demorec.robots.assets import allow_models, asset_path
 from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.robots.spec_check import spec_problems

@@ -21,7 +21,7 @@ from demorec.robots.motors import MotorUnits
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
     from demorec.check.report import Subject, SubjectReport
-    from demorec.replay.deep import DeepReport
+    from demorec.replay.deep.check import DeepReport
 
 
 _SHOWN = 12
@@ -137,7 +137,7 @@ class CheckCommand:
         return text
 
     def _remade(self, subjects: Sequence[Subject], workers: int) -> Iterator[DeepReport]:
-        from demorec.replay.deep import deep_checks, deep_dataset_checks
+        from demorec.replay.deep.check import deep_checks, deep_dataset_checks
 
         allowed = allowed_modules(self.allow)
         paths, datasets = _split(subjects)

@@ -26,7 +26,8 @@ from demorec.robots.motors import MotorUnits
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
-    from demorec.replay import Demonstration, ReplayOptions, ReplayReport
+    from demorec.replay.demonstration import Demonstration, ReplayOptions
+    from demorec.replay.drive import ReplayReport
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +93,8 @@ class Replay:
         need_paths(self.paths, "replay")
         if self.tolerance < 0:
             raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
-        from demorec.replay import ReplayOptions, is_as_recorded, replay_all
+        from demorec.replay.demonstration import ReplayOptions
+        from demorec.replay.drive import is_as_recorded, replay_all
 
         allowed = (*allowed_modules(self.allow), *modules_of([self.robot]))
         options = ReplayOptions(
@@ -177,7 +179,7 @@ def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: s
 
 def _found(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
     from demorec.datasets.options import parse_episodes
-    from demorec.replay import dataset_demonstrations, open_file
+    from demorec.replay.demonstration import dataset_demonstrations, open_file
 
     wanted = parse_episodes(episodes)
     for path in paths:

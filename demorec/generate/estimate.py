@@ -11,7 +11,8 @@ from pathlib import Path
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.processes import available_cores
-from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.generate.executor import MAKE_EPISODE, Made, Raised
 from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunOptions

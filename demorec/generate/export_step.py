@@ -11,11 +11,13 @@ from pathlib import Path
 from demorec.core.errors import DemorecError, resource_error
 from demorec.core.files import free_name, run_lock, sync_path
 from demorec.core.replacing import obstacle
-from demorec.datasets.lerobot import ExportOptions, ExportReport, dataset_digest, export_lerobot
 from demorec.datasets.lerobot.card import has_own_card
-from demorec.datasets.lerobot.inspect import check_tables
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.inspect import check_tables, dataset_digest
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
+from demorec.datasets.options import ExportReport
 from demorec.generate.contents import check_dataset_place, is_dataset_of_run
 from demorec.runs.run_file import DATASET, UNFINISHED, ExportRecord, RunFile, load_run_file, save_run_file
 

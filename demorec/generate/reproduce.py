@@ -14,10 +14,11 @@ from pathlib import Path
 from demorec.check.run_dataset import export_options
 from demorec.core.config import GenerateConfig, parse_config
 from demorec.core.errors import ConfigError, RecordingError, describe_error
-from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EXPORT_PATH
 from demorec.episode.validity import read_episode_info
 from demorec.generate.contents import is_dataset_of_run

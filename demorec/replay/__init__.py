@@ -5,16 +5,3 @@ the way is compared with the recorded one, bit by bit. On one type of machine no
 answers how robust a demonstration is (a lower command rate, noise, delay) and whether an exported dataset, with its
 float32 actions of any kind, still does the task.
 """
-
-from demorec.replay.demonstration import Demonstration, ReplayOptions, dataset_demonstrations, open_file
-from demorec.replay.drive import ReplayReport, is_as_recorded, replay_all
-
-__all__ = [
-    "Demonstration",
-    "ReplayOptions",
-    "ReplayReport",
-    "dataset_demonstrations",
-    "is_as_recorded",
-    "open_file",
-    "replay_all",
-]

@@ -9,7 +9,9 @@ import pytest
 from support.commands import exit_code
 from support.export import episode_rows, files_of, make_run
 
-from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.inspect import dataset_digest
+from demorec.datasets.lerobot.options import ExportOptions
 
 
 @pytest.fixture(scope="module")

@@ -17,7 +17,8 @@ from support.commands import ON_A_PATH, exit_code, words_of
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.plain import to_plain
-from demorec.datasets.lerobot import ExportOptions, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.simulated import with_simulation
 from demorec.runs.recorded import inspect_recording
 from demorec.runs.run_file import RUN_NAME, Generation, RunFile, save_run_file

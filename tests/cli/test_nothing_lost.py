@@ -33,7 +33,7 @@ from demorec.core.replacing import (
     settle_parts,
 )
 from demorec.core.tables import EXPORTERS
-from demorec.datasets.lerobot import ExportOptions
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.generate import reproduce as reproducing
 from demorec.generate.options import RunResult
 from demorec.learn.evaluate.rollouts import Settings, _open
@@ -160,7 +160,8 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
 
 
 def test_files_put_into_the_target_meanwhile_are_kept(place: Path) -> None:
-    from demorec.datasets.lerobot import ExportOptions, export_lerobot
+    from demorec.datasets.lerobot.export import export_lerobot
+    from demorec.datasets.lerobot.options import ExportOptions
 
     def note(done: int, total: int) -> None:
         (place / "dataset" / "notes.txt").write_text("years of work")

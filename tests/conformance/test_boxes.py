@@ -12,8 +12,8 @@ from support.export import export, make_run
 from support.language import NOUNS, language_of
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.mcap import Recording
 
 PREFIX = "observation.images."

@@ -12,8 +12,10 @@ from support.commands import exit_code
 
 from demorec.cli import generate_dataset_main
 from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot
+from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import dataset_digest
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.verify import Verifier
 from demorec.generate.export_step import export_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult

@@ -20,8 +20,8 @@ from support import bag_mappings, bags
 from support.check import level_of
 from support.export import episode_rows, export
 
-from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.mcap import Recording
 from demorec.sources.dataset_import import import_lerobot

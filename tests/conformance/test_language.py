@@ -20,9 +20,8 @@ from demorec.annotate.situation import place_of
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
-from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import episode_digests
+from demorec.datasets.lerobot.inspect import dataset_digest, episode_digests
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.episode.words import nouns_of

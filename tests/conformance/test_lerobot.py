@@ -18,8 +18,11 @@ from support.export import data_table, episode_rows, export, make_run
 from support.recording import make_episode
 
 import demorec.datasets.lerobot.parquet
-from demorec.datasets.lerobot import ExportOptions, dataset_digest, export_lerobot, verify
+from demorec.datasets.lerobot import verify
 from demorec.datasets.lerobot.depth import DepthScale, quantised
+from demorec.datasets.lerobot.export import export_lerobot
+from demorec.datasets.lerobot.inspect import dataset_digest
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.mcap import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)

@@ -17,7 +17,7 @@ from support.external import TOP, Episode, make_external, write_external
 
 from demorec.core.geometry import Pose
 from demorec.core.text import printable
-from demorec.datasets.lerobot import dataset_digest
+from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.episode.info import Camera
 from demorec.mcap import Recording
 

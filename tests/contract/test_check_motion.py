@@ -219,7 +219,7 @@ def test_a_description_that_the_user_names(foreign: Path, tmp_path: Path, capsys
 
 def test_frames_without_a_number_do_not_stop_a_law(foreign: Path, tmp_path: Path) -> None:
     spoilt = copy(foreign, tmp_path / "ds")
-    count = CheckedDataset(spoilt).places[0].length
+    count = CheckedDataset(spoilt).folder.listed[0].length
 
     def gap(rows: Rows) -> Rows:
         rows[20:25] = np.nan

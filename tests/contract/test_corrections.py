@@ -29,7 +29,8 @@ from demorec.learn.evaluate.turns import Turns, read_takeover
 from demorec.learn.evaluate.watch import Watch
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.mcap import Recording
-from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.replay.demonstration import ReplayOptions, open_file
+from demorec.replay.drive import replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
 

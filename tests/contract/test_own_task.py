@@ -10,7 +10,8 @@ from support.check import checked, simulate
 
 from demorec.core.tables import ROBOTS
 from demorec.mcap import Recording
-from demorec.replay import ReplayOptions, open_file, replay_all
+from demorec.replay.demonstration import ReplayOptions, open_file
+from demorec.replay.drive import replay_all
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
 

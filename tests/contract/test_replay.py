@@ -21,7 +21,8 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import Event
 from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
-from demorec.replay import ReplayOptions, ReplayReport, open_file, replay_all
+from demorec.replay.demonstration import ReplayOptions, open_file
+from demorec.replay.drive import ReplayReport, replay_all
 
 
 @pytest.fixture(scope="session")

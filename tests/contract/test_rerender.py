@@ -12,7 +12,7 @@ from support.commands import exit_code
 
 from demorec.mcap import Recording
 from demorec.render.painter import WarmRenderer
-from demorec.replay.deep import deep_check
+from demorec.replay.deep.check import deep_check
 from demorec.replay.rerender import RerenderOptions, rerender
 
 pytestmark = pytest.mark.slow

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from demorec.check import lerobot_opens
 from demorec.core.config import VideoConfig
 from demorec.core.tables import EXPORTERS
-from demorec.datasets.lerobot import ExportReport
 from demorec.datasets.lerobot import export as lerobot_export
+from demorec.datasets.options import ExportReport
 from support.recording import write_episode
 
 

@@ -17,9 +17,8 @@ from support.recording import make_episode, write_episode
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot import dataset_digest
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import attempt_counts
+from demorec.datasets.lerobot.inspect import attempt_counts, dataset_digest
 from demorec.datasets.options import parse_episodes
 from demorec.mcap import Recording
 

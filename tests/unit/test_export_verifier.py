@@ -11,7 +11,8 @@ import pytest
 from support.verifier import die, lack_memory, never_end, never_listen
 
 from demorec.core.errors import ExportError, ResourceError
-from demorec.datasets.lerobot import ExportOptions, verify
+from demorec.datasets.lerobot import verify
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.verify import Verifier
 
 

@@ -14,8 +14,8 @@ from demorec.check.dataset import CheckedDataset
 from demorec.cli import COMMANDS, main
 from demorec.core.errors import ExportError, MissingDependencyError
 from demorec.core.tables import CHECKS
-from demorec.datasets.lerobot import ExportOptions, export_lerobot
-from demorec.datasets.lerobot.export import push_to_hub
+from demorec.datasets.lerobot.export import export_lerobot, push_to_hub
+from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.verify import LEROBOT
 from demorec.learn.evaluate.policy import Policy
 

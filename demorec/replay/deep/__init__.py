@@ -5,8 +5,3 @@ and outcome come out once more; a derived recording (a replay, a rendering) has 
 is named by stream, field and frame. So nothing can be wrong with a recording of our own that this does not find,
 other than what the program itself does wrong each time.
 """
-
-from demorec.replay.deep.check import DeepReport, deep_check, deep_checks, deep_dataset_checks
-from demorec.replay.deep.contents import RemakeDifference
-
-__all__ = ["DeepReport", "RemakeDifference", "deep_check", "deep_checks", "deep_dataset_checks"]
