@@ -23,7 +23,6 @@ from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
-from demorec.episode.features import ACTION, ActionKind, action_names
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 from demorec.episode.validity import read_episode_info
@@ -163,8 +162,8 @@ class CheckedDataset:
             )
 
     def described(self) -> list[DescribedEpisode]:
-        """The simulated episodes that the sidecar describes, if not all: LeRobot's `resume` adds some without."""
-        return [
+        """The simulated episodes that the sidecar describes, in order; LeRobot's `resume` adds some without."""
+        found = [
             DescribedEpisode(
                 number=number,
                 rows=self.rows[number],
@@ -175,6 +174,7 @@ class CheckedDataset:
             for row in self.sidecar
             if row["episode_info"] is not None and (number := row["episode_index"]) in self.rows
         ]
+        return sorted(found, key=lambda episode: episode.number)
 
     def _info_of(self, row: Mapping[str, Any]) -> EpisodeInfo:
         try:
@@ -183,12 +183,6 @@ class CheckedDataset:
             raise ExportError(
                 f"The sidecar's episode_info cannot be used ({describe_error(error)}): {self.path}"
             ) from error
-
-    def action_kind(self, info: EpisodeInfo) -> ActionKind | None:
-        """The kind of the actions by the names of their components; None for another kind than demorec writes."""
-        names = self.info.features[ACTION].names if ACTION in self.info.features else None
-        kinds: tuple[ActionKind, ...] = ("joint", "joint_increment", "ee", "ee_delta")
-        return next((kind for kind in kinds if action_names(info.simulated.robot, kind) == names), None)
 
 
 Episodes = CheckedEpisode | CheckedDataset

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import struct
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing, suppress
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -14,7 +17,6 @@ from numpy.typing import NDArray
 from demorec.check.base import Form
 from demorec.check.evidence import Motion, motion_of_features, motion_of_simulated
 from demorec.check.films import CameraFilms, film_of_recording
-from demorec.check.topic_scan import TopicScan, scan_topics
 from demorec.core.errors import RecordingError
 from demorec.episode.episode import Table, Trajectory, frame_time_ns
 from demorec.episode.info import EpisodeInfo
@@ -22,6 +24,35 @@ from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recordin
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
 from demorec.robots.urdf import Urdf
+
+_STAMP_FIRST = {
+    "sensor_msgs/msg/JointState",
+    "geometry_msgs/msg/PoseStamped",
+    "geometry_msgs/msg/WrenchStamped",
+    "sensor_msgs/msg/CompressedImage",
+    "sensor_msgs/msg/Image",
+    "foxglove_msgs/msg/CompressedVideo",
+    "rcl_interfaces/msg/Log",
+}
+"""Types whose first field is a timestamp, alone or in a header."""
+_STAMP = struct.Struct("<iI")
+_STAMP_OFFSET = 4
+"""Bytes of CDR's head before the first field."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TopicScan:
+    """The messages of one topic, in the order of the file.
+
+    Attributes:
+        schema: Its type.
+        time_ns: (N,) time of each message.
+        stamp_ns: (N,) timestamp inside each message; None for types without one.
+    """
+
+    schema: str
+    time_ns: NDArray[np.int64]
+    stamp_ns: NDArray[np.int64] | None
 
 
 class CheckedEpisode(ExitStack):
@@ -81,7 +112,7 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
         """Every message of every topic, read once: every chunk's checksum is verified on the way."""
-        return scan_topics(self.container)
+        return _scan_topics(self.container)
 
     @cached_property
     def container(self) -> Container:
@@ -131,3 +162,32 @@ class CheckedEpisode(ExitStack):
                     pass
             except RecordingError as error:
                 yield camera, str(error)
+
+
+def _scan_topics(container: Container) -> dict[str, TopicScan]:
+    """Read all messages by topic, and all attachments; the checksum of every chunk is verified on the way."""
+    schemas = {name: container.schemas[channel.schema_id].name for name, channel in container.channels.items()}
+    times: dict[str, list[int]] = defaultdict(list)
+    stamps: dict[str, list[int]] = defaultdict(list)
+    for topic, time_ns, data in container.messages(list(schemas)):
+        times[topic].append(time_ns)
+        if schemas[topic] in _STAMP_FIRST:
+            stamps[topic].append(_stamp_ns(data))
+    for name in container.attachment_names:
+        container.attachment(name)
+    return {
+        topic: TopicScan(
+            schema=schema,
+            time_ns=np.array(times[topic], dtype=np.int64),
+            stamp_ns=np.array(stamps[topic], dtype=np.int64) if schema in _STAMP_FIRST else None,
+        )
+        for topic, schema in schemas.items()
+    }
+
+
+def _stamp_ns(data: bytes) -> int:
+    """The first field of a message; -1 for one that is too short."""
+    if len(data) < _STAMP_OFFSET + _STAMP.size:
+        return -1
+    seconds, nanoseconds = _STAMP.unpack_from(data, _STAMP_OFFSET)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)

@@ -8,9 +8,8 @@ import numpy as np
 
 from demorec.check.base import ANY_EPISODE, Found, Measurement, NotMeasured, check, counted
 from demorec.check.dataset import Episodes
-from demorec.check.evidence import Motion, without_gaps
-from demorec.check.films import Film
-from demorec.check.rest import longest_rest, moves_of
+from demorec.check.evidence import without_gaps
+from demorec.check.motion import longest_rest, moves_of
 
 MAX_SAME_STEP = 0.1
 """Mean change of an image's parts, of 255, up to which it shows the same; a frozen image changes so when encoded again,
@@ -57,7 +56,7 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
             motion = motions.get(film.episode)
             if motion is None or len(film.cells) < 2:
                 continue
-            same, moves = film.steps <= MAX_SAME_STEP, moves_of(_state_at(film, motion))
+            same, moves = film.steps <= MAX_SAME_STEP, moves_of(without_gaps(motion.state)[film.frames])
             rest = longest_rest(same, moves, np.diff(film.frames))
             frame = int(film.frames[rest.start]) + 1 if rest.moving else None
             found.append(Measurement(value=rest.moving / film.fps, frame=frame, detail=film.where))
@@ -69,7 +68,3 @@ def frozen_images(subject: Episodes) -> Iterator[Found]:
             yield NotMeasured(why=f"{camera} hardly sees the robot move")
         else:
             yield from found
-
-
-def _state_at(film: Film, motion: Motion) -> np.ndarray[tuple[int, ...], np.dtype[np.float64]]:
-    return without_gaps(motion.state)[film.frames]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -41,19 +41,12 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
     found = sum(bool(row["success"]) for row in dataset.sidecar)
     if found != successes:
         wrong.append(f"it has {found} successes, the run {successes}")
-    for episode, videos in with_videos(dataset):
+    for episode in dataset.described():
         folder = run.path / ("episodes" if episode.kept["success"] else "failed")
         file = folder / Path(str(episode.kept["source"])).name
-        if words := [what for what, _ in episode_differences(file, options, episode, videos)]:
+        if words := [what for what, _ in episode_differences(file, options, episode, dataset)]:
             wrong.append(f"episode {episode.number}: {', '.join(words)}")
     return counted(wrong, f"{len(dataset.sidecar)} episodes")
-
-
-def with_videos(dataset: CheckedDataset) -> Iterator[tuple[DescribedEpisode, Mapping[str, str]]]:
-    """Every simulated episode that the sidecar knows, in order, and of each camera feature SHA-256 (hex) of its coded
-    images; ExportError when a file cannot be read."""
-    for each in sorted(dataset.described(), key=lambda each: each.number):
-        yield each, video_digests(dataset.folder, dataset.folder.listed[each.number])
 
 
 def export_options(dataset: Path) -> ExportOptions:
@@ -83,11 +76,12 @@ def export_options(dataset: Path) -> ExportOptions:
 
 
 def episode_differences(
-    recording_file: Path, options: ExportOptions, episode: DescribedEpisode, videos: Mapping[str, str]
+    recording_file: Path, options: ExportOptions, episode: DescribedEpisode, dataset: CheckedDataset
 ) -> Iterator[tuple[str, tuple[int, ...]]]:
     """(what, in which frames) of an episode is not what a recording gives with the same options.
 
     Raises:
+        ExportError: A video of the dataset cannot be read.
         ResourceError: This machine cannot read it.
     """
     try:
@@ -113,6 +107,7 @@ def episode_differences(
             yield name, ()
         elif len(frames := np.flatnonzero((found != true).any(axis=1))):
             yield name, tuple(frames.tolist())
+    videos = video_digests(dataset.folder, dataset.folder.listed[episode.number])
     for key, video in recorded.items():
         if videos.get(key) != video.digest:
             yield key, ()

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from demorec.core.config import MAX_PHYSICS_HZ, deciding_versions
 from demorec.core.errors import ConfigError, ExportError, OptionError, RecordingError, check_option, check_seed
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
-from demorec.episode.features import ACTION, STATE, ActionKind
+from demorec.episode.features import ACTION, STATE, ActionKind, action_names
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.scene import Physics, RobotPlacement, Scene
@@ -255,11 +255,12 @@ def dataset_demonstrations(
             f"{path}"
         )
     dataset.check_simulated()
+    names = dataset.info.features[ACTION].names if ACTION in dataset.info.features else None
     for each in dataset.described():
         if not wanted(each.number):
             continue
         number, rows, row, info = each.number, each.rows, each.kept, each.info
-        kind = dataset.action_kind(info)
+        kind = next((kind for kind in get_args(ActionKind) if action_names(info.simulated.robot, kind) == names), None)
         if kind is None:
             raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")
         state, arm = rows[STATE].astype(np.float64), len(info.simulated.robot.arm_joints)

@@ -17,7 +17,6 @@ from support.external import make_external, write_external
 from support.mcap import rewritten
 
 from demorec.check.dataset import CheckedDataset
-from demorec.check.run_dataset import with_videos
 from demorec.cli import main
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.export import export_lerobot
@@ -237,7 +236,7 @@ def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> N
     spoilt = copy(run, tmp_path / "run")
     path = next((spoilt / "dataset/demorec/episodes").glob("*/*.parquet"))
     pq.write_table(pq.read_table(path).slice(1), path)
-    assert [episode.number for episode, _ in with_videos(CheckedDataset(spoilt / "dataset"))] == [1, 2]
+    assert [episode.number for episode in CheckedDataset(spoilt / "dataset").described()] == [1, 2]
     (result,) = checked(spoilt / "dataset", "dataset", only=["dataset_sidecar"]).results
     assert (result.level, result.detail) == ("fail", "episode 0 is unknown, as one that LeRobot recorded with resume")
     assert level_of(spoilt / "dataset", "forward_kinematics", "dataset") == "pass"

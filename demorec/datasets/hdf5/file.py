@@ -35,14 +35,10 @@ _PARTS: dict[str, tuple[str, ...]] = {
 _DEMO = re.compile(r"data/demo_\d+(?=/|$)")
 
 
-def _begins_as_hdf5(path: Path) -> bool:
-    with open_regular(path) as file:
-        return file.read(len(HDF5_MAGIC)) == HDF5_MAGIC
-
-
 def _is_our_dataset(path: Path) -> bool:
-    if not _begins_as_hdf5(path):
-        return False
+    with open_regular(path) as file:
+        if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
+            return False
     try:
         with h5py.File(path, "r", locking=False) as file:
             data = file.get("data")

@@ -30,9 +30,9 @@ from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
 # What reads videos, images, robots and the sidecar takes longer to load than to read the numbers of most datasets.
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.attempts import Attempts
     from demorec.datasets.lerobot.boxes import StoredBoxes
     from demorec.datasets.lerobot.robots import DatasetRobot
+    from demorec.datasets.lerobot.sidecar import Attempts
     from demorec.datasets.lerobot.stored_images import StoredImages
     from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
     from demorec.episode.info import Camera, Feature, Kept
@@ -187,7 +187,7 @@ class LeRobotFolder:
     @cached_property
     def attempts(self) -> Attempts:
         """The attempts of the sidecar."""
-        from demorec.datasets.lerobot.attempts import Attempts
+        from demorec.datasets.lerobot.sidecar import Attempts
 
         return Attempts(self.sidecar_tables("attempts"))
 

@@ -150,7 +150,9 @@ def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, 
                 f"({describe_error(error)})."
             ) from error
         wrong = [
-            name for name, values in episode.columns.items() if name in item and not _equal(item[name], values[moment])
+            name
+            for name, values in episode.columns.items()
+            if name in item and not np.array_equal(np.ravel(item[name]), np.ravel(values[moment]))
         ]
         wrong += _wrong_language(item, language, moment)
         if item["task"] != episode.info.instruction:
@@ -168,11 +170,6 @@ def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, 
                 f"{episode_index} differ from the recording: {episode.recording.path}"
             )
     return len(moments)
-
-
-def _equal(tensor: Any, values: Any) -> bool:
-    found = np.asarray(tensor)
-    return bool(np.array_equal(found.reshape(-1), np.asarray(values).reshape(-1)))
 
 
 def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[str]:

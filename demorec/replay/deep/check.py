@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.check.dataset import CheckedDataset, DescribedEpisode
-from demorec.check.run_dataset import episode_differences, export_options, with_videos
+from demorec.check.run_dataset import episode_differences, export_options
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
 from demorec.core.own_versions import version_differences
@@ -255,7 +255,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
                 raise ExportError(missing)
             for number, problem in dataset.unreadable.items():
                 yield _impossible(DeepReport(path=path / f"episode {number}"), ExportError(problem))
-            for episode, videos in with_videos(dataset):
+            for episode in dataset.described():
                 info = episode.info
                 report = DeepReport(
                     path=path / f"episode {episode.number}",
@@ -263,7 +263,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
                     num_frames=len(episode.rows["index"]),
                 )
                 try:
-                    found = tuple(_episode_differences(episode, videos, options, simulators, allowed))
+                    found = tuple(_episode_differences(episode, dataset, options, simulators, allowed))
                     yield replace(report, differences=found)
                 except DemorecError as error:
                     yield _impossible(report, error)
@@ -273,7 +273,7 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
 
 def _episode_differences(
     episode: DescribedEpisode,
-    videos: Mapping[str, str],
+    dataset: CheckedDataset,
     options: ExportOptions,
     simulators: SimulatorCache,
     allowed: Sequence[str],
@@ -284,5 +284,5 @@ def _episode_differences(
     with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
         again = Path(folder) / "again.mcap"
         _generate_again(info, again, simulators, allowed)
-        for what, frames in episode_differences(again, options, episode, videos):
+        for what, frames in episode_differences(again, options, episode, dataset):
             yield RemakeDifference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
