@@ -66,7 +66,6 @@ class CheckOptions:
 
 @cache
 def _all_checks() -> tuple[Check, ...]:
-    """Of the table."""
     return tuple(CHECKS.load(name) for name in CHECKS.names())
 
 

@@ -1,4 +1,4 @@
-"""Checks of a run's folder against its run.json, and the findings of an import.
+"""Checks of a run's folder against its run.json, of its episodes against each other, and the findings of an import.
 
 `demorec import` keeps its findings in import.json: the bags themselves may be gone.
 """
@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict
 from functools import cached_property, partial
 from pathlib import Path
@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from demorec.check.base import Form, Found, Measurement, counted, run_check
+from demorec.check.base import Form, Found, Measurement, NotMeasured, check, counted, run_check
+from demorec.check.dataset import CheckedDataset
 from demorec.check.evidence import motion_vector
 from demorec.core.errors import DemorecError, RecordingError, resource_error
 from demorec.core.files import sha256_of
@@ -33,6 +34,8 @@ _MAX_LISTED = 5
 _ANY_RUN: tuple[Form, ...] = ("run", "external run")
 _NOT_RECORDED = ("file", "seconds")
 """What run.json has of an attempt that is not in its recording."""
+MAX_DISTANCE = 1e-4
+"""Root mean square difference of two motions, rad or m, up to which one is a copy: float32 rounds to less."""
 
 
 class CheckedRun:
@@ -183,3 +186,41 @@ def import_dropped(run: CheckedRun) -> Found:
     rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
     dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
     return Measurement(value=len(dropped), detail="; ".join(dropped[:_MAX_LISTED]))
+
+
+@check(
+    group="run",
+    on=("run", "external run", "dataset"),
+    measures="episodes that have the motion of an earlier one",
+    needs="two episodes",
+)
+def duplicates(subject: CheckedRun | CheckedDataset) -> Found:
+    """Compare the states of all episodes at 32 moments each."""
+    motions = subject.courses()
+    if len(motions) < 2:
+        return NotMeasured(why="it needs two episodes")
+    if subject.has_equal_starts:
+        return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
+    copies = _copies(list(motions.values()))
+    detail = f"{len(motions)} different motions"
+    if copies:
+        names = list(motions)
+        later, earlier = min(copies.items())
+        detail = f"{names[later]} is like {names[earlier]}"
+    return Measurement(value=len(copies), detail=detail)
+
+
+def _copies(motions: Sequence[Array]) -> dict[int, int]:
+    """Episode -> the first one that it is a copy of."""
+    found: dict[int, int] = {}
+    # The means of copies differ by less than their distance: only neighbours in that order are compared.
+    order = sorted((float(motion.mean()), number) for number, motion in enumerate(motions) if np.isfinite(motion).all())
+    for place, (mean, number) in enumerate(order):
+        for other_mean, other in order[place + 1 :]:
+            if other_mean - mean > MAX_DISTANCE:
+                break
+            one, two = motions[number], motions[other]
+            if len(one) == len(two) and np.linalg.norm(one - two) <= MAX_DISTANCE * math.sqrt(len(one)):
+                later, earlier = max(number, other), min(number, other)
+                found[later] = min(earlier, found.get(later, earlier))
+    return found

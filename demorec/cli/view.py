@@ -153,7 +153,7 @@ class View:
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
         from demorec.datasets.lerobot.folder import LeRobotFolder
-        from demorec.datasets.scoring.score import score_dataset
+        from demorec.datasets.scoring import score_dataset
         from demorec.runs.find import find
 
         if others := [path for path in self.paths if find(path).kind != "dataset"]:

@@ -241,7 +241,6 @@ def _report(
 
 
 def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
-    """As of the report."""
     columns = np.abs(np.column_stack([off[JOINTS], off[OPENING]])).T
     names = (*d.info.simulated.robot.arm_joints, "gripper")
     return {name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)}

@@ -19,7 +19,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.scoring.score import MIN_EPISODES, MIN_SOUND, score_dataset
+from demorec.datasets.scoring import MIN_EPISODES, MIN_SOUND, score_dataset
 from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import IMAGE_PREFIX

@@ -17,7 +17,7 @@ from demorec.core.targets import OptionalTarget
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.datasets.scoring.score import EpisodeScore
+    from demorec.datasets.scoring import EpisodeScore
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class Score:
         """Score, print, and write."""
         from demorec.datasets.lerobot.files import leave_pandas_out
         from demorec.datasets.lerobot.folder import LeRobotFolder
-        from demorec.datasets.scoring.score import score_dataset, to_json
+        from demorec.datasets.scoring import score_dataset, to_json
 
         leave_pandas_out()
         folder = LeRobotFolder(dataset_at(self.dataset), named=self.roles.named)
@@ -62,7 +62,7 @@ class Score:
 
     def _written(self, folder: LeRobotFolder, out: Path) -> Sequence[EpisodeScore]:
         """Score, and write the scores to a file."""
-        from demorec.datasets.scoring.score import SCORES, score_dataset, write_scores
+        from demorec.datasets.scoring import SCORES, score_dataset, write_scores
 
         refuse_inside([out])
         if not out.absolute().parent.is_dir():
@@ -76,7 +76,7 @@ class Score:
 def scored_columns(folder: LeRobotFolder, names: Collection[str], file: Path | None) -> list[dict[str, Any]]:
     """Read the columns of a dataset's episodes, with `score` if that is among the names and no column of its own."""
     from demorec.datasets.editing.episode_records import episode_columns
-    from demorec.datasets.scoring.score import read_scores, score_dataset
+    from demorec.datasets.scoring import read_scores, score_dataset
 
     columns = episode_columns(folder)
     if "score" not in names or any("score" in row for row in columns):

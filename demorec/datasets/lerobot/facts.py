@@ -28,7 +28,6 @@ import pyarrow.parquet as pq
 from demorec.annotate.progress import StageRun, dense_stages, progress, proportions
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import sync_path
-from demorec.core.geometry import Array
 from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 
 if TYPE_CHECKING:
@@ -86,23 +85,17 @@ def write_progress(root: Path) -> None:
         ) from error
     shares = proportions(episodes, tuple(dict.fromkeys(chain.from_iterable(stages))))
     parts = [progress(runs, possible, shares) for runs, possible in zip(episodes, stages, strict=True)]
-    pq.write_table(_progress_table(parts), root / PROGRESS_PATH, use_dictionary=["episode_index"])
+    lengths = [len(part) for part in parts]
+    columns = {
+        "index": np.arange(sum(lengths)),
+        "episode_index": np.repeat(np.arange(len(lengths)), lengths),
+        "frame_index": np.concatenate([np.arange(length) for length in lengths]),
+        "progress_dense": np.concatenate(parts).astype(np.float32),
+    }
+    pq.write_table(pa.table(columns), root / PROGRESS_PATH, use_dictionary=["episode_index"])
     sync_path(root / PROGRESS_PATH)
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2) + "\n")
     sync_path(root / PROPORTIONS_PATH)
-
-
-def _progress_table(parts: Sequence[Array]) -> pa.Table:
-    """Return `index`, `episode_index`, `frame_index` and `progress_dense` (0..1) of every row of these episodes."""
-    lengths = [len(part) for part in parts]
-    return pa.table(
-        {
-            "index": np.arange(sum(lengths)),
-            "episode_index": np.repeat(np.arange(len(lengths)), lengths),
-            "frame_index": np.concatenate([np.arange(length) for length in lengths]),
-            "progress_dense": np.concatenate(parts).astype(np.float32),
-        }
-    )
 
 
 _TYPES: dict[str, pa.DataType] = {

@@ -18,7 +18,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, ExportError, describe_error, resource_error
 from demorec.core.processes import SPAWN, exit_silently
@@ -181,14 +180,9 @@ def _is_wrong_image(tensor: Any, episode: LeRobotEpisode, camera: ExportCamera, 
     """Whether an image differs from the recorded one, for depth beyond the resolution of its codes."""
     number, recording = int(episode.numbers(camera)[moment]), episode.recording
     if camera.is_depth:
-        return _is_wrong_depth(tensor, next(islice(recording.depth(camera.name), number, None)))
+        recorded = next(islice(recording.depth(camera.name), number, None))
+        metres = tensor.numpy().reshape(recorded.shape) / 1000
+        return bool(np.abs(metres - DepthScale().values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
     limit = _TRANSCODED_TOLERANCE if reason_to_transcode(episode, camera) else 0.0
     found = tensor.numpy().transpose(1, 2, 0).astype(np.float64)
     return bool(np.abs(found - recording.numbered_image(camera.name, number)).mean() > limit)
-
-
-def _is_wrong_depth(tensor: Any, recorded: NDArray[np.float32]) -> bool:
-    """Whether distances from LeRobot, mm, differ from the recorded ones (H, W), m, beyond the codes' resolution."""
-    found = tensor.numpy()
-    found = found.reshape(found.shape[-2:]) / 1000
-    return bool(np.abs(found - DepthScale().values()[quantised(recorded)]).max() > _DEPTH_TOLERANCE)
