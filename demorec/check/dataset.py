@@ -61,8 +61,6 @@ class CheckedDataset:
     """
 
     form: ClassVar[Form] = "dataset"
-    has_equal_starts: ClassVar[bool] = False
-    """Not recorded in datasets."""
 
     def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
         self.path = path

@@ -18,11 +18,11 @@ from demorec.check.base import Form
 from demorec.check.evidence import Motion, motion_of_features, motion_of_simulated
 from demorec.check.films import CameraFilms, film_of_recording
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Table, Trajectory, frame_time_ns
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.episode import Table, Trajectory
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
+from demorec.mcap.frames import frame_times
 from demorec.robots.urdf import Urdf
 
 _STAMP_FIRST = {
@@ -86,28 +86,18 @@ class CheckedEpisode(ExitStack):
     def form(self) -> Form:
         """By whether there is a scene; one that cannot be opened counts as simulated."""
         with suppress(RecordingError):
-            return "simulated" if self.info.simulation is not None else "external"
+            return "simulated" if self.recording.info.simulation is not None else "external"
         return "simulated"
 
     @cached_property
     def roles(self) -> Roles:
         """The roles of its features."""
-        return roles_of_recording(self.info, self._named)
-
-    @property
-    def info(self) -> EpisodeInfo:
-        """What was known before the first frame."""
-        return self.recording.info
-
-    @property
-    def table(self) -> Table:
-        """Features of every frame."""
-        return self.recording.table()
+        return roles_of_recording(self.recording.info, self._named)
 
     @cached_property
     def frame_times(self) -> NDArray[np.int64]:
         """(T,) ns: when each frame ought to be."""
-        return np.array([frame_time_ns(t, self.info.fps) for t in range(self.recording.num_frames)], dtype=np.int64)
+        return frame_times(self.recording.num_frames, self.recording.info.fps)
 
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
@@ -122,9 +112,9 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def motions(self) -> list[Motion]:
         """The one of its robot, if it has a state."""
-        info = self.info
+        info = self.recording.info
         if self.form == "external":
-            table, urdf = self.table, self._named_urdf or info.urdf
+            table, urdf = self.recording.table(), self._named_urdf or info.urdf
             motion = motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns, named=self._named)
             return [] if motion is None else [motion]
         if not self.recording.num_frames:
@@ -134,7 +124,7 @@ class CheckedEpisode(ExitStack):
     def numbers(self) -> Iterator[tuple[str, NDArray[Any]]]:
         """(name, (T, ...) table) of all floating-point numbers."""
         numbers: Table | Trajectory
-        numbers = self.table if self.form == "external" else self.recording.trajectory()
+        numbers = self.recording.table() if self.form == "external" else self.recording.trajectory()
         for name, column in vars(numbers).items():
             tables = column.items() if isinstance(column, Mapping) else [(name, column)]
             for key, table in tables:
@@ -144,8 +134,8 @@ class CheckedEpisode(ExitStack):
     @cached_property
     def films(self) -> dict[str, CameraFilms]:
         """Camera -> its colour images."""
-        colours = [camera for camera in self.recording.cameras if camera in self.table.images]
-        return {camera: film_of_recording(self.recording, self.table, camera) for camera in colours}
+        colours = [camera for camera in self.recording.cameras if camera in self.recording.table().images]
+        return {camera: film_of_recording(self.recording, self.recording.table(), camera) for camera in colours}
 
     def undecoded(self) -> Iterator[tuple[str, str]]:
         """(camera, problem) of every camera whose images do not all decode: colours, distances, labels."""

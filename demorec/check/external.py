@@ -36,7 +36,7 @@ def drops(subject: CheckedEpisode) -> Found:
 )
 def rate(subject: CheckedEpisode) -> Found:
     """Compare the mean rate of the frames with the nominal one, which datasets and policies use."""
-    times, fps = subject.table.time_ns, subject.recording.info.fps
+    times, fps = subject.recording.table().time_ns, subject.recording.info.fps
     if len(times) < 2:
         return None
     rate = (len(times) - 1) * _NANOSECONDS / float(times[-1] - times[0])
@@ -51,7 +51,7 @@ def rate(subject: CheckedEpisode) -> Found:
 )
 def gaps(subject: CheckedEpisode) -> Found:
     """Find frames that are missing between others."""
-    steps = np.diff(subject.table.time_ns)
+    steps = np.diff(subject.recording.table().time_ns)
     if not len(steps):
         return None
     frame = int(steps.argmax())
@@ -68,7 +68,7 @@ def gaps(subject: CheckedEpisode) -> Found:
 )
 def sample_age(subject: CheckedEpisode) -> Iterator[Found]:
     """Compare the timestamp of each frame with those of its samples and images."""
-    table = subject.table
+    table = subject.recording.table()
     for name in table.stamps:
         yield worst_frame(np.abs(table.age_ns(name)) / _NANOSECONDS, name)
     for camera, numbers in table.images.items():
@@ -84,7 +84,7 @@ def sample_age(subject: CheckedEpisode) -> Iterator[Found]:
 )
 def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
     """Count the frames without an image, of each camera."""
-    for camera, numbers in subject.table.images.items():
+    for camera, numbers in subject.recording.table().images.items():
         without = np.flatnonzero(numbers == NO_IMAGE)
         if len(numbers):
             first = int(without[0]) if len(without) else None

@@ -43,7 +43,7 @@ def topics(episode: CheckedEpisode) -> Measurement:
     expected: dict[str, tuple[str, int | None]] = {}
     for stream in episode.recording.streams:
         expected[stream.topic] = (stream.schema, num_frames)
-    for camera in episode.info.simulated.scene.cameras:
+    for camera in episode.recording.info.simulated.scene.cameras:
         expected |= {topic: (schema, num_frames) for topic, schema in _image_streams(episode, camera.name)}
         expected[channels.camera_topic(camera.name, "camera_info")] = (messages.CAMERA_INFO, None)
     wrong = []
@@ -84,7 +84,7 @@ def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, 
 def readable(episode: CheckedEpisode) -> Measurement:
     """Decode every message by the layout in the metadata, at its frame's time."""
     words = len(list(episode.recording.events())) + len(episode.recording.subtasks)
-    return Measurement(value=0, detail=f"{episode.table.num_frames} frames, {words} events and subtasks")
+    return Measurement(value=0, detail=f"{episode.recording.table().num_frames} frames, {words} events and subtasks")
 
 
 @file_check(
@@ -133,7 +133,7 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Count the encoded images of each camera: one a frame, at the frame's time, with a keyframe in every GOP."""
     expected = episode.frame_times
-    for camera in episode.info.simulated.scene.cameras:
+    for camera in episode.recording.info.simulated.scene.cameras:
         settings = episode.recording.video_settings(camera.name)
         topic = channels.video_topic(camera.name, settings.codec)
         scan = episode.scan.get(topic)

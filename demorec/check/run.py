@@ -78,11 +78,6 @@ class CheckedRun:
 
         return load_import_file(self.path)
 
-    @property
-    def has_equal_starts(self) -> bool:
-        """Whether every episode starts alike because that was asked for."""
-        return self.form == "run" and self.run.config.fixed
-
     def courses(self) -> dict[str, Array]:
         """Name of each recording in episodes/ that can be read and has a state -> its motion."""
         found: dict[str, Array] = {}
@@ -199,7 +194,7 @@ def duplicates(subject: CheckedRun | CheckedDataset) -> Found:
     motions = subject.courses()
     if len(motions) < 2:
         return NotMeasured(why="it needs two episodes")
-    if subject.has_equal_starts:
+    if subject.form == "run" and subject.run.config.fixed:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     copies = _copies(list(motions.values()))
     detail = f"{len(motions)} different motions"

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.annotate import KINDS, LanguageKind
-from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, OptionError, check_option
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
@@ -69,11 +68,6 @@ class ExportOptions(CommonOptions):
     """Codec of images that cannot be taken as they are (jpeg, or --fps between keyframes)."""
     transcode_crf: int | None = 18
     """Constant rate factor of such images, smaller is better; auto is that of a recording."""
-
-    @property
-    def transcode(self) -> VideoConfig:
-        """How images are encoded that cannot be taken as they are."""
-        return VideoConfig(codec=self.transcode_codec, crf=self.transcode_crf)
 
     @property
     def spoken(self) -> tuple[LanguageKind, ...]:

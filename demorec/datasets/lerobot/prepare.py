@@ -14,6 +14,7 @@ from demorec.annotate.attempts import episode_timeline
 from demorec.annotate.boxes import seen_objects
 from demorec.annotate.progress import dense_runs
 from demorec.annotate.statements import episode_statements
+from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import SeenByCamera
@@ -214,8 +215,9 @@ def _lead(recording: Recording, camera: str, number: int) -> int:
 
 def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[EncodedVideo, VideoSettings]:
     """Encode the images of a camera again, one a frame."""
-    size = episode.recording.video_settings(camera.name)
-    encoder = make_encoder(video=episode.options.transcode, width=size.width, height=size.height, fps=episode.fps)
+    size, options = episode.recording.video_settings(camera.name), episode.options
+    video = VideoConfig(codec=options.transcode_codec, crf=options.transcode_crf)
+    encoder = make_encoder(video=video, width=size.width, height=size.height, fps=episode.fps)
     units = [unit for image in episode.images(camera) for unit in encoder.encode(image)]
     units += encoder.finish()
     lengths = [len(unit) for unit in units]

@@ -20,10 +20,11 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
-from demorec.episode.episode import Event, Outcome, Table, frame_time_ns
+from demorec.episode.episode import Event, Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.roles import Roles
+from demorec.mcap.frames import frame_times
 from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
@@ -167,7 +168,7 @@ class DatasetRecording:
     def _table(self) -> Table:
         leads = {name: self._lead(name) for name in self.dataset.keys}
         begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
-        times = np.array([frame_time_ns(index, fps) for index in range(begin + self.num_frames)], dtype=np.int64)
+        times = frame_times(begin + self.num_frames, fps)
         if self.measured_ns is not None:  # behind the images that come before the first frame
             times[begin:] = self.measured_ns + times[begin]
         features = {item.name: self._rows[item.name].astype(item.dtype) for item in self.dataset.features}

@@ -57,8 +57,12 @@ class DataRows:
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """Yield the rows of an episode."""
         found = 0
-        if place.length:
-            self._check_count(place)
+        there, listed = (self._tables.num_rows(place.data), self._num_rows[place.data]) if place.length else (0, 0)
+        if there > listed:
+            raise ExportError(
+                f"The data file has {there} rows, the episodes' table only lists {listed} of them, so that it is not "
+                f"complete: {place.data}"
+            )
         for batch in self._tables.read(place.data, place.first_row, place.length) if place.length else ():
             _check_own(batch, place, found)
             found += len(batch)
@@ -66,15 +70,6 @@ class DataRows:
         if found < place.length:
             raise ExportError(
                 f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {place.data}"
-            )
-
-    def _check_count(self, place: EpisodePlace) -> None:
-        """Raise ExportError if the episodes' table lists fewer rows than the file of an episode has."""
-        there, listed = self._tables.num_rows(place.data), self._num_rows[place.data]
-        if there > listed:
-            raise ExportError(
-                f"The data file has {there} rows, the episodes' table only lists {listed} of them, so that it is not "
-                f"complete: {place.data}"
             )
 
     def read(self, place: EpisodePlace) -> pa.Table:

@@ -197,7 +197,7 @@ def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter |
 
 
 def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[RemakeDifference]:
-    """Ordered by the first frame."""
+    """Ordered by the first frame, what belongs to no frame first."""
     found, made = Contents.of(recording.path), Contents.of(again)
     with open_simulated(again) as remade:
         if recording.is_recovered:
@@ -209,7 +209,7 @@ def _differences(recording: Recording, again: Path, simulators: SimulatorCache) 
             assert painter is not None, "images were drawn"
             cameras = coded_topics(remade.info)
             differences += image_differences(found, made, remade, painter, cameras, images)
-    yield from sorted(differences, key=lambda difference: difference.first_frame)
+    yield from sorted(differences, key=lambda difference: difference.frames[:1])
 
 
 def _replayed(recording: Recording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:

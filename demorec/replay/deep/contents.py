@@ -58,11 +58,6 @@ class RemakeDifference:
     largest: float | None = None
     is_coding: bool = False
 
-    @property
-    def first_frame(self) -> int:
-        """For the order: what belongs to no frame comes first."""
-        return self.frames[0] if self.frames else -1
-
     def __str__(self) -> str:
         where = f"{self.stream} {self.field}"
         if self.frames:
