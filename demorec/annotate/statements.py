@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from demorec.annotate import KINDS, LanguageKind, Statement
 from demorec.annotate.attempts import PhaseSegment, episode_timeline
-from demorec.annotate.situation import Surroundings, situation
+from demorec.annotate.referring import Surroundings, situation
 from demorec.annotate.subtasks import goal_words, memories, motion, plan, subtask
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array

@@ -6,8 +6,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from demorec.annotate.attempts import EpisodeTimeline, GoalAttempt, PhaseSegment
-from demorec.annotate.referring import phrase_for
-from demorec.annotate.situation import Surroundings, place_of
+from demorec.annotate.referring import Surroundings, phrase_for, place_of
 from demorec.core.geometry import Array
 from demorec.episode.scene import Scene
 from demorec.episode.words import VESSELS, nouns_of

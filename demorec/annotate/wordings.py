@@ -12,8 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from demorec.annotate.referring import phrases_for, references, resolve
-from demorec.annotate.situation import Surroundings, place_of, situation
+from demorec.annotate.referring import Surroundings, phrases_for, place_of, references, resolve, situation
 from demorec.annotate.subtasks import joined, prepositions
 from demorec.episode.scene import Goal, Scene
 

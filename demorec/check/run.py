@@ -194,7 +194,7 @@ def duplicates(subject: CheckedRun | CheckedDataset) -> Found:
     motions = subject.courses()
     if len(motions) < 2:
         return NotMeasured(why="it needs two episodes")
-    if subject.form == "run" and subject.run.config.fixed:
+    if isinstance(subject, CheckedRun) and subject.form == "run" and subject.run.config.fixed:
         return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
     copies = _copies(list(motions.values()))
     detail = f"{len(motions)} different motions"

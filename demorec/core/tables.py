@@ -96,7 +96,7 @@ CHECKS: Registry[Check] = Registry(
     rows=_named_alike(
         "demorec.check",
         ("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps", "video_frames"),
-        ("external", "drops", "rate", "gaps", "sample_age", "missing_images"),
+        ("file", "drops", "rate", "gaps", "sample_age", "missing_images"),
         ("images", "images_decode"),
         ("motion", "finite_numbers", "joint_limits", "velocity_matches_position"),
         ("kinematics", "forward_kinematics"),

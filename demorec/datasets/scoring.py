@@ -42,7 +42,6 @@ _KIND = "scores of demorec"
 _NORMAL = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
 
-
 _QUANTITIES: Mapping[str, tuple[float, str]] = {
     "pause": (0.1, "stands still for {value:.1f} s amid the motion, usual are {usual:.1f} s"),
     "path": (0.1, "goes a detour of {value:.0%} of the range, usual are {usual:.0%}"),

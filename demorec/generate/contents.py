@@ -167,7 +167,6 @@ def _is_unfinished(name: str) -> bool:
 
 RUN = ReplaceableKind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)
 
-
 Inspector = Callable[[Path], tuple[Attempt, Mapping[str, Any], Mapping[str, str]]]
 """Reads all of a recording, as `inspect_recording` does; DemorecError or OSError when it is none."""
 

@@ -16,7 +16,7 @@ from support.export import data_table, episode_rows, export, files_of
 from support.language import active, language_of, meant, phrases, scene_at
 
 from demorec.annotate import KINDS
-from demorec.annotate.situation import place_of
+from demorec.annotate.referring import place_of
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS

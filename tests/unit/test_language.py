@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from support.recording import make_episode
 
-from demorec.annotate.referring import phrase_for, phrases_for, resolve
-from demorec.annotate.situation import situation
+from demorec.annotate.referring import phrase_for, phrases_for, resolve, situation
 from demorec.annotate.statements import episode_statements
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Event

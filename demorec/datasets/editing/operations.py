@@ -35,7 +35,6 @@ _EQUALITIES = (ast.Eq, ast.NotEq)
 _Value = Callable[[Mapping[str, Any]], Any]
 """Value of a part of a condition, by an episode's columns."""
 
-
 Rows = Sequence[Mapping[str, Any]]
 """Values of each episode in order, as `episode_columns` reads them."""
 

@@ -65,7 +65,6 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
     "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
 }
 
-
 _SIMULATED_ROWS = (
     "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
     "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "

@@ -41,7 +41,6 @@ REPEATING = tuple(f"{name}.list.element.{item}" for name in COLUMNS for item in 
 REPEATING += (f"{PERSISTENT}.list.element.timestamp",)
 """Parquet's names of the parts whose values come again and again."""
 
-
 _AT_ONCE = 16
 """How many rows of an episode are made in one step."""
 

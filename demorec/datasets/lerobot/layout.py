@@ -316,7 +316,6 @@ _PLAIN_FIELDS = (
 )  # fmt: skip
 _INFO_FIELDS = frozenset(("fps", "robot_type", "video_path", *_PLAIN_FIELDS))
 
-
 _ENCODER_INFO = ("video.g", "video.crf", "video.preset", "video.fast_decode", "video.extra_options")
 
 

@@ -40,7 +40,6 @@ _TRANSCODED_TOLERANCE = 12.0
 _DEPTH_TOLERANCE = 6e-4
 """Metres; LeRobot rounds distances to millimetres."""
 
-
 _GRACE_S = 5.0
 """Time for the process to end by itself."""
 

@@ -43,7 +43,6 @@ _TEMPORAL_DELIMITER = b"\x12\x00"
 _MAX_REORDERED = 32
 """Images by which one is stored before it is shown; codecs allow 16."""
 
-
 OpenedVideo = tuple[av.container.InputContainer, av.video.stream.VideoStream]
 
 
