@@ -22,7 +22,7 @@ from demorec.episode.episode import Table, Trajectory
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
-from demorec.mcap.frames import frame_times
+from demorec.mcap.streams import frame_times
 from demorec.robots.urdf import Urdf
 
 _STAMP_FIRST = {

@@ -24,8 +24,8 @@ from demorec.episode.episode import Event, Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
 from demorec.episode.roles import Roles
-from demorec.mcap.frames import frame_times
 from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
+from demorec.mcap.streams import frame_times
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
 _SUCCESS = "next.success"
