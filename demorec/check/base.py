@@ -23,7 +23,7 @@ Form = Literal["simulated", "external", "run", "external run", "dataset"]
 """What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
 Group = Literal["file", "time", "physics", "alignment", "images", "run", "dataset"]
 
-_BLOCKED = "it needs what is damaged"
+BLOCKED = "it needs what is damaged"
 NOTHING = "nothing to measure"
 
 SCENE = "a simulated scene"
@@ -121,10 +121,6 @@ class Check:
         level: Level = "pass" if found.value <= self.warn else "warn" if found.value <= self.fail else "fail"
         return self._result(level, found)
 
-    def blocked(self) -> Result:
-        """The result of a check that needs what another one has found to be damaged."""
-        return self.skipped(_BLOCKED)
-
     def skipped(self, why: str) -> Result:
         """The result of a check that could not be run."""
         return self._result("skip", Measurement(value=math.nan, detail=why))
@@ -172,7 +168,7 @@ class Result:
     @property
     def is_blocked(self) -> bool:
         """Whether nothing was measured since what it needs is damaged, which another check tells."""
-        return self.level == "skip" and self.detail == _BLOCKED
+        return self.level == "skip" and self.detail == BLOCKED
 
 
 def check(

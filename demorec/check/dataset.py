@@ -38,14 +38,12 @@ class DescribedEpisode:
     Attributes:
         number: Its `episode_index`.
         rows: Feature -> (T, D).
-        tasks: Instructions.
         kept: Its row of the sidecar.
         info: What was known before its first frame.
     """
 
     number: int
     rows: Rows
-    tasks: tuple[str, ...]
     kept: dict[str, Any]
     info: EpisodeInfo
 
@@ -161,26 +159,19 @@ class CheckedDataset:
 
     def described(self) -> list[DescribedEpisode]:
         """The simulated episodes that the sidecar describes, in order; LeRobot's `resume` adds some without."""
-        found = [
-            DescribedEpisode(
-                number=number,
-                rows=self.rows[number],
-                tasks=self.folder.listed[number].tasks,
-                kept=row,
-                info=self._info_of(row),
-            )
-            for row in self.sidecar
-            if row["episode_info"] is not None and (number := row["episode_index"]) in self.rows
-        ]
+        found = []
+        for row in self.sidecar:
+            number = row["episode_index"]
+            if row["episode_info"] is None or number not in self.rows:
+                continue
+            try:
+                info = read_episode_info(row["episode_info"])
+            except (ValueError, KeyError, TypeError) as error:
+                raise ExportError(
+                    f"The sidecar's episode_info cannot be used ({describe_error(error)}): {self.path}"
+                ) from error
+            found.append(DescribedEpisode(number=number, rows=self.rows[number], kept=row, info=info))
         return sorted(found, key=lambda episode: episode.number)
-
-    def _info_of(self, row: Mapping[str, Any]) -> EpisodeInfo:
-        try:
-            return read_episode_info(row["episode_info"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise ExportError(
-                f"The sidecar's episode_info cannot be used ({describe_error(error)}): {self.path}"
-            ) from error
 
 
 Episodes = CheckedEpisode | CheckedDataset

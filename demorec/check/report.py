@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.base import Check, Form, Level, Result
+from demorec.check.base import BLOCKED, Check, Form, Level, Result
 from demorec.check.dataset import CheckedDataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
@@ -197,10 +197,10 @@ def _run(options: CheckOptions, subject: Checked) -> list[Result]:
         result = check.run(subject)
         if result.level == "fail" and result.value is None:
             if result.detail in unreadable:
-                result = check.blocked()
+                result = check.skipped(BLOCKED)
             unreadable.add(result.detail)
         results.append(result)
         if check.name == "opens" and result.level == "fail":
-            results += [other.blocked() for other in checks if other is not check]
+            results += [other.skipped(BLOCKED) for other in checks if other is not check]
             break
     return results

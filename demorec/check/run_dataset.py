@@ -99,7 +99,8 @@ def episode_differences(
             raise lack from error
         yield f"its recording gives no such episode ({describe_error(error)})", ()
         return
-    if episode.tasks != (expected.info.instruction,):
+    place = dataset.folder.listed[episode.number]
+    if place.tasks != (expected.info.instruction,):
         yield "instruction", ()
     for name, values in columns.items():
         found, true = episode.rows.get(name), values.reshape(len(values), -1)
@@ -107,7 +108,7 @@ def episode_differences(
             yield name, ()
         elif len(frames := np.flatnonzero((found != true).any(axis=1))):
             yield name, tuple(frames.tolist())
-    videos = video_digests(dataset.folder, dataset.folder.listed[episode.number])
+    videos = video_digests(dataset.folder, place)
     for key, video in recorded.items():
         if videos.get(key) != video.digest:
             yield key, ()

@@ -23,7 +23,7 @@ from demorec.core.errors import DemorecError, ExportError, describe_error, resou
 from demorec.core.processes import SPAWN, exit_silently
 from demorec.datasets.episode import ExportCamera
 from demorec.datasets.lerobot.depth import DepthScale, quantised
-from demorec.datasets.lerobot.language import EVENTS, PERSISTENT, EpisodeLanguage
+from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.motor_units import export_episode
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.prepare import LeRobotEpisode, language_of, reason_to_transcode
@@ -152,7 +152,8 @@ def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, 
             for name, values in episode.columns.items()
             if name in item and not np.array_equal(np.ravel(item[name]), np.ravel(values[moment]))
         ]
-        wrong += _wrong_language(item, language, moment)
+        said = {PERSISTENT: language.persistent, EVENTS: language.events.get(moment, ())}
+        wrong += [name for name, expected in said.items() if name in item and item[name] != list(expected)]
         if item["task"] != episode.info.instruction:
             wrong.append("task")
         if float(item["timestamp"]) != float(np.float32(moment / dataset.meta.fps)):
@@ -168,11 +169,6 @@ def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, 
                 f"{episode_index} differ from the recording: {episode.recording.path}"
             )
     return len(moments)
-
-
-def _wrong_language(item: Any, expected: EpisodeLanguage, moment: int) -> list[str]:
-    rows = {PERSISTENT: expected.persistent, EVENTS: expected.events.get(moment, ())}
-    return [name for name, expected in rows.items() if name in item and item[name] != list(expected)]
 
 
 def _is_wrong_image(tensor: Any, episode: LeRobotEpisode, camera: ExportCamera, moment: int) -> bool:
