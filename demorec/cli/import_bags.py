@@ -84,9 +84,9 @@ class Import:
         check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
         form, motors = FORMATS.get(word), named_motors(self.motor_units, self.calibration)
-        if motors is not None and (form is None or not form.has_motor_units):
+        if motors is not None and (form is None or form.mapping):
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
-        if self.roles.named and (form is None or not form.has_roles):
+        if self.roles.named and (form is None or form.mapping):
             raise ConfigError(
                 "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
                 "bags and HDF5 files say it in their mapping."
@@ -114,7 +114,7 @@ class Import:
         return self._import_bags(self.bags, self.mapping, self.out)
 
     def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path], motors: Motors | None) -> int:
-        if (self.skip_bad and not form.can_skip) or self.workers > 1:
+        if (self.skip_bad and form.mapping) or self.workers > 1:
             raise ConfigError(
                 "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
                 "--workers, --skip-bad out."

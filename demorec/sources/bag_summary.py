@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.sources.bag import open_bag
+from demorec.sources.bag_files import MAX_TIME_NS
 
 NS = 1_000_000_000
 
@@ -23,7 +24,7 @@ class TopicSummary:
 
     type: str
     count: int = 0
-    first_ns: int = 0
+    first_ns: int = MAX_TIME_NS
     last_ns: int = 0
 
     @property
@@ -31,6 +32,11 @@ class TopicSummary:
         """Mean rate by the times of recording; 0 for fewer than two messages."""
         span_s = (self.last_ns - self.first_ns) / NS
         return (self.count - 1) / span_s if self.count > 1 and span_s > 0 else 0.0
+
+    def add(self, time_ns: int) -> None:
+        """Count a message that was recorded at this time."""
+        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
+        self.count += 1
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -73,10 +79,6 @@ def summarize_bag(path: Path) -> BagSummary:
     problems: list[str] = []
     topics: dict[str, TopicSummary] = {}
     for message in bag.messages(problems):
-        name, time_ns = message.channel.topic, message.log_ns
-        topic = topics.get(name)
-        if topic is None:
-            topic = topics[name] = TopicSummary(type=message.channel.type, first_ns=time_ns, last_ns=time_ns)
-        topic.count += 1
-        topic.first_ns, topic.last_ns = min(topic.first_ns, time_ns), max(topic.last_ns, time_ns)
+        topic = topics.setdefault(message.channel.topic, TopicSummary(type=message.channel.type))
+        topic.add(message.log_ns)
     return BagSummary(num_bytes=bag.num_bytes, topics=dict(sorted(topics.items())), problems=tuple(problems))

@@ -61,16 +61,7 @@ def import_lerobot(
         ExportError: It is damaged, or not at its rate.
         RecordingError: A number is not finite, or the disk is full.
     """
-    if len(roots) != 1:
-        raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
-    root = roots[0]
-    expect(root, "dataset")
-    dataset = LeRobotFolder(root, motors, named)
-    state = dataset.roles.elements(dataset.roles.state)  # ConfigError if a named feature is missing
-    if parts := [name for name in named.gripper if name in state and name not in dataset.info.features]:
-        raise ConfigError(f"An import takes whole features: --gripper names {parts[0]!r}, an element of the state.")
-    if not dataset.places:
-        raise ConfigError(f"The dataset has no episodes: {root}")
+    dataset = _opened(roots, motors, named)
     left_out = _left_out(dataset)
     episodes = _Episodes(skip_bad=skip_bad)
     survey = _surveyed(dataset, episodes)
@@ -99,6 +90,20 @@ def import_lerobot(
         left_out=left_out,
         skipped={f"episode {index}": reason for index, reason in episodes.skipped.items()},
     )
+
+
+def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> LeRobotFolder:
+    if len(roots) != 1:
+        raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
+    root = roots[0]
+    expect(root, "dataset")
+    dataset = LeRobotFolder(root, motors, named)
+    state = dataset.roles.elements(dataset.roles.state)  # ConfigError if a named feature is missing
+    if parts := [name for name in named.gripper if name in state and name not in dataset.info.features]:
+        raise ConfigError(f"An import takes whole features: --gripper names {parts[0]!r}, an element of the state.")
+    if not dataset.places:
+        raise ConfigError(f"The dataset has no episodes: {root}")
+    return dataset
 
 
 @dataclass(kw_only=True)
