@@ -114,7 +114,8 @@ class Replay:
             if out is None and self.view:
                 out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="demorec-replay-")))
             if out is not None:
-                _check_out(self.paths, out)
+                targets = [out / file.name for path in self.paths for file in _replayable(path).recordings]
+                refuse_sources(self.paths, targets or [out], do="replay")
             found = demonstrations(self.paths, options, episodes=self.episodes)
             reports: list[ReplayReport] = []
             pairs: list[tuple[Path, Path]] = []
@@ -144,12 +145,6 @@ class Replay:
             if self.view:
                 _show(pairs)
         return 0 if all(good) else 1
-
-
-def _check_out(paths: Sequence[Path], out: Path) -> None:
-    """Refuse to write replays into what is replayed, or over each other."""
-    targets = [out / file.name for path in paths for file in _replayable(path).recordings]
-    refuse_sources(paths, targets or [out], do="replay")
 
 
 def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:

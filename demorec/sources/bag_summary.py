@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from demorec.sources.bag import open_bag
 from demorec.sources.bag_files import MAX_TIME_NS
@@ -39,37 +39,8 @@ class TopicSummary:
         self.count += 1
 
 
-@dataclass(frozen=True, kw_only=True)
-class BagSummary:
-    """A bag as far as it can be read.
-
-    Attributes:
-        num_bytes: Size of its files.
-        topics: Topic -> its messages, sorted by topic.
-        problems: Why parts of it could not be read.
-    """
-
-    num_bytes: int
-    topics: Mapping[str, TopicSummary]
-    problems: tuple[str, ...]
-
-    @property
-    def num_messages(self) -> int:
-        """Number of messages of all topics."""
-        return sum(topic.count for topic in self.topics.values())
-
-    @property
-    def span_s(self) -> float:
-        """Seconds from the first message to the last; 0 for none."""
-        if not self.topics:
-            return 0.0
-        first_ns = min(topic.first_ns for topic in self.topics.values())
-        last_ns = max(topic.last_ns for topic in self.topics.values())
-        return (last_ns - first_ns) / NS
-
-
-def summarize_bag(path: Path) -> BagSummary:
-    """Read a bag to its end and count the messages of each topic.
+def summarize_bag(path: Path) -> dict[str, Any]:
+    """Read a bag as far as it can be read, and count the messages of each topic, as `demorec info --json` prints it.
 
     Raises:
         ConfigError: There is no bag.
@@ -81,4 +52,17 @@ def summarize_bag(path: Path) -> BagSummary:
     for message in bag.messages(problems):
         topic = topics.setdefault(message.channel.topic, TopicSummary(type=message.channel.type))
         topic.add(message.log_ns)
-    return BagSummary(num_bytes=bag.num_bytes, topics=dict(sorted(topics.items())), problems=tuple(problems))
+    first_ns = min((topic.first_ns for topic in topics.values()), default=0)
+    last_ns = max((topic.last_ns for topic in topics.values()), default=0)
+    return {
+        "kind": "bag",
+        "path": str(path),
+        "bytes": bag.num_bytes,
+        "seconds": (last_ns - first_ns) / NS,
+        "messages": sum(topic.count for topic in topics.values()),
+        "topics": [
+            {"topic": name, "type": topic.type, "messages": topic.count, "rate": topic.rate_hz}
+            for name, topic in sorted(topics.items())
+        ],
+        "problems": problems,
+    }
