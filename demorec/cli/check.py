@@ -10,13 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, describe_error
-from demorec.robots.motors import MotorUnits
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
@@ -55,12 +53,7 @@ class CheckCommand:
     urdf: Path | None = None
     """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
     their names, or by their order."""
-    motor_units: MotorUnits | None = None
-    """For datasets that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether the joints are in
-    degrees, LeRobot's default, or scaled to -100..100 of their ranges. The dataset itself does not say so."""
-    calibration: Path | None = None
-    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
-    says)."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     strict: bool = False
     """Warnings count as failures."""
@@ -99,7 +92,7 @@ class CheckCommand:
             workers=workers,
             lerobot=self.lerobot,
             urdf=self._description(),
-            motors=named_motors(self.motor_units, self.calibration),
+            motors=self.motors.named,
             named=self.roles.named,
         )
         options.validate()

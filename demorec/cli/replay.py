@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.registry import modules_of
 from demorec.core.tables import load_robot
 from demorec.core.targets import OptionalTarget
-from demorec.robots.motors import MotorUnits
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -69,12 +67,7 @@ class Replay:
     """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
     robot: str = ""
     """The arm that does what a real one did: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
-    motor_units: MotorUnits | None = None
-    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
-    degrees, LeRobot's default, or scaled to -100..100 of their ranges."""
-    calibration: Path | None = None
-    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
-    says)."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     out: OptionalTarget = None
     """Folder for recordings of the replays, images included."""
@@ -103,7 +96,7 @@ class Replay:
             seed=self.seed,
             allowed=allowed,
             robot=load_robot(self.robot, allowed) if self.robot else None,
-            motors=named_motors(self.motor_units, self.calibration),
+            motors=self.motors.named,
             named=self.roles.named,
         )
         if options.robot is not None and (self.out is not None or self.view):

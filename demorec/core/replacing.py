@@ -61,13 +61,7 @@ REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
 REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
 
 
-def check_replaceable(
-    target: Path,
-    kind: ReplaceableKind,
-    *,
-    overwrite: bool,
-    sources: Iterable[Path] = (),
-) -> None:
+def check_replaceable(target: Path, kind: ReplaceableKind, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
     """Raise unless `target` is free, or may be replaced by something of its kind and the user asks for that.
 
     An empty folder counts as free; an empty file does not, since somebody's lock or mark may be one.

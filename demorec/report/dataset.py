@@ -28,7 +28,6 @@ from demorec.report.content import CheckSummaries, Components, Report, ReportedE
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 
 _SUCCESS = "next.success"
-_NUMBERS = ("float32", "float64", "int64", "bool")
 _MAX_COMPONENTS = 64
 """Of one feature that are drawn."""
 _EPISODE_COLUMNS = (

@@ -80,14 +80,14 @@ def import_bags(
         was_unfinished = bool(json_object(out / RUN_NAME).get("planned"))
         if new or was_unfinished or (known.bags and batch.skipped_bags() != known.skipped):
             with open_external_run(out, recovers=False) as folder:
-
-                def read(bag: Bag) -> Future[PlannedBag]:
-                    return submit(plan_bag, bag, mapping, urdf, video)
-
-                def write(planned: PlannedBag) -> Future[_Written]:
-                    return submit(write_bag, planned, folder.path, video)
-
-                batch.run(new, folder, read, write, ahead=1 if workers == 1 else 2 * workers, tell=tell)
+                batch.run(
+                    new,
+                    folder,
+                    lambda bag: submit(plan_bag, bag, mapping, urdf, video),
+                    lambda planned: submit(write_bag, planned, folder.path, video),
+                    ahead=1 if workers == 1 else 2 * workers,
+                    tell=tell,
+                )
     return batch
 
 
