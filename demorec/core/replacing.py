@@ -198,7 +198,7 @@ def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
     if not os.path.lexists(aside):
         return False
     found = {path.name for path in aside.iterdir()} if aside.is_dir() and not aside.is_symlink() else {"no folder"}
-    if not found <= {_MARK, *names} or (found and _MARK not in found):
+    if not found <= {_MARK, *names} or (found and not (aside / _MARK).is_file()):
         raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {aside}")
     return bool(found)
 
