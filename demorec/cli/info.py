@@ -92,7 +92,7 @@ def _bag_or_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.sources.bag_summary import summarize_bag
+    from demorec.sources.bag import summarize_bag
 
     plain = summarize_bag(path)
     length = f"{plain['seconds']:.2f} s, {counted(plain['messages'], 'message')}"

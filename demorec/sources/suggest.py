@@ -19,9 +19,8 @@ import numpy as np
 from demorec.episode.info import DEPTH_UNITS
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
-from demorec.sources.bag import Bag, open_bag
+from demorec.sources.bag import Bag, TopicSummary, open_bag
 from demorec.sources.bag_files import BagError
-from demorec.sources.bag_summary import TopicSummary
 from demorec.sources.candidates import Candidate, Choice, candidates_of, choose_features, of_publishers
 from demorec.sources.clock import NS, SKEW_S
 from demorec.sources.decoding import BagDecoder, UnknownEncodingError
