@@ -26,7 +26,7 @@ from demorec.core.tables import CAMERAS, TASKS, environment_name
 from demorec.episode import features
 from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
-from demorec.episode.info import EpisodeInfo
+from demorec.episode.info import EpisodeInfo, Feature
 from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Scene
 from demorec.episode.simulated import on_request, with_simulation
@@ -40,7 +40,6 @@ SUCCESS_FRAMES = 5
 """For how many frames in a row every check of the task must hold."""
 SECONDS_PER_GOAL = 15.0
 """Time limit for each object to be moved, about twice what the expert takes."""
-
 PROBED_SCENES = 16
 """How many scenes are looked at to tell whether the number of objects varies."""
 
@@ -161,19 +160,15 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
         info = self.episode.info
-        known = {feature.name: feature for feature in on_request(info)}
-        self._sensed = tuple(known[check_choice("sensed", name, tuple(known))] for name in sensed)
-        self._max_episode_steps = episode_length or round(
-            SECONDS_PER_GOAL * config.fps * max(1, len(info.simulated.scene.goals))
-        )
+        self._sensed = _on_request(info, sensed)
+        num_goals = max(1, len(info.simulated.scene.goals))
+        self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * num_goals)
         self.privileged = self._is_privileged() if privileged is None else privileged
         self._vector_lengths = self._lengths(info)
         self.observation_space = _observation_space(info, self._vector_lengths)
         low, high = (bound.astype(np.float32) for bound in action_bounds(info.simulated.robot, action, fps=config.fps))
         self.action_space = spaces.Box(low, high)
         self._simulators, self._viewers = SimulatorCache(), WarmRenderer()
-
-    # ------------------------------------------------------------------------------------------------ what it is at
 
     @property
     def keys(self) -> dict[str, str]:
@@ -209,8 +204,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     def task_description(self) -> str:
         """The present episode's instruction, LeRobot's task text."""
         return self.info.instruction
-
-    # ------------------------------------------------------------------------------------------------ gymnasium's
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -273,10 +266,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             return None
         _after_reset(self._situation)
         if self._viewer is None:
-            width, height = self._render_size
-            camera = CAMERAS.load(self._render_camera).camera(
-                self._render_camera, self.info.simulated.robot, width=width, height=height
-            )
+            name, (width, height) = self._render_camera, self._render_size
+            camera = CAMERAS.load(name).camera(name, self.info.simulated.robot, width=width, height=height)
             self._viewer = Painter(self._viewers.of(self.config.renderer), (camera,), antialias=self.config.antialias)
             self._viewer.setup(self.world)
         return self._viewer.images()[self._render_camera].color
@@ -289,18 +280,15 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
             self._viewers.close()
         self._viewer = self._session = self._situation = None
 
-    # ------------------------------------------------------------------------------------------------ parts
-
     def _prepare(self, index: int, scene: Scene | None) -> PreparedEpisode:
         """The first attempt at this episode for which a layout is found, as the generator does it."""
         for attempt in range(self.config.max_attempts):
             try:
                 episode = prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))
+                break
             except SceneError:
                 if attempt == self.config.max_attempts - 1:
                     raise
-                continue
-            break
         if scene is None:
             return episode
         scene = replace(scene, cameras=episode.info.simulated.scene.cameras)
@@ -310,12 +298,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         """The default: without cameras, and with as many objects in each of the first scenes."""
         if self.config.cameras:
             return False
-        infos = [self._prepare(index, None).info for index in range(PROBED_SCENES)]
-        # A round object has no yaw, so that its vector is shorter.
-        names = (
-            features.observation_names(info.simulated.robot, info.simulated.scene, privileged=True) for info in infos
-        )
-        return len({len(of_scene[features.ENVIRONMENT_STATE]) for of_scene in names}) == 1
+        lengths = set()
+        for index in range(PROBED_SCENES):
+            simulated = self._prepare(index, None).info.simulated
+            names = features.observation_names(simulated.robot, simulated.scene, privileged=True)
+            lengths.add(len(names[features.ENVIRONMENT_STATE]))  # a round object has no yaw: its vector is shorter
+        return len(lengths) == 1
 
     def _lengths(self, info: EpisodeInfo) -> dict[str, int]:
         """Dataset feature -> how many numbers it has."""
@@ -341,10 +329,11 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         )
 
     def _observation(self, situation: Situation) -> dict[str, Any]:
+        simulated = self.info.simulated
         vectors = features.observation_vectors(
             ObservationRows.of_observation(situation.observation),
-            self.info.simulated.robot,
-            self.info.simulated.scene,
+            simulated.robot,
+            simulated.scene,
             privileged=self.privileged,
             state=self._state_kind,
             sensed=self._sensed,
@@ -366,16 +355,19 @@ def _checked(render_mode: str | None) -> str | None:
     return render_mode
 
 
+def _on_request(info: EpisodeInfo, names: Collection[str]) -> tuple[Feature, ...]:
+    known = {feature.name: feature for feature in on_request(info)}
+    return tuple(known[check_choice("sensed", name, tuple(known))] for name in names)
+
+
 def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
     found: dict[str, spaces.Space[Any]] = {
         _key(name): spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
         for name, length in vector_lengths.items()
     }
     if info.simulated.scene.cameras:
-        images = {
-            camera.name: spaces.Box(0, 255, shape=(camera.height, camera.width, 3), dtype=np.uint8)
-            for camera in info.simulated.scene.cameras
-        }
+        sizes = {camera.name: (camera.height, camera.width, 3) for camera in info.simulated.scene.cameras}
+        images = {name: spaces.Box(0, 255, shape=size, dtype=np.uint8) for name, size in sizes.items()}
         found["pixels"] = spaces.Dict(images)
     return spaces.Dict(found)
 

@@ -53,7 +53,6 @@ COMMANDS: Registry[type[Command]] = Registry(
     },
 )
 
-
 _LONGEST = 4000
 """Of an error's sentence."""
 

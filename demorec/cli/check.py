@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, describe_error
-from demorec.robots.motors import MotorUnits
 
 if TYPE_CHECKING:
     from demorec.check.base import Level, Result
@@ -55,12 +53,7 @@ class CheckCommand:
     urdf: Path | None = None
     """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
     their names, or by their order."""
-    motor_units: MotorUnits | None = None
-    """For datasets that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether the joints are in
-    degrees, LeRobot's default, or scaled to -100..100 of their ranges. The dataset itself does not say so."""
-    calibration: Path | None = None
-    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
-    says)."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     strict: bool = False
     """Warnings count as failures."""
@@ -99,7 +92,7 @@ class CheckCommand:
             workers=workers,
             lerobot=self.lerobot,
             urdf=self._description(),
-            motors=named_motors(self.motor_units, self.calibration),
+            motors=self.motors.named,
             named=self.roles.named,
         )
         options.validate()
@@ -140,7 +133,9 @@ class CheckCommand:
         from demorec.replay.deep.check import deep_checks, deep_dataset_checks
 
         allowed = allowed_modules(self.allow)
-        paths, datasets = _split(subjects)
+        paths = [subject.path for subject in subjects if subject.kind == "recording"]
+        runs = [subject.path for subject in subjects if subject.kind == "run"]  # whose datasets hold the same episodes
+        datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
         found = [deep_checks(paths, workers=workers, allowed=allowed)]
         found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
         with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
@@ -149,13 +144,6 @@ class CheckCommand:
                 if not self.json:
                     say(*deep_lines(report, verbose=self.verbose))
                 yield report
-
-
-def _split(subjects: Sequence[Subject]) -> tuple[list[Path], list[Path]]:
-    """Recordings, and datasets but for those of the runs, which hold the same episodes once more."""
-    runs = [subject.path for subject in subjects if subject.kind == "run"]
-    datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
-    return [subject.path for subject in subjects if subject.kind == "recording"], datasets
 
 
 def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
@@ -170,33 +158,29 @@ def _lines(report: SubjectReport, *, verbose: bool) -> Iterator[str]:
     counts = ", ".join(f"{numbers[level]} {word}" for level, word in words if numbers[level])
     counts = counts or f"none of the chosen checks is about a {report.kind}"
     yield f"{report.level:<4}  {report.kind} {report.path}: {counts}"
-    yield from _noted([report])
+    yield from _once(report.notes)
     for result in report.results:
         if result.level in ("warn", "fail") or (verbose and not result.is_blocked):
             yield f"      {_result(result)}"
     if not verbose:
-        yield from _not_measured([report])
+        yield from _once(_not_measured([report]))
     if blocked:
         yield f"      {blocked} {'check needs' if blocked == 1 else 'checks need'} what is damaged."
 
 
-def _noted(reports: Sequence[SubjectReport]) -> Iterator[str]:
-    """One line for each note about features without a role."""
-    notes = Counter(note for report in reports for note in report.notes)
-    for note, count in notes.items():
-        times = "" if count == 1 else f" ({count} times)"
-        yield f"      {note}{times}"
-
-
 def _not_measured(reports: Sequence[SubjectReport]) -> Iterator[str]:
-    """One line for each reason why checks measured nothing."""
+    """Each reason why checks measured nothing."""
     from demorec.check.base import NOTHING
 
     results = [result for report in reports for result in report.results if result.level == "skip"]
-    reasons = Counter(f"{r.check}: {r.detail}" for r in results if not r.is_blocked and r.detail != NOTHING)
-    for reason, count in reasons.most_common():
-        times = "" if count == 1 else f" ({count} times)"
-        yield f"      not measured  {reason}{times}"
+    reasons = (f"{r.check}: {r.detail}" for r in results if not r.is_blocked and r.detail != NOTHING)
+    return (f"not measured  {reason}" for reason in reasons)
+
+
+def _once(lines: Iterable[str]) -> Iterator[str]:
+    """Each line once, the most frequent first, with how often it occurs."""
+    for line, count in Counter(lines).most_common():
+        yield f"      {line}{'' if count == 1 else f' ({count} times)'}"
 
 
 def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
@@ -209,8 +193,8 @@ def _passed(reports: Sequence[SubjectReport]) -> Iterator[str]:
     unmeasured = f", {skipped} not measured" if skipped else ""
     things = ", ".join(counted(number, kind) for kind, number in kinds.items())
     yield f"pass  {things}: {passed} checks passed{unmeasured}"
-    yield from _noted(reports)
-    yield from _not_measured(reports)
+    yield from _once(note for report in reports for note in report.notes)
+    yield from _once(_not_measured(reports))
 
 
 def _result(result: Result) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -23,6 +23,8 @@ if TYPE_CHECKING:
 
 
 Split = Literal["all", "train", "eval"]
+_SCENES = ("task", "robot", "objects", "object_split", "split", "seed", "variation")
+"""Options of `GenerateConfig` that decide which scenes there are."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,20 +107,9 @@ class RolloutFlags:
             )
 
     def _config(self) -> GenerateConfig:
-        plain: dict[str, Any] = {} if self.renderer is None else {"renderer": self.renderer}
-        return GenerateConfig(
-            task=self.task,
-            robot=self.robot,
-            objects=self.objects,
-            object_split=self.object_split,
-            split=self.split,
-            seed=self.seed,
-            fps=self.fps,
-            cameras=self.cameras,
-            variation=self.variation,
-            video=self.video,
-            **plain,
-        )
+        names = (*_SCENES, "fps", "cameras", "video", "renderer")
+        values: dict[str, Any] = {name: getattr(self, name) for name in names}
+        return GenerateConfig(**{name: value for name, value in values.items() if value is not None})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -163,7 +154,7 @@ class Evaluate(RolloutFlags):
 
         a, b = load_evaluation(first), load_evaluation(second)
         scenes_a, scenes_b = a.settings.config, b.settings.config
-        for name in ("task", "robot", "objects", "object_split", "split", "seed", "variation"):
+        for name in _SCENES:
             there, here = getattr(scenes_a, name), getattr(scenes_b, name)
             if there != here:
                 raise ConfigError(f"The two evaluations did not use the same scenes: {name} is {there} and {here}.")
@@ -185,13 +176,16 @@ def _evaluation_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
     lengths = sorted(r.num_frames for r in evaluation.rollouts if r.success)
     if lengths:
         yield f"median length {lengths[len(lengths) // 2] / settings.config.fps:.1f} s of the successes"
-    failures = Counter(f"{r.phase}: {r.reason}" for r in evaluation.rollouts if not r.success)
-    for number, (reason, count) in enumerate(failures.most_common()):
-        yield f"{'failures' if number == 0 else '':<13} {count:>4}  {reason}"
+    yield from _counts("failures", (f"{r.phase}: {r.reason}" for r in evaluation.rollouts if not r.success))
     yield from ("", f"{'by cell':<20} {'range':<20} success (Wilson 95 %)")
     for cell in cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]):
         yield f"{cell.factor:<20} {f'{cell.low:.3f} .. {cell.high:.3f}':<20} {cell.rate}"
     yield from ("", f"recordings    {out / 'episodes'}, {out / 'failed'}")
+
+
+def _counts(title: str, reasons: Iterable[str]) -> Iterator[str]:
+    for number, (reason, count) in enumerate(Counter(reasons).most_common()):
+        yield f"{title if number == 0 else '':<13} {count:>4}  {reason}"
 
 
 def _plain(evaluation: Evaluation) -> dict[str, Any]:
@@ -252,14 +246,12 @@ def _correction_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
 
     config = evaluation.settings.config
     found = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]
-    reasons = Counter(reason for taken in found if taken is not None for reason in taken.reasons)
     frames = sum(taken.num_frames for taken in found if taken is not None)
     total = sum(rollout.num_frames for rollout in evaluation.rollouts)
     yield f"policy        {evaluation.settings.policy_type} {evaluation.settings.policy_digest}"
     yield f"scenes        {config.task}, split {config.split}, seed {config.seed}"
     yield f"by itself     {sum(taken is None for taken in found)} of {len(found)} episodes"
-    for number, (reason, count) in enumerate(reasons.most_common()):
-        yield f"{'taken over' if number == 0 else '':<13} {count:>4}  {reason}"
+    yield from _counts("taken over", (reason for taken in found if taken is not None for reason in taken.reasons))
     yield f"success       {evaluation.rate} (Wilson 95 %) in the end"
     yield f"expert acted  {frames} of {total} frames"
     yield f"recordings    {out / 'episodes'}, {out / 'failed'}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
@@ -17,6 +17,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, read_toml
 from demorec.core.errors import ConfigError
+from demorec.core.files import Closing
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.registry import nearest_match
 from demorec.generate.options import RunObserver, RunOptions
@@ -178,7 +179,7 @@ def _prepare_comparison(original: Original, out: Path) -> None:
         tell(f"Note: {'; '.join(different)}.")
 
 
-class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
+class RunProgress(RunObserver, Closing):
     """How a run goes, one bar after another; a context manager.
 
     `watch` is called with every attempt that has ended.
@@ -190,7 +191,8 @@ class RunProgress(RunObserver, AbstractContextManager["RunProgress"]):
         self._title = ""
         self._failed = 0
 
-    def __exit__(self, *exc: object) -> None:
+    def close(self) -> None:
+        """Take the last bar off the terminal."""
         if self._bar is not None:
             self._bar.close()
 

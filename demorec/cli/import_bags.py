@@ -9,16 +9,15 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
 from demorec.core.targets import OptionalTarget
-from demorec.robots.motors import Motors, MotorUnits
+from demorec.robots.motors import Motors
 from demorec.runs.find import find, name_of
 from demorec.sources.formats import FORMATS, SourceFormat
 
@@ -37,7 +36,8 @@ class Import:
     metadata.yaml stands for the bags in it.
 
     A LeRobot dataset (v3.0, v2.1 or v2.0, whoever wrote it) needs no mapping: its features keep their names, its
-    numbers stay bit-exact, and its video packets pass through where each episode begins with a keyframe.
+    numbers stay bit-exact, and its video packets pass through where each episode begins with a keyframe. With
+    --motor-units its recordings have the arm's URDF and joints.
 
     HDF5 files in robomimic's or ALOHA's layout take a mapping as well: which datasets become which features. Their
     numbers keep every bit, JPEG files pass through.
@@ -64,13 +64,7 @@ class Import:
     """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or file to standard output instead of importing."""
-    motor_units: MotorUnits | None = None
-    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
-    degrees, LeRobot's default, or scaled to -100..100 of their ranges. Its recordings then have the arm's URDF and
-    joints."""
-    calibration: Path | None = None
-    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
-    says)."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
     """How images are encoded that come as pixels."""
@@ -83,10 +77,10 @@ class Import:
             refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
-        form, motors = FORMATS.get(word), named_motors(self.motor_units, self.calibration)
-        if motors is not None and (form is None or not form.has_motor_units):
+        form, motors = FORMATS.get(word), self.motors.named
+        if motors is not None and (form is None or form.mapping):
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
-        if self.roles.named and (form is None or not form.has_roles):
+        if self.roles.named and (form is None or form.mapping):
             raise ConfigError(
                 "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
                 "bags and HDF5 files say it in their mapping."
@@ -114,7 +108,7 @@ class Import:
         return self._import_bags(self.bags, self.mapping, self.out)
 
     def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path], motors: Motors | None) -> int:
-        if (self.skip_bad and not form.can_skip) or self.workers > 1:
+        if (self.skip_bad and form.mapping) or self.workers > 1:
             raise ConfigError(
                 "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
                 "--workers, --skip-bad out."

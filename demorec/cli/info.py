@@ -92,29 +92,17 @@ def _bag_or_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.sources.bag_summary import summarize_bag
+    from demorec.sources.bag import summarize_bag
 
-    bag = summarize_bag(path)
-    plain = {
-        "kind": "bag",
-        "path": str(path),
-        "bytes": bag.num_bytes,
-        "seconds": bag.span_s,
-        "messages": bag.num_messages,
-        "topics": [
-            {"topic": name, "type": topic.type, "messages": topic.count, "rate": topic.rate_hz}
-            for name, topic in bag.topics.items()
-        ],
-        "problems": list(bag.problems),
-    }
-    length = f"{bag.span_s:.2f} s, {counted(bag.num_messages, 'message')}"
-    facts = [("bag", f"{path} ({size_in_words(bag.num_bytes)})"), ("length", length)]
-    facts += [("problem", problem) for problem in bag.problems[:_MOST_PROBLEMS]]
-    rows = [
-        (name, str(topic.count), f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else "", topic.type)
-        for name, topic in bag.topics.items()
-    ]
-    lines = [*aligned(facts), "", *aligned([("topic", "messages", "rate", "type"), *rows])]
+    plain = summarize_bag(path)
+    length = f"{plain['seconds']:.2f} s, {counted(plain['messages'], 'message')}"
+    facts = [("bag", f"{path} ({size_in_words(plain['bytes'])})"), ("length", length)]
+    facts += [("problem", problem) for problem in plain["problems"][:_MOST_PROBLEMS]]
+    rows = [("topic", "messages", "rate", "type")]
+    for topic in plain["topics"]:
+        rate = f"{topic['rate']:.1f} Hz" if topic["rate"] else ""
+        rows.append((topic["topic"], str(topic["messages"]), rate, topic["type"]))
+    lines = [*aligned(facts), "", *aligned(rows)]
     return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
 
 
@@ -195,31 +183,22 @@ def _run(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     from demorec.runs.run_file import load_any_run_file
 
     run = load_any_run_file(path)
+    known = {"path": str(path), "complete": run.is_complete, "digest": run.digest}
     if run.generation is None:
         left_out = _left_out(path)
         roles = role_lines.roles_of_run(path, run, named)
-        plain = {
-            "kind": "external run",
-            "path": str(path),
-            "complete": run.is_complete,
-            "digest": run.digest,
-            **run.plain(),
-        }
+        plain = {"kind": "external run", **known, **run.plain()}
         plain |= {"roles": None if roles is None else role_lines.roles_as_plain(roles), "left_out": left_out}
-        return plain, [*_external_run_lines(path, run, roles), *_left_out_lines(left_out)]
+        lines = _external_run_lines(path, run, roles)
+        if left_out:
+            rows = ((row["bag"], row["what"], row["reason"]) for row in left_out)
+            lines += ["", *aligned([("left out of", "what", "reason"), *rows])]
+        return plain, lines
     if named:
         from demorec.episode.roles import SIMULATED_ROLES
 
         raise ConfigError(SIMULATED_ROLES)
-    plain = {
-        "kind": "run",
-        "path": str(path),
-        "complete": run.is_complete,
-        "digest": run.digest,
-        "config_digest": run.config_digest,
-        **run.plain(),
-    }
-    return plain, _run_lines(path, run)
+    return {"kind": "run", **known, "config_digest": run.config_digest, **run.plain()}, _run_lines(path, run)
 
 
 def _run_lines(path: Path, run: RunFile) -> list[str]:
@@ -299,11 +278,6 @@ def _left_out(path: Path) -> list[dict[str, str]]:
         if row.episode_index is None
     ]
     return dropped + [{"bag": bag.name, "what": "the bag", "reason": bag.reason} for bag in imported.skipped]
-
-
-def _left_out_lines(left_out: list[dict[str, str]]) -> list[str]:
-    rows = [("left out of", "what", "reason"), *((row["bag"], row["what"], row["reason"]) for row in left_out)]
-    return ["", *aligned(rows)] if left_out else []
 
 
 def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:

@@ -12,6 +12,8 @@ from demorec.cli.shared.output import aligned, say, say_json
 
 if TYPE_CHECKING:
     from demorec.core.registry import Registry
+    from demorec.objects.shelf import Shelf
+    from demorec.robots.robot import RobotSpec
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,8 +35,8 @@ class ListRows:
         from demorec.core import tables
 
         registry: Registry[Any] = getattr(tables, self.what.upper())
-        describe = _DESCRIBED.get(self.what, _own_summary)
-        rows = [(name, describe(registry, name)) for name in registry.names()]
+        describe = _DESCRIBED.get(self.what, lambda row: str(row.summary))
+        rows = [(name, describe(registry.load(name))) for name in registry.names()]
         if self.json:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
         else:
@@ -42,28 +44,18 @@ class ListRows:
         return 0
 
 
-def _own_summary(registry: Registry[Any], name: str) -> str:
-    return str(registry.load(name).summary)
-
-
-def _robot(registry: Registry[Any], name: str) -> str:
-    robot = registry.load(name)
+def _robot(robot: RobotSpec) -> str:
     opening = 1000 * robot.gripper.open_width
     return f"{len(robot.arm_joints)} joints, gripper opening {opening:.0f} mm, from {robot.urdf}"
 
 
-def _kinds(registry: Registry[Any], name: str) -> str:
-    kinds = registry.load(name).kinds
-    return f"{sum(kind.count for kind in kinds)} shapes: {', '.join(kind.noun for kind in kinds)}"
+def _kinds(shelf: Shelf) -> str:
+    return f"{sum(kind.count for kind in shelf.kinds)} shapes: {', '.join(kind.noun for kind in shelf.kinds)}"
 
 
-def _first_line_of_docstring(registry: Registry[Any], name: str) -> str:
-    return (registry.load(name).__doc__ or "").strip().splitlines()[0]
-
-
-_DESCRIBED: Mapping[str, Callable[[Registry[Any], str], str]] = {
+_DESCRIBED: Mapping[str, Callable[[Any], str]] = {
     "robots": _robot,
     "objects": _kinds,
-    "renderers": _first_line_of_docstring,
+    "renderers": lambda renderer: (renderer.__doc__ or "").strip().partition("\n")[0],
 }
 """How a row is described in one line, where it has no summary of its own."""

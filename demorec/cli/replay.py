@@ -13,16 +13,14 @@ from typing import TYPE_CHECKING
 from tyro.conf import Positional
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.motors import named_motors
 from demorec.cli.shared.output import say, say_json, tell
 from demorec.cli.shared.paths import need_paths, refuse_sources
 from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.registry import modules_of
 from demorec.core.tables import load_robot
 from demorec.core.targets import OptionalTarget
-from demorec.robots.motors import MotorUnits
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:
@@ -70,12 +68,7 @@ class Replay:
     """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
     robot: str = ""
     """The arm that does what a real one did: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
-    motor_units: MotorUnits | None = None
-    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
-    degrees, LeRobot's default, or scaled to -100..100 of their ranges."""
-    calibration: Path | None = None
-    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
-    says)."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     out: OptionalTarget = None
     """Folder for recordings of the replays, images included."""
@@ -105,7 +98,7 @@ class Replay:
             seed=self.seed,
             allowed=allowed,
             robot=load_robot(self.robot, allowed) if self.robot else None,
-            motors=named_motors(self.motor_units, self.calibration),
+            motors=self.motors.named,
             named=self.roles.named,
         )
         if options.robot is not None and (self.out is not None or self.view):
@@ -116,7 +109,8 @@ class Replay:
             if out is None and self.view:
                 out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="demorec-replay-")))
             if out is not None:
-                _check_out(self.paths, out)
+                targets = [out / file.name for path in self.paths for file in _replayable(path).recordings]
+                refuse_sources(self.paths, targets or [out], do="replay")
             found = demonstrations(self.paths, options, episodes=self.episodes)
             reports: list[ReplayReport] = []
             pairs: list[tuple[Path, Path]] = []
@@ -146,12 +140,6 @@ class Replay:
             if self.view:
                 _show(pairs)
         return 0 if all(good) else 1
-
-
-def _check_out(paths: Sequence[Path], out: Path) -> None:
-    """Refuse to write replays into what is replayed, or over each other."""
-    targets = [out / file.name for path in paths for file in _replayable(path).recordings]
-    refuse_sources(paths, targets or [out], do="replay")
 
 
 def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:

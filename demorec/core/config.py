@@ -24,7 +24,6 @@ from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
 MAX_PIXELS = 16_000_000
 MAX_PHYSICS_HZ = 10_000
 
-
 PRESETS: Mapping[str, tuple[str, ...]] = {
     "h264": (
         "ultrafast", "superfast", "veryfast", "faster", "fast", "medium", "slow", "slower", "veryslow", "placebo",

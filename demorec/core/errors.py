@@ -101,7 +101,6 @@ _LACKS = {
     errno.EIO: "The storage reports an input/output error: see whether it is sound",
 }
 
-
 _LINKER_WORDS = {"failed to map segment": errno.ENOMEM}
 _LINKER_WORDS |= {os.strerror(number): number for number in (errno.ENOMEM, errno.EMFILE, errno.ENFILE)}
 

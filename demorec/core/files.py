@@ -1,4 +1,4 @@
-"""Files of unknown origin, opened without waiting and read within bounds; locks; files written in one step.
+"""Files of unknown origin, opened without waiting and read within bounds; locks; files written in one step; the cache.
 
 A folder may hold anything under the name that is looked for: opening a FIFO waits for its other end for ever, reading
 a device never ends, and a file of some gigabytes fills the memory before anybody has looked at its first byte.
@@ -13,8 +13,9 @@ import json
 import os
 import platform
 import stat
+import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from io import BufferedReader
 from pathlib import Path
@@ -238,5 +239,49 @@ def sync_path(path: Path) -> None:
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def cache_folder(*parts: str) -> Path:
+    """A folder below the user's cache folder, created when missing; `DEMOREC_CACHE` moves it elsewhere."""
+    import platformdirs
+
+    root = os.environ.get("DEMOREC_CACHE") or platformdirs.user_cache_dir("demorec", appauthor=False)
+    folder = Path(root).joinpath(*parts)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError:
+        # A home that cannot be written to (containers): work goes on, and is lost with the temporary folder.
+        folder = Path(tempfile.gettempdir()).joinpath(f"demorec-{os.getuid()}", *parts)
+        folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def write_whole(path: Path, write: Callable[[Path], object]) -> None:
+    """Let `write` fill a temporary file beside `path`, then move it there: readers see all of it or nothing."""
+    handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=path.suffix)
+    os.close(handle)
+    temporary = Path(name)
+    try:
+        write(temporary)
+        temporary.replace(path)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def folder_lock(folder: Path) -> Iterator[None]:
+    """Hold a lock between processes for as long as the context lasts; the system frees it if the process dies.
+
+    A folder that cannot be written to is not locked: nothing will be kept in it.
+    """
+    try:
+        descriptor = open_locked(folder / "lock", waits=True)
+    except OSError:
+        yield
+        return
+    try:
+        yield
     finally:
         os.close(descriptor)

@@ -147,7 +147,8 @@ def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
     while True:
         told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), tick_s)
         if told is None:
-            family = [child, *_children(child)]
+            started = _words_of(f"/proc/{child}/task/{child}/children")  # by its main thread, such as its workers
+            family = [child, *map(int, started)]
             filled = max(map(_private_bytes, family))
             tick_s = _LARGE_TICK_S if filled > memory_bytes // 2 else _TICK_S
             if filled > memory_bytes:
@@ -172,11 +173,6 @@ def _pass_on(number: int, child: int, heard: int) -> None:
         numbers = b""
     if number not in numbers:
         os.kill(child, number)
-
-
-def _children(pid: int) -> list[int]:
-    """Processes that the main thread of a process has started, such as its workers."""
-    return [int(word) for word in _words_of(f"/proc/{pid}/task/{pid}/children")]
 
 
 def _private_bytes(pid: int) -> int:

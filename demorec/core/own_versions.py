@@ -141,11 +141,8 @@ def _distributions() -> Mapping[str, list[str]]:
 def _files_below(package: Path) -> list[Path]:
     """List all files of a package in order, without hidden ones and compiled modules."""
     files = [path for path in sorted(package.rglob("*")) if path.is_file()]
-    return [path for path in files if not any(_is_left_out(part) for part in path.relative_to(package).parts)]
-
-
-def _is_left_out(name: str) -> bool:
-    return name.startswith(".") or name == "__pycache__"
+    names = {path: path.relative_to(package).parts for path in files}
+    return [path for path in files if not any(name.startswith(".") or name == "__pycache__" for name in names[path])]
 
 
 def _model_digest(urdf: Path) -> str:

@@ -21,7 +21,6 @@ from demorec.core.geometry import Pose
 
 _converter = make_converter(forbid_extra_keys=True)
 
-
 MAX_DEPTH = 64
 """Lists and objects within each other: our own data have ten at most, and code that walks deeper ones would recurse."""
 _MAX_DIGITS = 20

@@ -61,13 +61,7 @@ REPORT_MARK = "<!doctype html>\n<!-- A report by demorec. -->\n"
 REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_MARK.encode()))
 
 
-def check_replaceable(
-    target: Path,
-    kind: ReplaceableKind,
-    *,
-    overwrite: bool,
-    sources: Iterable[Path] = (),
-) -> None:
+def check_replaceable(target: Path, kind: ReplaceableKind, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
     """Raise unless `target` is free, or may be replaced by something of its kind and the user asks for that.
 
     An empty folder counts as free; an empty file does not, since somebody's lock or mark may be one.
@@ -194,26 +188,26 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
     _drop(aside, names)
 
 
-def has_unsettled_parts(folder: Path) -> bool:
-    """Whether a crash within `replaced_parts` has left something for `settle_parts`: what has its mark."""
-    return (folder / _ASIDE / _MARK).is_file()
+def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
+    """Whether a crash within `replaced_parts` has left something for `settle_parts`: what has its mark.
 
-
-def check_unsettled_parts(folder: Path, names: Sequence[str]) -> None:
-    """Raise ConfigError where what is there by the name of such leftovers is not ours."""
+    Raises:
+        ConfigError: What is there by the name of such leftovers is not ours.
+    """
     aside = folder / _ASIDE
     if not os.path.lexists(aside):
-        return
+        return False
     found = {path.name for path in aside.iterdir()} if aside.is_dir() and not aside.is_symlink() else {"no folder"}
     if not found <= {_MARK, *names} or (found and not (aside / _MARK).is_file()):
         raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {aside}")
+    return bool(found)
 
 
 def settle_parts(folder: Path, names: Sequence[str]) -> None:
     """Finish what a crash within `replaced_parts` left: put the old back, or delete it where the new is there.
 
     Raises:
-        ConfigError: A folder of that name is there and is not ours.
+        ConfigError: As `check_unsettled_parts`.
     """
     aside = folder / _ASIDE
     check_unsettled_parts(folder, names)

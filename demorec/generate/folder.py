@@ -28,7 +28,6 @@ from demorec.core.replacing import (
     check_replaceable,
     check_unsettled_parts,
     files_below,
-    has_unsettled_parts,
     obstacle,
     replaced_parts,
     settle_parts,
@@ -159,9 +158,7 @@ def open_run(
         generation=Generation(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
     )
     with _told_as_unusable(path):
-        if has_unsettled_parts(path):
-            check_unsettled_parts(path, PARTS)
-        else:
+        if not check_unsettled_parts(path, PARTS):
             _check_request(path, asked, options, inspect=inspect)
     make_folder(path)
     with run_lock(path):  # from here on nobody else changes it, so what was found is looked at once more

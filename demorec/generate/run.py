@@ -73,14 +73,8 @@ def generate(
         GenerationError: The run cannot go on; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
-    from demorec.loop import load_task
-    from demorec.tasks.robot_check import check_robot
-
     progress = progress or RunObserver()
-    load_task(config)  # these raise what the first worker would raise, before anything is written
-    allow_models(config.modules)
-    if split_name(config.robot) is not None:
-        check_robot(load_robot(config.robot, config.modules), uses_workspace=split_name(config.task) is None)
+    _check_code(config)
     with ExitStack() as stack:
         if options.executor == "ray":
             from demorec.generate.on_ray import connected
@@ -109,6 +103,17 @@ def generate(
                 f"The run has ended before it had all that was asked for: run the same command again. {folder.kept}"
             )
         return result
+
+
+def _check_code(config: GenerateConfig) -> None:
+    """Raise what the first worker would raise about the task and the robot, before anything is written."""
+    from demorec.loop import load_task
+    from demorec.tasks.robot_check import check_robot
+
+    load_task(config)
+    allow_models(config.modules)
+    if split_name(config.robot) is not None:
+        check_robot(load_robot(config.robot, config.modules), uses_workspace=split_name(config.task) is None)
 
 
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:

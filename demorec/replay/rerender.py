@@ -247,13 +247,7 @@ def rerender(
         view, config = new_view(info, options), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = _video_options(info, config)
-        new_info = with_simulation(
-            replace(info, origin=f"render of {recording.digest()[:16]}"),
-            scene=view.scene,
-            behaviour=view_behaviour(info, view),
-            config=config,
-            config_digest=digest(config),
-        )
+        new_info = _drawn_info(recording, view, config)
         was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
         if not was_there:
             states = RecordedStates(info.simulated.robot, view.scene, trajectory)
@@ -275,6 +269,17 @@ def rerender(
         compared=tuple(compared),
         differing={name: frame for name, frame in compared.items() if frame is not None},
         was_there=was_there,
+    )
+
+
+def _drawn_info(recording: Recording, view: SceneView, config: Mapping[str, Any]) -> EpisodeInfo:
+    info = recording.info
+    return with_simulation(
+        replace(info, origin=f"render of {recording.digest()[:16]}"),
+        scene=view.scene,
+        behaviour=view_behaviour(info, view),
+        config=config,
+        config_digest=digest(config),
     )
 
 

@@ -80,7 +80,6 @@ class ReportedEpisode:
 MAX_SAMPLES = 200
 """Frames of each episode that a distribution is drawn from, beside its extremes."""
 
-
 Components = dict[tuple[Literal["state", "action"], str], list[NDArray[np.float32]]]
 """(role, name of the component) -> its sampled values, episode by episode."""
 

@@ -28,7 +28,6 @@ from demorec.report.content import CheckSummaries, Components, Report, ReportedE
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 
 _SUCCESS = "next.success"
-_NUMBERS = ("float32", "float64", "int64", "bool")
 _MAX_COMPONENTS = 64
 """Of one feature that are drawn."""
 _EPISODE_COLUMNS = (
@@ -187,19 +186,14 @@ def _left_out(row: _Row) -> ReportedEpisode:
 
 
 def _count_components(into: Components, roles: Roles, columns: Mapping[str, NDArray[Any]]) -> None:
-    drawn: tuple[tuple[Literal["state", "action"], tuple[str, ...]], ...] = (
-        ("state", roles.state),
-        ("action", roles.action),
-    )
-    for role, parts in drawn:
+    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
+    for role, parts in drawn.items():
         if parts:
             values = np.hstack([columns[part] for part in parts])
-            add_values(into, role, _component_names(roles.elements(parts))[:_MAX_COMPONENTS], values)
-
-
-def _component_names(names: tuple[str, ...]) -> tuple[str, ...]:
-    """Names of elements, "component 0" where they have none."""
-    return tuple(f"component {name}" for name in names) if is_numbered(names) else names
+            names = roles.elements(parts)
+            if is_numbered(names):
+                names = tuple(f"component {name}" for name in names)
+            add_values(into, role, names[:_MAX_COMPONENTS], values)
 
 
 def _missing(info: DatasetInfo, roles: Roles, *, has_sidecar: bool) -> Iterator[str]:

@@ -206,12 +206,12 @@ def _vectors(content: ExportEpisode[CommonOptions], named: NamedRoles) -> _Vecto
         vectors = content.vectors
     except ExportError:  # no frames, or numbers that are not finite, which the checks report
         return {}
-    found: _Vectors = {}
-    if roles.state:
-        found["state"] = roles.elements(roles.state), np.hstack([vectors[part] for part in roles.state])
-    if roles.action:
-        found["action"] = roles.elements(roles.action), np.hstack([vectors[part] for part in roles.action])
-    return found
+    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
+    return {
+        role: (roles.elements(parts), np.hstack([vectors[part] for part in parts]))
+        for role, parts in drawn.items()
+        if parts
+    }
 
 
 def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:

@@ -10,7 +10,7 @@ import hashlib
 from contextlib import suppress
 from pathlib import Path
 
-from demorec.core.cache import cache_folder, write_whole
+from demorec.core.files import cache_folder, write_whole
 
 
 def remember_model(description: str, urdf: Path) -> None:

@@ -136,11 +136,6 @@ class ExternalFolder:
             self._begun_with = info
             self.save()
 
-    @property
-    def began_in_vain(self) -> bool:
-        """Whether run.json was written for planned episodes, and none is there."""
-        return self._begun_with is not None and not self.episodes
-
     def add(self, recording: Path) -> Attempt:
         """Take a finished recording into run.json."""
         line = external_line(recording)
@@ -207,7 +202,7 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
             yield folder
         finally:
             folder.save(ended=True)
-            if folder.began_in_vain:
+            if folder._begun_with is not None and not folder.episodes:
                 (path / RUN_NAME).unlink(missing_ok=True)
             if not was_there and not (path / RUN_NAME).exists():
                 with suppress(OSError):  # of what is in it: a recording, or what is left of one

@@ -81,7 +81,6 @@ _MARKS: tuple[tuple[str, PathKind], ...] = (
 )
 """The file by whose presence a folder is known."""
 
-
 NOT_UTF8 = "This name has bytes that are not UTF-8, which not every library can open: rename it"
 
 

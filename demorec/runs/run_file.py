@@ -16,12 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.config import GenerateConfig
-from demorec.core.errors import (
-    ConfigError,
-    DemorecError,
-    describe_error,
-    resource_error,
-)
+from demorec.core.errors import ConfigError, DemorecError, describe_error, resource_error
 from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sync_path
 from demorec.core.plain import digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
@@ -259,30 +254,17 @@ class RunFile:
         """All of it as plain data."""
         plain: dict[str, Any] = to_plain(self)
         if self.generation is None:
+            about = {key: plain[key] for key in ("robot", "fps", "planned")}
             sessions = [{key: session[key] for key in ("started", "ended")} for session in plain["sessions"]]
-            lines = self._lines(_EXTERNAL_LINE)
-            return {
-                "robot": self.robot,
-                "fps": self.fps,
-                "planned": list(self.planned),
-                "sessions": sessions,
-                "episodes": lines,
-            }
-        generation = {key: value for key, value in plain["generation"].items() if key != "beyond"}
-        export = generation.pop("export")
-        lines = self._lines(_LINE)
-        count = len(self.attempts)
-        return {
-            **generation,
-            "sessions": plain["sessions"],
-            "export": export,
-            "attempts": lines[:count],
-            "beyond": lines[count:],
-        }
+            return {**about, "sessions": sessions, "episodes": _lines(self.attempts, _EXTERNAL_LINE)}
+        generation = {key: value for key, value in plain["generation"].items() if key not in ("beyond", "export")}
+        about = {"sessions": plain["sessions"], "export": plain["generation"]["export"]}
+        lines = {"attempts": _lines(self.attempts, _LINE), "beyond": _lines(self.beyond, _LINE)}
+        return {**generation, **about, **lines}
 
-    def _lines(self, keys: Iterable[str]) -> list[dict[str, Any]]:
-        attempts = self.attempts if self.generation is None else self.known
-        return [{key: line[key] for key in keys} for line in map(to_plain, attempts)]
+
+def _lines(attempts: Iterable[Attempt], keys: Iterable[str]) -> list[dict[str, Any]]:
+    return [{key: line[key] for key in keys} for line in map(to_plain, attempts)]
 
 
 def save_run_file(run: RunFile, folder: Path) -> None:

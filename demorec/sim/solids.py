@@ -15,8 +15,8 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.core.cache import cache_folder, write_whole
 from demorec.core.errors import SceneError
+from demorec.core.files import cache_folder, write_whole
 from demorec.core.geometry import Array, Pose
 from demorec.episode.mesh import UNIT, SolidMesh, decode_mesh, encode_mesh
 from demorec.episode.scene import Body, Physics, Shape

@@ -9,16 +9,7 @@ import numpy as np
 from demorec.core.geometry import signs_of_course
 from demorec.episode.features import ACTION
 from demorec.sources.clock import NS, SKEW_S, Numbers, Timeline
-from demorec.sources.findings import (
-    GAP,
-    LOST,
-    NOTE,
-    STILL_S,
-    Finding,
-    frozen_images,
-    of_stream,
-    stream_findings,
-)
+from demorec.sources.findings import GAP, LOST, NOTE, STILL_S, Finding, frozen_images, of_stream, stream_findings
 from demorec.sources.rows import RATE, EpisodeRows, Timelines
 
 _EPOCH_S = 1e8

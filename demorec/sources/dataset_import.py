@@ -61,6 +61,39 @@ def import_lerobot(
         ExportError: It is damaged, or not at its rate.
         RecordingError: A number is not finite, or the disk is full.
     """
+    dataset = _opened(roots, motors, named)
+    left_out = _left_out(dataset)
+    skipped: dict[int, str] = {}
+    noted = skipped if skip_bad else None
+    survey = _surveyed(dataset, noted)
+    for name in survey.inexact:
+        dataset.leave_out(name)
+        left_out[name] = "it has whole numbers that float64 cannot hold"
+    cameras, fates = _cameras(dataset, survey)
+    digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
+    with open_external_run(out, recovers=False) as folder:
+        indices = [place.episode_index for place in dataset.places if place.episode_index not in skipped]
+        folder.planned = [planned_episode(n) for n in indices if not episode_path(folder.path, n).exists()]
+        for number, place in enumerate(dataset.places):
+            if place.episode_index in skipped:
+                continue
+            with _reading(place, noted):
+                recording = DatasetRecording(dataset, number)
+                num_new += _write(recording, cameras, folder, video or VideoConfig(), digest)
+                num_frames += place.length
+                if recording.language_left_out:
+                    left_out[PERSISTENT] = recording.language_left_out
+    return FramesImport(
+        num_episodes=len(dataset.places) - len(skipped),
+        num_frames=num_frames,
+        num_new=num_new,
+        cameras=fates,
+        left_out=left_out,
+        skipped={f"episode {index}": reason for index, reason in skipped.items()},
+    )
+
+
+def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> LeRobotFolder:
     if len(roots) != 1:
         raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
     root = roots[0]
@@ -71,57 +104,18 @@ def import_lerobot(
         raise ConfigError(f"An import takes whole features: --gripper names {parts[0]!r}, an element of the state.")
     if not dataset.places:
         raise ConfigError(f"The dataset has no episodes: {root}")
-    left_out = _left_out(dataset)
-    episodes = _Episodes(skip_bad=skip_bad)
-    survey = _surveyed(dataset, episodes)
-    for name in survey.inexact:
-        dataset.leave_out(name)
-        left_out[name] = "it has whole numbers that float64 cannot hold"
-    cameras, fates = _cameras(dataset, survey)
-    digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
-    with open_external_run(out, recovers=False) as folder:
-        indices = [place.episode_index for place in dataset.places if place.episode_index not in episodes.skipped]
-        folder.planned = [planned_episode(n) for n in indices if not episode_path(folder.path, n).exists()]
-        for number, place in enumerate(dataset.places):
-            if place.episode_index in episodes.skipped:
-                continue
-            with episodes.reading(place):
-                recording = DatasetRecording(dataset, number)
-                num_new += _write(recording, cameras, folder, video or VideoConfig(), digest)
-                num_frames += place.length
-                if recording.language_left_out:
-                    left_out[PERSISTENT] = recording.language_left_out
-    return FramesImport(
-        num_episodes=len(dataset.places) - len(episodes.skipped),
-        num_frames=num_frames,
-        num_new=num_new,
-        cameras=fates,
-        left_out=left_out,
-        skipped={f"episode {index}": reason for index, reason in episodes.skipped.items()},
-    )
+    return dataset
 
 
-@dataclass(kw_only=True)
-class _Episodes:
-    """What becomes of episodes that cannot be read.
-
-    Attributes:
-        skip_bad: Whether they are left out; otherwise the first of them ends the import.
-        skipped: episode_index -> why it was left out.
-    """
-
-    skip_bad: bool
-    skipped: dict[int, str] = field(default_factory=dict)
-
-    @contextmanager
-    def reading(self, place: EpisodePlace) -> Iterator[None]:
-        """Note an episode that cannot be read in the context, or pass its error on."""
-        try:
-            yield
-        except (ExportError, RecordingError) as error:
-            if not self.skip_bad or resource_error(error) is not None:
-                raise
-            self.skipped[place.episode_index] = str(error)
+@contextmanager
+def _reading(place: EpisodePlace, skipped: dict[int, str] | None) -> Iterator[None]:
+    """Note why an episode cannot be read in the context among those that are skipped; None: none is, raise it."""
+    try:
+        yield
+    except (ExportError, RecordingError) as error:
+        if skipped is None or resource_error(error) is not None:
+            raise
+        skipped[place.episode_index] = str(error)
 
 
 @dataclass(kw_only=True)
@@ -139,13 +133,14 @@ class _Survey:
     reasons: dict[str, str] = field(default_factory=dict)
 
 
-def _surveyed(dataset: LeRobotFolder, episodes: _Episodes) -> _Survey:
+def _surveyed(dataset: LeRobotFolder, skipped: dict[int, str] | None) -> _Survey:
     """Look at the whole numbers and the encoded images of every episode."""
     survey = _Survey()
-    whole = [feature.name for feature in dataset.features if dataset.info.features[feature.name].dtype in _WHOLE]
+    types = {feature.name: dataset.info.features[feature.name].dtype for feature in dataset.features}
+    whole = [name for name, dtype in types.items() if dtype in ("int64", "uint64")]
     rows = dataset.rows(whole)
     for place in dataset.places:
-        with episodes.reading(place):
+        with _reading(place, skipped):
             if place.length < 1:
                 raise ExportError(f"Episode {place.episode_index} of the dataset has no frames: {dataset.root}")
             numbers = rows.numbers(place) if whole else {}
@@ -157,9 +152,6 @@ def _surveyed(dataset: LeRobotFolder, episodes: _Episodes) -> _Survey:
                     survey.reasons[name] = survey.reasons.get(name) or video.why_transcoded()
             survey.inexact |= {name for name in whole if (abs(numbers[name]) > _MAX_EXACT).any()}
     return survey
-
-
-_WHOLE = ("int64", "uint64")
 
 
 def _left_out(dataset: LeRobotFolder) -> dict[str, str]:

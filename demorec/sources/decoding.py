@@ -122,10 +122,6 @@ def _protobuf_decoder(type_name: str, schema: bytes) -> Decoder:
     return decode
 
 
-def _is_number_list(field: Any) -> bool:
-    return bool(field.is_repeated) and field.type not in (field.TYPE_STRING, field.TYPE_BYTES, field.TYPE_MESSAGE)
-
-
 def _protobuf_values(message: Any, descriptor: Any, methods: Any, depth: int = 0) -> Values:
     if depth > MAX_DEPTH:
         raise ValueError("its values are nested too deeply")
@@ -136,8 +132,8 @@ def _protobuf_values(message: Any, descriptor: Any, methods: Any, depth: int = 0
             found = getattr(message, field.name)
             if kind is None:
                 dtype = {field.TYPE_FLOAT: "f4", field.TYPE_BOOL: "u1"}.get(field.type, "f8")
-                is_list = _is_number_list(field)
-                values[field.name] = np.fromiter(found, dtype, len(found)) if is_list else list(found)
+                are_numbers = field.type not in (field.TYPE_STRING, field.TYPE_BYTES)
+                values[field.name] = np.fromiter(found, dtype, len(found)) if are_numbers else list(found)
             elif not kind.GetOptions().map_entry:  # maps hold no features
                 values[field.name] = [_protobuf_values(item, kind, methods, depth + 1) for item in found]
         elif kind is None:

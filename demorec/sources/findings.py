@@ -8,10 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.sources.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.sources.streams import NO_STAMP, Stream
@@ -139,27 +137,17 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
         yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
 
 
-def _longest_run(numbers: NDArray[Any]) -> tuple[int, int]:
-    """First and last index of the longest run of equal numbers."""
-    edges = _run_edges(numbers)
-    longest = int(np.argmax(np.diff(edges)))
-    return int(edges[longest]), int(edges[longest + 1]) - 1
-
-
 def frozen_images(line: Timeline) -> tuple[int, int] | None:
     """First and last index of images in a row with the very same bytes, of a camera that repeats none for less."""
     if not line.stream.heads:
         return None
     sums = np.asarray(line.stream.image_sums)[line.order].astype(np.int64)
-    begin, end = _longest_run(sums)
-    runs = np.diff(_run_edges(sums))
+    edges = np.concatenate(([0], np.flatnonzero(np.diff(sums) != 0) + 1, [len(sums)]))
+    runs = np.diff(edges)
+    longest = int(np.argmax(runs))
     has_noise = not ((runs > 1) & (runs < FROZEN)).any()  # a drawn camera gives the same again wherever all rests
-    return (begin, end) if end - begin + 1 >= FROZEN and has_noise else None
-
-
-def _run_edges(numbers: NDArray[Any]) -> Int:
-    """First index of each run of equal numbers, and their count."""
-    return np.concatenate(([0], np.flatnonzero(np.diff(numbers) != 0) + 1, [len(numbers)]))
+    is_frozen = runs[longest] >= FROZEN and has_noise
+    return (int(edges[longest]), int(edges[longest + 1]) - 1) if is_frozen else None
 
 
 def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:

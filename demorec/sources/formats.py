@@ -36,10 +36,8 @@ class SourceFormat:
         name: In a sentence, of many.
         example: What follows `demorec import` and the format's word.
         importer: "module:function", which `read` calls with its arguments.
-        mapping: Whose keys its mappings have; None where it needs none.
-        has_motor_units: Whether its numbers may be those of an arm's servos.
-        has_roles: Whether the user may name the roles of its features; a mapping says them otherwise.
-        can_skip: Whether episodes that cannot be read may be left out.
+        mapping: Whose keys its mappings have; None where it needs none, so that its numbers may be those of an arm's
+            servos, the user may name the roles of its features, and episodes that cannot be read may be left out.
         suggester: "module:function", path -> the lines of a mapping, where it needs one.
     """
 
@@ -48,9 +46,6 @@ class SourceFormat:
     example: str
     importer: str
     mapping: SourceKind | None = None
-    has_motor_units: bool = False
-    has_roles: bool = False
-    can_skip: bool = False
     suggester: str = ""
 
     def read(
@@ -64,17 +59,10 @@ class SourceFormat:
         *,
         skip_bad: bool = False,
     ) -> FramesImport:
-        """Make or continue the run `out`; pixels are encoded as `video` says, numbers those of `motors`.
-
-        With `skip_bad`, episodes that cannot be read are left out, where the format can.
-
-        Raises:
-            DemorecError: As the importer.
-        """
+        """Make or continue the run `out`; arguments and errors as of the importer, the last three without a mapping."""
         importer = pkgutil.resolve_name(self.importer)
-        skipping = {"skip_bad": skip_bad} if self.can_skip else {}
-        found = importer(paths, mapping, out, video=video, motors=motors, named=named, **skipping)
-        return cast("FramesImport", found)
+        own = {} if self.mapping else {"motors": motors, "named": named, "skip_bad": skip_bad}
+        return cast("FramesImport", importer(paths, mapping, out, video=video, **own))
 
     def suggest(self, path: Path) -> list[str]:
         """The lines of a mapping of a format that needs one."""
@@ -87,9 +75,6 @@ _ROWS = (
         name="LeRobot datasets",
         example="datasets/cups --out runs/cups",
         importer="demorec.sources.dataset_import:import_lerobot",
-        has_motor_units=True,
-        has_roles=True,
-        can_skip=True,
     ),
     SourceFormat(
         kind="hdf5",

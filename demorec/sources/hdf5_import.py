@@ -25,9 +25,7 @@ from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.episode.episode import Outcome, Vector
 from demorec.episode.info import EpisodeInfo, SourceFile
-from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.episode.validity import find_problems
-from demorec.robots.motors import Motors
 from demorec.runs.external import differences, open_external_run, planned_episode
 from demorec.runs.find import expect
 from demorec.sources.fields import FieldError
@@ -47,8 +45,6 @@ def import_hdf5(
     out: Path,
     *,
     video: VideoConfig | None = None,
-    motors: Motors | None = None,
-    named: NamedRoles = NO_NAMES,
 ) -> FramesImport:
     """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
 
@@ -57,8 +53,6 @@ def import_hdf5(
         mapping_path: Of the mapping.
         out: The run's folder; one that the same files and mapping began is continued.
         video: How images are encoded that come as pixels.
-        motors: Unused: the mapping says what the numbers are.
-        named: Unused: the mapping says which features there are.
 
     Raises:
         ConfigError: The mapping is impossible, the files differ, or the folder holds something else.

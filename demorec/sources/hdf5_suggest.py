@@ -93,6 +93,11 @@ class _Contents:
             except Hdf5Error as error:
                 self.unusable.append(without_path(error, file.path))
 
+    def text(self, name: str) -> str:
+        """The text of an attribute; "" where it is missing, blank or no text."""
+        found = found_attribute(self.file, self.place, name)
+        return found if isinstance(found, str) and found.strip() else ""
+
     def is_vector(self, name: str) -> bool:
         """Whether it holds rows of numbers."""
         array = self.arrays[name]
@@ -165,25 +170,22 @@ def _left_out(contents: _Contents, layout: _Layout) -> Iterator[str]:
 
 
 def _robot(contents: _Contents, layout: _Layout) -> str:
-    found = (found_attribute(contents.file, contents.place, name) for name in _ROBOTS)
-    return next(
-        (name for name in found if isinstance(name, str) and name.strip()), "aloha" if layout.is_aloha else "robot"
-    )
+    for name in _ROBOTS:
+        if text := contents.text(name):
+            return text
+    return "aloha" if layout.is_aloha else "robot"
 
 
 def _model(contents: _Contents) -> list[str]:
-    text = found_attribute(contents.file, contents.place, "model_file")
-    is_urdf = isinstance(text, str) and "<robot" in text[:1000]  # robosuite's models are MuJoCo's
+    is_urdf = "<robot" in contents.text("model_file")[:1000]  # robosuite's models are MuJoCo's
     return ['urdf_attribute = "model_file"'] if is_urdf else ['# urdf = "robot.urdf"']
 
 
 def _task(contents: _Contents, path: Path) -> list[str]:
     for name in _TASKS:
-        found = found_attribute(contents.file, contents.place, name)
-        if isinstance(found, str) and found.strip():
+        if found := contents.text(name):
             return [f"attribute = {quoted(name)}  # {quoted(found[:60])}"]
-    named = found_attribute(contents.file, contents.place, "env_args.env_name")
-    text = named if isinstance(named, str) and named.strip() else task_in_name(path.stem)
+    text = contents.text("env_args.env_name") or task_in_name(path.stem)
     if text in ("", "episode"):  # episode_0.hdf5, in a folder that is called after the task
         text = task_in_name(path.absolute().parent.name) or path.stem
     return [f"text = {quoted(text)}  # what the robot was asked to do", "# file_name = true"]

@@ -131,7 +131,6 @@ _SEQUENCE_BYTES = 24
 """Of an AV1 keyframe, within which its sequence header ends."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
 
-
 _HEAD_BYTES = 12
 """ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
 

@@ -80,14 +80,14 @@ def import_bags(
         was_unfinished = bool(json_object(out / RUN_NAME).get("planned"))
         if new or was_unfinished or (known.bags and batch.skipped_bags() != known.skipped):
             with open_external_run(out, recovers=False) as folder:
-
-                def read(bag: Bag) -> Future[PlannedBag]:
-                    return submit(plan_bag, bag, mapping, urdf, video)
-
-                def write(planned: PlannedBag) -> Future[_Written]:
-                    return submit(write_bag, planned, folder.path, video)
-
-                batch.run(new, folder, read, write, ahead=1 if workers == 1 else 2 * workers, tell=tell)
+                batch.run(
+                    new,
+                    folder,
+                    lambda bag: submit(plan_bag, bag, mapping, urdf, video),
+                    lambda planned: submit(write_bag, planned, folder.path, video),
+                    ahead=1 if workers == 1 else 2 * workers,
+                    tell=tell,
+                )
     return batch
 
 
@@ -168,7 +168,7 @@ class ImportBatch:
             tell: Called with the report of each bag that is in the run now.
         """
         self._kind = folder.kind()
-        folder.planned = self._planned()
+        folder.planned = [path.name for path in self._left]
         waiting, failure = deque(bags), None
         reading: deque[tuple[Bag, Future[PlannedBag]]] = deque()
         writing: deque[tuple[Path, Future[_Written]]] = deque()
@@ -195,14 +195,11 @@ class ImportBatch:
                 first: list[Future[Any]] = [future for _, future in list(writing)[:1]]
                 first += [future for _, future in list(reading)[:1]]
                 wait(first, return_when=FIRST_COMPLETED)
-        folder.planned = self._planned()
+        folder.planned = [path.name for path in self._left]
         if failure is not None:
             raise failure
         if self._known.bags:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
-
-    def _planned(self) -> list[str]:
-        return [path.name for path in self._left]
 
     def _take(self, folder: ExternalFolder, path: Path, report: BagReport, lines: Sequence[Attempt]) -> None:
         """Take a bag whose episodes are written into the run; run.json, which says that it is done, comes last."""
@@ -210,7 +207,7 @@ class ImportBatch:
         save_import_file(self._known, folder.path)
         self.num_new += 1
         self._advance(path)
-        folder.planned = self._planned()
+        folder.planned = [path.name for path in self._left]
         folder.extend(lines)
 
     def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> PlannedBag | None:

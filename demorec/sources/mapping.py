@@ -33,7 +33,6 @@ ROWS = ("camera", "grid")
 KIND = "kind"
 """In a field's metadata: the kind of source to which it belongs alone."""
 
-
 _BAG, _HDF5 = {KIND: "bag"}, {KIND: "hdf5"}
 """Metadata of keys that only mappings of that kind have."""
 

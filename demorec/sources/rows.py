@@ -160,15 +160,13 @@ class Timelines:
         for index, source in enumerate(self.mapping.features[name]):
             later = 1 if source.next else 0
             part = slice(later, later + count)
-            keys = self._keys(source.next) if source.next else [(name, index)]
+            followed_sources = self.mapping.features.get(source.next, ())
+            keys: list[Key] = [(source.next, number) for number in range(len(followed_sources))] or [(name, index)]
             for key in keys:
                 values.append(self.lines[key].sampled(chosen[key])[part])
                 # The age of a next row counts from the row that has it, and so is below 0.
                 ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
         return FeatureRows(values=np.concatenate(values, axis=1), ages_ns=np.max(np.stack(ages), axis=0))
-
-    def _keys(self, feature: str) -> list[Key]:
-        return [(feature, index) for index in range(len(self.mapping.features[feature]))]
 
     def _extent(self, window: Window) -> tuple[int, int]:
         """From where on and until when all streams have something, within a window."""
@@ -193,15 +191,13 @@ class Timelines:
             line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
             if line is None:
                 raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
-            times, follows = line.within(begin, end), line.stream.label
-        elif clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
-            times, follows = self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
-        else:
-            # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a
-            # stream that jitters is off by a few hundredths.)
-            slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
-            return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
-        return times, follows
+            return line.within(begin, end), line.stream.label
+        if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
+            return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
+        # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a
+        # stream that jitters is off by a few hundredths.)
+        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
+        return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
         """Cameras that give an image for each row; the one that rows follow first.

@@ -203,7 +203,6 @@ class BagStreams:
 
     Attributes:
         all: Key -> stream, the sources of features before cameras.
-        cameras: Name of a camera -> its stream.
         infos: Name of a camera -> its first calibration message.
         texts: Topic -> its texts.
         problems: Why parts of the bag could not be read.
@@ -236,11 +235,6 @@ class BagStreams:
         self._counts: dict[str, int] = {}
         self._types: defaultdict[str, set[str]] = defaultdict(set)
         self._refused: dict[str, str] = {}
-
-    @property
-    def cameras(self) -> dict[str, Stream]:
-        """Name of a camera -> its stream."""
-        return {key: stream for key, stream in self.all.items() if isinstance(key, str)}
 
     def add(self, message: ScannedMessage) -> None:
         """Take a message."""
@@ -313,7 +307,6 @@ class BagStreams:
                 problems.append(
                     f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
                 )
-        for stream in self.all.values():
             if stream.heads and not stream.heads.are_keyframes.any():
                 problems.append(f"{stream.topic} has no keyframe with its parameter sets, so it cannot be decoded")
         if problems:

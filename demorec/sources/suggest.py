@@ -19,7 +19,7 @@ import numpy as np
 from demorec.episode.info import DEPTH_UNITS
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
-from demorec.sources.bag import Bag, open_bag
+from demorec.sources.bag import Bag, TopicSummary, open_bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.candidates import Candidate, Choice, candidates_of, choose_features, of_publishers
 from demorec.sources.clock import NS, SKEW_S
@@ -42,12 +42,10 @@ _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 
 
 @dataclass(kw_only=True, eq=False)
-class _Topic:
+class _Topic(TopicSummary):
     """Contents of a topic.
 
     Attributes:
-        count: Number of messages.
-        first_ns, last_ns: Range of the times of recording.
         first: First message; None where none can be read.
         head: Head of its first image; None where its messages are no images.
         candidates: Numbers in it that a feature may take.
@@ -59,10 +57,6 @@ class _Topic:
     """
 
     name: str
-    type: str
-    count: int = 0
-    first_ns: int = 0
-    last_ns: int = 0
     first: Values | None = None
     head: ImageHead | None = None
     candidates: list[Candidate] = field(default_factory=list)
@@ -71,12 +65,6 @@ class _Topic:
     has_stamp: bool = True
     skew_ns: int = 0
     problem: str = ""
-
-    @property
-    def rate_hz(self) -> float:
-        """Mean rate of its messages; 0 for fewer than two."""
-        seconds = (self.last_ns - self.first_ns) / NS
-        return (self.count - 1) / seconds if self.count > 1 and seconds > 0 else 0.0
 
     @property
     def is_text(self) -> bool:
@@ -149,9 +137,8 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
     decoder = BagDecoder()
     for message in bag.messages(problems):
         name, type_name = message.channel.topic, message.channel.type
-        topic = topics.setdefault(name, _Topic(name=name, type=type_name, first_ns=message.log_ns))
-        topic.count += 1
-        topic.first_ns, topic.last_ns = min(topic.first_ns, message.log_ns), max(topic.last_ns, message.log_ns)
+        topic = topics.setdefault(name, _Topic(name=name, type=type_name))
+        topic.add(message.log_ns)
         if topic.count <= _MAX_DECODED and not topic.problem:
             _look_into(topic, message, decoder)
     return topics

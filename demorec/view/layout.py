@@ -213,16 +213,12 @@ def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
 
     plots = _PLOTS if len(roots) == 1 else _COMPARED_PLOTS
     known = {name for names in plots.values() for name in names} | {"target", "gripper target"}
+    # A feature whose name is not the usual one of its role has both as its title.
+    titles = {name: f"{role}: {name}" for name, role in episode.roles.items() if name not in (STATE, ACTION)}
     tabs = [item for title, names in plots.items() if title not in _SIDE and (item := view(title, *names)) is not None]
-    others = [view(_feature_title(name, episode.roles), name) for name in episode.curves if name not in known]
+    others = [view(titles.get(name, name), name) for name in episode.curves if name not in known]
     beside = [item for title in _SIDE if (item := view(title, *plots[title])) is not None]
     (tabs or beside).extend(item for item in others if item is not None)
     columns: list[rrb.View | rrb.Container] = [rrb.Tabs(*tabs, active_tab=0)] if tabs else []
     columns += beside
     return rrb.Horizontal(*columns, column_shares=[1.8, *([1.0] * (len(columns) - 1))] if tabs else None)
-
-
-def _feature_title(name: str, roles: Mapping[str, str]) -> str:
-    """The title of a feature's plot: its name, and its role where the name in common use is another."""
-    is_usual = name in (STATE, ACTION) or name not in roles
-    return name if is_usual else f"{roles[name]}: {name}"

@@ -20,8 +20,8 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from demorec.core.cache import cache_folder, write_whole
 from demorec.core.errors import DemorecError, RecordingError, describe_error
+from demorec.core.files import cache_folder, write_whole
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path

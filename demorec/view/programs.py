@@ -8,8 +8,8 @@ import socket
 import sys
 from pathlib import Path
 
-from demorec.core.cache import cache_folder
 from demorec.core.errors import MissingDependencyError
+from demorec.core.files import cache_folder
 
 
 def viewer_program() -> str:

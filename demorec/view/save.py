@@ -14,14 +14,17 @@ from demorec.view.scene import log_comparison, log_episode, new_comparison, new_
 from demorec.view.sources import PlaybackSource
 
 
-def save(source: PlaybackSource, target: Path) -> None:
-    """Write an episode to an .rrd file.
+def save(source: PlaybackSource, target: Path, *, is_alone: bool = True) -> None:
+    """Write an episode to an .rrd file; one that is alone needs no list of episodes.
 
     Raises:
         DemorecError: The episode cannot be read.
         OSError: The file cannot be written.
     """
-    _save_episode(source, target, is_alone=True)
+    with source.open() as episode:
+        recording = new_recording(episode)
+        with _saving(recording, target, episode_layout(episode, is_alone=is_alone)):
+            log_episode(recording, episode)
 
 
 def numbered(target: Path, count: int) -> list[Path]:
@@ -43,7 +46,7 @@ def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
     files = [folder / f"{index:06d}.rrd" for index in range(len(sources))]
     for source, file in zip(sources, files, strict=True):
         try:
-            _save_episode(source, file, is_alone=len(sources) == 1)
+            save(source, file, is_alone=len(sources) == 1)
         except OSError as error:
             raise write_error("The file", error, file, RecordingError) from error
     return files
@@ -55,13 +58,6 @@ def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
         recording = new_comparison(first, second)
         with _saving(recording, target, comparison_layout(first, second)):
             log_comparison(recording, first, second)
-
-
-def _save_episode(source: PlaybackSource, target: Path, *, is_alone: bool) -> None:
-    with source.open() as episode:
-        recording = new_recording(episode)
-        with _saving(recording, target, episode_layout(episode, is_alone=is_alone)):
-            log_episode(recording, episode)
 
 
 @contextmanager

@@ -164,33 +164,28 @@ _VALUE_OF: Mapping[Any, Callable[[str], Any]] = {
 
 @FLAG_TYPES.primitive_rule
 def _value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--noise FLOAT` and the like."""
-    value_of = _VALUE_OF.get(info.type)
-    if value_of is None:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=info.type.__name__.upper(),
-        instance_from_str=lambda words: value_of(words[0]),
-        is_instance=lambda value: isinstance(value, info.type),
-        str_from_instance=lambda value: [str(value)],
-    )
-
-
-@FLAG_TYPES.primitive_rule
-def _optional_value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--workers INT` and `--codec {auto,h264,av1}` with auto for None, where tyro would show `{None}|INT`."""
-    kind = _kind_beside_none(info.type)
-    choices = ("auto", *get_args(kind)) if get_origin(kind) is Literal else None
+    """`--noise FLOAT`; `--workers INT` and `--codec {auto,h264,av1}` with auto for None, else shown as `{None}|INT`."""
+    optional = _kind_beside_none(info.type)
+    kind = info.type if optional is None else optional
+    choices = ("auto", *get_args(kind)) if optional is not None and get_origin(kind) is Literal else None
     if choices is None and kind not in _VALUE_OF:
         return None
     value_of = _VALUE_OF[str if choices else kind]
+
+    def from_words(words: list[str]) -> Any:
+        return None if optional is not None and words[0] == "auto" else value_of(words[0])
+
+    def is_instance(value: Any) -> bool:
+        if value is None:
+            return optional is not None
+        return value in choices if choices else isinstance(value, kind)
+
     return PrimitiveConstructorSpec(
         nargs=1,
         metavar=f"{{{','.join(choices)}}}" if choices else kind.__name__.upper(),
         choices=choices,
-        instance_from_str=lambda words: None if words[0] == "auto" else value_of(words[0]),
-        is_instance=lambda value: value is None or (value in choices if choices else isinstance(value, kind)),
+        instance_from_str=from_words,
+        is_instance=is_instance,
         str_from_instance=lambda value: ["auto" if value is None else str(value)],
     )
 

@@ -6,12 +6,12 @@ import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from typing import Any
 
 from tqdm import tqdm
 
 from demorec.cli.shared.output import tell
+from demorec.core.files import Closing
 
 _QUIET_S = 10.0
 """Time before the first line, and between the first ones: what is over by then needs none."""
@@ -23,7 +23,7 @@ _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 """Without tqdm's own time that is left, which counts the start as work."""
 
 
-class ProgressBar(AbstractContextManager["ProgressBar"]):
+class ProgressBar(Closing):
     """Counts what is done of one job; a context manager.
 
     On a terminal a bar. Elsewhere a line every ten seconds, in a long job every 5 % of the time that has passed, but
@@ -68,9 +68,6 @@ class ProgressBar(AbstractContextManager["ProgressBar"]):
         else:
             self._writer = threading.Thread(target=self._write_lines, daemon=True)
             self._writer.start()
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Take the bar off the terminal's last line, let no line follow; harmless when called twice."""

@@ -1,11 +1,15 @@
-"""The flags by which commands that read other people's data let the user name features' roles."""
+"""The flags by which commands that read other people's data let the user name features' roles and an arm's servos."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import UseAppendAction, arg
+
+from demorec.core.errors import ConfigError
+from demorec.robots.motors import Motors, MotorUnits
 
 if TYPE_CHECKING:
     from demorec.episode.roles import NamedRoles
@@ -34,3 +38,29 @@ class RoleFlags:
 
 
 NamedByFlags = Annotated[RoleFlags, arg(name="")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class MotorFlags:
+    """The servos of a real arm, whose values LeRobot recorded as state and action."""
+
+    motor_units: MotorUnits | None = None
+    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
+    degrees, LeRobot's default, or scaled to -100..100 of their ranges. The dataset itself does not say so."""
+    calibration: Path | None = None
+    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
+    says)."""
+
+    @property
+    def named(self) -> Motors | None:
+        """The servos; None without --motor-units. Raises ConfigError for a calibration that is none of theirs."""
+        from demorec.robots.so101 import SO101_FOLLOWER
+
+        if self.motor_units is not None:
+            return SO101_FOLLOWER.motors(self.motor_units, self.calibration)
+        if self.calibration is not None:
+            raise ConfigError("--calibration belongs to --motor-units.")
+        return None
+
+
+MotorsByFlags = Annotated[MotorFlags, arg(name="")]

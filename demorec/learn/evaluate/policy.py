@@ -105,14 +105,13 @@ class Policy:
     Args:
         checkpoint: As of `find_checkpoint`.
         action_steps: Actions of a chunk that are executed before the policy looks again; None: as trained.
-        device: Of torch.
 
     Raises:
         ConfigError: LeRobot cannot load it, or it has no such setting.
         MissingDependencyError: LeRobot, or the package that registers this type of policy, is not installed.
     """
 
-    def __init__(self, checkpoint: Path, *, action_steps: int | None = None, device: str = "cpu") -> None:
+    def __init__(self, checkpoint: Path, *, action_steps: int | None = None) -> None:
         try:
             import torch
             from lerobot.configs import PreTrainedConfig
@@ -122,8 +121,7 @@ class Policy:
             raise MissingDependencyError(
                 "Running a policy", error.name or "lerobot", "pip install 'demorec[train]'"
             ) from error
-        if device == "cpu":
-            torch.set_num_threads(1)
+        torch.set_num_threads(1)
         self._torch, self._preprocess = torch, preprocess_observation
         kind = str(policy_config(checkpoint).get("type", ""))
         not_imported = _register_plugins()
@@ -131,13 +129,13 @@ class Policy:
             raise _missing_plugin(kind, not_imported)
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint)
-            config.device = device
+            config.device = "cpu"
             with contextlib.redirect_stdout(io.StringIO()):  # LeRobot says where it loads weights from
                 self._policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
             self._before, self._after = make_pre_post_processors(
                 policy_cfg=config,
                 pretrained_path=str(checkpoint),
-                preprocessor_overrides={"device_processor": {"device": device}},
+                preprocessor_overrides={"device_processor": {"device": "cpu"}},
             )
         except Exception as error:  # whatever a foreign format may lack
             raise ConfigError(f"LeRobot cannot load this policy ({describe_error(error)}): {checkpoint}") from error

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from demorec.episode.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame
 from demorec.episode.scene import Goal
@@ -164,14 +164,8 @@ class Turns:
         return PHASES[min(self._stages, default=0)], reason
 
 
-@dataclass(frozen=True, kw_only=True)
-class TakenOver:
-    """The corrections in a recording.
-
-    Attributes:
-        reasons: Why the expert took over, each time.
-        num_frames: How many the expert acted in.
-    """
+class TakenOver(NamedTuple):
+    """The corrections in a recording: why the expert took over, each time, and how many frames it acted in."""
 
     reasons: tuple[str, ...]
     num_frames: int

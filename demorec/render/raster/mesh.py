@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.cache import cache_folder, folder_lock, write_whole
+from demorec.core.files import cache_folder, folder_lock, write_whole
 
 log = logging.getLogger(__name__)
 Floats = NDArray[np.float64]

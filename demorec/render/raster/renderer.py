@@ -9,8 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.core.cache import folder_lock
-from demorec.core.files import Closing
+from demorec.core.files import Closing, folder_lock
 from demorec.core.geometry import Array, Pose, look_at
 from demorec.episode.episode import CameraImages
 from demorec.episode.scene import SceneCamera, Texture

@@ -12,8 +12,8 @@ import llvmlite.binding
 import numba
 import numpy as np
 
-from demorec.core.cache import cache_folder
 from demorec.core.compiled import njit
+from demorec.core.files import cache_folder
 
 # Only flags that change no finite result: images are equal whatever vector width a CPU has. `contract`, `arcp` and
 # `reassoc` are left out on purpose.
