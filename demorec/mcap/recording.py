@@ -87,7 +87,8 @@ class Recording(EpisodeFile):
     def _numbers_and_events(self) -> tuple[Table | Trajectory, TimedMessages]:
         """Read once: an export and a check look at them from several sides."""
         topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
-        return self._layout.read(self._container, self.num_frames, topics)
+        with damage_as_recording_error(self.path):
+            return self._layout.read(self._container, self.num_frames, topics)
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:

@@ -183,11 +183,11 @@ def test_whole_numbers_that_no_recording_holds_are_left_out(imported: tuple[str,
     assert "observation.touch" not in told
 
 
-def _off_the_grid(dataset: Path) -> None:
+def _backwards(dataset: Path) -> None:
     file = sorted((dataset / "data").rglob("*.parquet"))[0]
     table = pq.read_table(file)
     times = table.column("timestamp").to_pylist()
-    times[2] += 0.01
+    times[2] = times[1] - 0.01
     column = table.schema.get_field_index("timestamp")
     kind = table.schema.field(column)
     changed = table.set_column(column, kind, pa.array(times, type=kind.type))
@@ -207,7 +207,7 @@ def _odd_name(dataset: Path) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
-    "times": (_off_the_grid, "no multiple of 1/30 s"),
+    "times": (_backwards, "timestamps must rise"),
     "video": (_no_video, "video"),
     "column": (_odd_name, "frames"),
     "tasks": (lambda dataset: (dataset / "meta" / "tasks.parquet").unlink(), "tasks.parquet"),
