@@ -70,7 +70,11 @@ def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMes
         report(f"it was not finished ({describe_error(error).rstrip('.')}), so it is read without its index")
         from demorec.sources.ros1_scan import scan_ros1
 
-        yield from (message for message in scan_ros1(path, report) if topics is None or message.channel.topic in topics)
+        channels: dict[int, ScannedChannel] = {}
+        for connection, time_ns, data in scan_ros1(path, report):
+            if topics is None or connection.topic in topics:
+                channel = channels.get(connection.id) or channels.setdefault(connection.id, _channel(connection))
+                yield ScannedMessage(channel, time_ns, data)
         return
     yield from _rosbags_messages(reader, topics, report)
 
@@ -79,7 +83,7 @@ def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[S
     """Read the messages of an open reader of `rosbags`, and close it."""
     try:
         wanted = [connection for connection in reader.connections if topics is None or connection.topic in topics]
-        channels = {connection.id: channel_of(connection) for connection in wanted}
+        channels = {connection.id: _channel(connection) for connection in wanted}
         for connection, time_ns, data in reader.messages(wanted) if wanted else ():
             yield ScannedMessage(channels[connection.id], time_ns, data)
     except MemoryError:
@@ -90,8 +94,8 @@ def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[S
         reader.close()
 
 
-def channel_of(connection: Any) -> ScannedChannel:
-    """The channel of a connection of `rosbags`."""
+def _channel(connection: Any) -> ScannedChannel:
+    """Channel of a connection of `rosbags`."""
     encoding = getattr(connection.ext, "serialization_format", "ros1")
     definition = connection.msgdef
     return ScannedChannel(

@@ -5,23 +5,22 @@ The format: http://wiki.ros.org/Bags/Format/2.0
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
+from rosbags.interfaces import Connection
 from rosbags.rosbag1.reader import Header, Reader, ReaderError, RecordType, decompressors, read_uint32
 
 from demorec.core.errors import describe_error
 from demorec.core.files import open_regular
-from demorec.mcap.scan import ScannedChannel, ScannedMessage
-from demorec.sources.bag_files import Report, channel_of
 
 _UNCOMPRESSED = "none"
 
 
-def scan_ros1(path: Path, report: Report) -> Iterator[ScannedMessage]:
-    """Read the messages of a bag in the order of the file.
+def scan_ros1(path: Path, report: Callable[[str], None]) -> Iterator[tuple[Connection, int, bytes]]:
+    """Read the messages of a bag in the order of the file: connection, time of recording and bytes of each.
 
     Args:
         path: The bag.
@@ -39,8 +38,8 @@ def scan_ros1(path: Path, report: Report) -> Iterator[ScannedMessage]:
 
 
 def _records(
-    file: BinaryIO, reader: Reader, channels: dict[int, ScannedChannel], report: Report
-) -> Iterator[ScannedMessage]:
+    file: BinaryIO, reader: Reader, connections: dict[int, Connection], report: Callable[[str], None]
+) -> Iterator[tuple[Connection, int, bytes]]:
     """Read the records of a file, or of a chunk in memory; ReaderError where one is not whole."""
     while True:
         place = file.tell()
@@ -53,7 +52,7 @@ def _records(
             file.seek(place)
             reader.bio = file
             connection = reader.read_connection()
-            channels[connection.id] = channel_of(connection)
+            connections[connection.id] = connection
             continue
         size = read_uint32(file)
         data = file.read(size)
@@ -63,8 +62,8 @@ def _records(
                 report(f"it is cut off within a chunk, of which {len(data):,} of {size:,} bytes are there")
                 if compression != _UNCOMPRESSED:
                     return
-            yield from _records(BytesIO(decompressors[compression](data)), reader, channels, report)
+            yield from _records(BytesIO(decompressors[compression](data)), reader, connections, report)
         elif len(data) < size:
             raise ReaderError(f"Got only {len(data)} of requested {size} bytes.")
-        elif kind == RecordType.MSGDATA and (number := header.get_uint32("conn")) in channels:
-            yield ScannedMessage(channels[number], header.get_time("time"), data)
+        elif kind == RecordType.MSGDATA and (number := header.get_uint32("conn")) in connections:
+            yield connections[number], header.get_time("time"), data
