@@ -29,7 +29,7 @@ raise SystemExit(code if code >= 0 else 128 - code)
 START = """
 import os, signal, sys, time
 from demorec.core import limited
-limited.READING_CPU_S, limited.CPU_S_PER_MB = 1, 1
+limited.READING_CPU_S, limited.CPU_S_PER_MB = int(os.environ.get("TEST_CPU_S", 20)), 1
 limited.continue_in_child(sys.argv[1:])
 """
 FILL = "content = bytearray(1 << 30)\nprint('filled', flush=True)\n"
@@ -130,7 +130,7 @@ def test_the_limits_can_be_removed(file: Path) -> None:
 
 
 def test_too_much_cpu_time_is_one_sentence(file: Path) -> None:
-    ended = run(SPIN, "info", file)
+    ended = run(SPIN, "info", file, environment={"TEST_CPU_S": "1"})
     assert ended.code == 1
     assert ended.errors.startswith("demorec info: Reading this takes more than 1 s of CPU time")
     assert ended.errors.count("\n") == 1
