@@ -93,27 +93,20 @@ TARGETS = {
 }
 
 
+@pytest.mark.parametrize("command", ["export lerobot runs/run --no-verify", "dataset select dataset --episodes 0"])
 @pytest.mark.parametrize("target", TARGETS)
-def test_export_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
+def test_nothing_but_a_dataset_is_replaced_by_one(
+    place: Path, capsys: pytest.CaptureFixture[str], command: str, target: str
+) -> None:
     before = files_of(place.parent)
-    arguments = ("export", "lerobot", place / "runs/run", "--out", place / target, "--no-verify")
+    name, kind, source, *options = command.split()
+    arguments = (name, kind, place / source, *options, "--out", place / target)
     assert exit_code(*arguments, "--overwrite") == 2
     said = capsys.readouterr().err
-    assert TARGETS[target] in said
+    assert TARGETS[target] in said or name == "dataset"  # which reads no run
     assert len(said.splitlines()) == 1
     assert exit_code(*arguments) == 2  # and without the flag nobody is told to use it
     assert "--overwrite" not in capsys.readouterr().err
-    assert files_of(place.parent) == before
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_editing_replaces_nothing_but_a_dataset(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
-    before = files_of(place.parent)
-    arguments = ("dataset", "select", place / "dataset", "--episodes", "0", "--out", place / target)
-    assert exit_code(*arguments, "--overwrite") == 2
-    assert len(capsys.readouterr().err.splitlines()) == 1
-    assert exit_code(*arguments) == 2
-    assert exit_code(*arguments[:-1], place / "dataset", "--overwrite") == 2  # the source itself
     assert files_of(place.parent) == before
 
 
@@ -139,16 +132,6 @@ def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) ->
     assert (place / "mixed/data/notes.txt").read_text() == "years of work"
 
 
-def test_a_dataset_is_replaced_and_its_neighbours_are_not(place: Path) -> None:
-    before = files_of(place)
-    other = write_episode(place.parent / "other.mcap", num_frames=3, cameras=("front",))
-    assert exit_code("export", "lerobot", other, "--out", place / "dataset", "--overwrite", "--no-verify") == 0
-    after = files_of(place)
-    for name, data in before.items():
-        assert name.startswith("dataset/") or after[name] == data
-    assert json.loads(after["dataset/meta/info.json"])["total_frames"] == 3
-
-
 def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     workshop = place / ".new.demorec-part"
     (workshop / "new").mkdir(parents=True)
@@ -157,19 +140,6 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
     assert exit_code("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 2
     assert "not made by demorec" in capsys.readouterr().err
     assert files_of(place) == before
-
-
-def test_files_put_into_the_target_meanwhile_are_kept(place: Path) -> None:
-    from demorec.datasets.lerobot import ExportOptions, export_lerobot
-
-    def note(done: int, total: int) -> None:
-        (place / "dataset" / "notes.txt").write_text("years of work")
-
-    with pytest.raises(ConfigError, match=r"notes\.txt"):
-        export_lerobot([place / "runs/run"], place / "dataset", ExportOptions(overwrite=True, verify=False), note)
-    assert (place / "dataset" / "notes.txt").read_text() == "years of work"
-    assert (place / "dataset.1" / "meta" / "info.json").is_file()  # the result is kept, too
-    assert not (place / ".dataset.demorec-part").exists()
 
 
 # A run: --overwrite of generate-dataset.
@@ -403,16 +373,112 @@ def test_what_only_has_the_name_of_an_evaluation_is_kept(evaluation: Path, conte
 # Commands that write recordings, and those that write images and .rrd files.
 
 
-def test_recover_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+FRAME = "dataset/images/front/episode-000000/frame-000000.png"
+KEPT: dict[str, dict[str, str]] = {
+    "recover broken.mcap --out": {
+        "thesis.tex": "it is not a recording",
+        "thesis": "it is a folder",
+        "link_to_thesis": "it is a folder",
+        "link_to_nothing": "a link to something that is not there",
+        "broken.mcap": "needs another name than the damaged one",
+        "lock.mcap": "lock.mcap",
+    },
+    "view alone.mcap --save": {
+        "alone.rrd": "it is not a Rerun file",  # a recording under another name
+        "thesis.rrd": "it is not a Rerun file",
+        "link.rrd": "this command reads it",
+        "folder.rrd": "it is a folder",
+        "dangling.rrd": "a link to something that is not there",
+        "lock.rrd": "lock.rrd",
+    },
+    "view alone.mcap --screenshot": {
+        "thesis.png": "it is not an image",
+        "link.png": "this command reads it",
+        "lock.png": "lock.png",
+    },
+    "view dataset --screenshot": {FRAME: "it lies in what this command reads"},
+    "report alone.mcap --out": {
+        "thesis.html": "it is not a report",
+        "link.html": "this command reads it",
+        "lock.html": "lock.html",
+    },
+    "report dataset --out": {"dataset/report.html": "Nothing else is written into a dataset"},
+    "dataset score dataset --out": {
+        "thesis.json": "thesis.json",
+        "thesis.tex": "thesis.tex",
+        "thesis": "it is a folder",
+        "dataset/meta/info.json": "info.json",
+        "dataset/scores.json": "Nothing else is written into a dataset",
+    },
+    **{f"export {exporter} alone.mcap --out": {"lock": "lock"} for exporter in EXPORTERS.names()},
+}
+"""Command -> what it shall not write over, and words of the reason."""
+
+
+@pytest.fixture
+def full(place: Path) -> Path:
+    """A home with something under every name; an empty file may be somebody's lock or mark."""
     (place / "broken.mcap").write_bytes((place / "alone.mcap").read_bytes()[:-500])
-    before = files_of(place.parent)
-    for target in ("thesis.tex", "thesis", "link_to_thesis", "link_to_nothing", "broken.mcap"):
-        assert exit_code("recover", place / "broken.mcap", "--out", place / target, "--overwrite") == 2, target
-        assert len(capsys.readouterr().err.splitlines()) == 1
-    (place / "x.mcap.recovering").write_text("years of work")
-    assert exit_code("recover", place / "broken.mcap", "--out", place / "x.mcap") == 2
-    assert files_of(place.parent) == {**before, "home/x.mcap.recovering": b"years of work"}
-    assert exit_code("recover", place / "broken.mcap", "--out", place / "alone.mcap", "--overwrite") == 0
+    shutil.copy(place / "alone.mcap", place / "alone.rrd")
+    for suffix in ("rrd", "png", "html", "json"):
+        (place / f"thesis.{suffix}").write_text('{"episodes": []}')
+        (place / f"link.{suffix}").symlink_to(place / "alone.mcap")
+        (place / f"dangling.{suffix}").symlink_to(place / "nothing")
+        (place / f"folder.{suffix}").mkdir()
+    for name in ("lock", "lock.mcap", "lock.rrd", "lock.png", "lock.html"):
+        (place / name).touch()
+    (place / "dataset" / "report.html").write_text(REPORT_MARK)
+    for image in (FRAME, "photo.png"):
+        (place / image).parent.mkdir(parents=True, exist_ok=True)
+        Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(place / image)
+    return place
+
+
+@pytest.mark.parametrize(("command", "target"), [(row, target) for row in KEPT for target in KEPT[row]])
+def test_a_command_replaces_its_own_files_only(
+    full: Path, capsys: pytest.CaptureFixture[str], command: str, target: str
+) -> None:
+    before = files_of(full.parent)
+    *words, source, flag = command.split()
+    for flags in ((), ("--overwrite",)):
+        assert exit_code(*words, full / source, flag, full / target, *flags) == 2
+        said = capsys.readouterr().err
+        assert len(said.splitlines()) == 1
+        assert "--overwrite" not in said
+    assert KEPT[command][target] in said
+    assert files_of(full.parent) == before
+
+
+OWN = {
+    "report --no-checks alone.mcap --out": "new.html",
+    "dataset score dataset --out": "new.json",
+    "recover broken.mcap --out": "new.mcap",
+}
+
+
+@pytest.mark.parametrize("command", OWN)
+def test_its_own_file_is_replaced_when_that_is_asked_for(
+    full: Path, capsys: pytest.CaptureFixture[str], command: str
+) -> None:
+    (full / "dataset/report.html").unlink()
+    *words, source, flag = command.split()
+    for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
+        assert exit_code(*words, full / source, flag, full / OWN[command], *flags) == code
+        assert ("--overwrite" in capsys.readouterr().err) == (code == 2)
+
+
+def test_a_screenshot_is_replaced_only_when_asked_for(full: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    before = files_of(full)
+    assert exit_code("view", full / "alone.mcap", "--screenshot", full / "photo.png") == 2
+    assert "--overwrite to replace it" in capsys.readouterr().err
+    assert files_of(full) == before
+
+
+def test_what_a_recovery_of_somebody_else_writes_stays(full: Path) -> None:
+    (full / "x.mcap.recovering").write_text("years of work")
+    before = files_of(full)
+    assert exit_code("recover", full / "broken.mcap", "--out", full / "x.mcap") == 2
+    assert files_of(full) == before
 
 
 @pytest.mark.parametrize("command", ["render", "replay"])
@@ -460,121 +526,15 @@ def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.Captur
     assert files_of(place.parent) == before
 
 
-VIEWED = {
-    "alone.rrd": "it is not a Rerun file",  # a recording under another name
-    "link.rrd": "this command reads it",
-    "thesis.rrd": "it is not a Rerun file",
-    "folder.rrd": "it is a folder",
-    "dangling.rrd": "a link to something that is not there",
-}
-
-
-@pytest.mark.parametrize("target", VIEWED)
-def test_view_saves_over_rerun_files_only(place: Path, capsys: pytest.CaptureFixture[str], target: str) -> None:
-    shutil.copy(place / "alone.mcap", place / "alone.rrd")
-    (place / "link.rrd").symlink_to(place / "alone.mcap")
-    (place / "thesis.rrd").write_text("years of work")
-    (place / "folder.rrd").mkdir()
-    (place / "dangling.rrd").symlink_to(place / "nothing")
-    before = files_of(place.parent)
-    assert exit_code("view", place / "alone.mcap", "--save", place / target, "--overwrite") == 2
-    assert VIEWED[target] in capsys.readouterr().err
-    assert exit_code("view", place / "alone.mcap", "--save", place / target) == 2
-    assert "--overwrite" not in capsys.readouterr().err
-    assert files_of(place.parent) == before
-
-
-def test_screenshots_replace_images_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (place / "thesis.png").write_text("years of work")
-    (place / "link.png").symlink_to(place / "alone.mcap")
-    frame = place / "dataset" / "images" / "front" / "episode-000000" / "frame-000000.png"
-    frame.parent.mkdir(parents=True)
-    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(frame)
-    Image.fromarray(np.zeros((4, 4, 3), np.uint8)).save(place / "photo.png")
-    before = files_of(place.parent)
-    for source, target, word in (
-        ("alone.mcap", "thesis.png", "it is not an image"),
-        ("alone.mcap", "link.png", "this command reads it"),
-        ("dataset", frame, "it lies in what this command reads"),
-    ):
-        assert exit_code("view", place / source, "--screenshot", place / target, "--overwrite") == 2
-        assert word in capsys.readouterr().err
-    assert exit_code("view", place / "alone.mcap", "--screenshot", place / "photo.png") == 2
-    assert "--overwrite to replace it" in capsys.readouterr().err
-    assert files_of(place.parent) == before
-
-
-@pytest.mark.parametrize(
-    ("words", "flag", "name"),
-    [
-        ("recover", "--out", "lock.mcap"),
-        ("view", "--save", "lock.rrd"),
-        ("view", "--screenshot", "lock.png"),
-        ("report", "--out", "lock.html"),
-        *((f"export {exporter}", "--out", "lock") for exporter in EXPORTERS.names()),
-    ],
-)
-def test_an_empty_file_is_not_replaced(
-    place: Path, capsys: pytest.CaptureFixture[str], words: str, flag: str, name: str
-) -> None:
-    """It may be somebody's lock or mark; nothing in it says that it is ours."""
-    target = place / name
-    target.touch()
-    before = files_of(place)
-    for flags in ((), ("--overwrite",)):
-        assert exit_code(*words.split(), place / "alone.mcap", flag, target, *flags) == 2
-        said = capsys.readouterr().err
-        assert len(said.splitlines()) == 1
-        assert str(target) in said
-        assert files_of(place) == before
-
-
-def test_scores_replace_scores_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    before = files_of(place)
-    (place / "other.json").write_text('{"episodes": []}')
-    score = ("dataset", "score", place / "dataset", "--out")
-    for name in ("other.json", "thesis.tex", "thesis", "dataset/meta/info.json", "dataset/scores.json"):
-        assert exit_code(*score, place / name, "--overwrite") == 2, name
-        assert len(capsys.readouterr().err.splitlines()) == 1
-    target = place / "scores.json"
-    for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
-        assert exit_code(*score, target, *flags) == code
-    target.unlink()
-    (place / "other.json").unlink()
-    assert files_of(place) == before
-
-
-def test_a_report_replaces_reports_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (place / "thesis.html").write_text("<!doctype html>\n<p>years of work")
-    (place / "link.html").symlink_to(place / "alone.mcap")
-    inside = place / "dataset" / "report.html"
-    inside.write_text(REPORT_MARK)
-    before = files_of(place.parent)
-    for source, target, word in (
-        ("alone.mcap", place / "thesis.html", "it is not a report"),
-        ("alone.mcap", place / "link.html", "this command reads it"),
-        ("dataset", inside, "Nothing else is written into a dataset"),
-    ):
-        assert exit_code("report", place / source, "--out", target, "--overwrite") == 2
-        assert word in capsys.readouterr().err
-    assert files_of(place.parent) == before
-    target = place / "report.html"
-    for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
-        assert exit_code("report", place / "alone.mcap", "--no-checks", "--out", target, *flags) == code
-    assert "--overwrite to replace it" in capsys.readouterr().err
-    assert target.read_text().startswith(REPORT_MARK)
-
-
+PARTS = ("runs/other/episodes", "runs/other/failed", "runs/other/unfinished", "runs/other/failed/new")
 INSIDE: dict[str, Sequence[str]] = {
-    "view --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/v.rrd", "dataset/data/v.rrd"),
-    "view --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png", "dataset/v.png"),
-    "report --out": ("runs/other/episodes/v.html", "dataset/v.html"),
-    "render --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
-    "replay --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
-    **{
-        f"export {exporter} --out": ("runs/other/episodes/x", "runs/other/unfinished", "dataset/inner", "dataset/a/b")
-        for exporter in EXPORTERS.names()
-    },
+    "view alone.mcap --save": ("runs/other/episodes/v.rrd", "runs/other/failed/v.rrd", "dataset/data/v.rrd"),
+    "view alone.mcap --screenshot": ("runs/other/unfinished/v.png", "evaluation/episodes/v.png", "dataset/v.png"),
+    "report alone.mcap --out": ("runs/other/episodes/v.html", "dataset/v.html"),
+    "render alone.mcap --out": ("runs/other/episodes", "dataset", "evaluation/failed", "runs/other/episodes/x.mcap"),
+    "replay alone.mcap --out": ("runs/other/episodes", "dataset/deep/er", "evaluation/failed"),
+    "import lerobot dataset --out": PARTS,
+    **{f"export {exporter} alone.mcap --out": (*PARTS, "dataset/a/b") for exporter in EXPORTERS.names()},
 }
 
 
@@ -588,22 +548,11 @@ def test_nothing_is_written_into_another_run_or_dataset(
             (place / whole / part).mkdir(parents=True)
         (place / whole / mark).write_text("{}")
     before = files_of(place)
-    *words, flag = command.split()
+    *words, source, flag = command.split()
     (place / target).parent.mkdir(parents=True, exist_ok=True)
-    assert exit_code(*words, place / "alone.mcap", flag, place / target) == 2
+    assert exit_code(*words, place / source, flag, place / target) == 2
     assert "Nothing else is written into" in capsys.readouterr().err
     assert files_of(place) == before
-
-
-@pytest.mark.parametrize("part", ["episodes", "failed", "unfinished", "failed/new"])
-def test_nothing_is_imported_into_a_part_of_a_run(place: Path, capsys: pytest.CaptureFixture[str], part: str) -> None:
-    (place / "runs/run/run.json").write_text("{}")
-    (place / "runs/run/unfinished").mkdir()
-    before = files_of(place)
-    assert exit_code("import", "lerobot", place / "dataset", "--out", place / "runs/run" / part) == 2
-    assert "Nothing else is written into a run" in capsys.readouterr().err
-    assert files_of(place) == before
-    assert not (place / "runs/run" / part / "episodes").exists()
 
 
 def test_what_is_made_beside_the_parts_of_a_run_is_taken(place: Path) -> None:
@@ -630,15 +579,6 @@ def test_an_unfinished_file_of_somebody_else_is_kept(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="not made by demorec"), atomic_write(tmp_path / "x.png", IMAGE):
         pass
     assert part.read_text() == "mine"
-
-
-def test_two_processes_do_not_write_one_file(tmp_path: Path) -> None:
-    target = tmp_path / "x.png"
-    with atomic_write(target, IMAGE) as part:
-        part.write_bytes(b"\x89PNG\r\n\x1a\n1")
-        with pytest.raises(ConfigError, match="Another command"), atomic_write(target, IMAGE):
-            pass
-    assert target.read_bytes().endswith(b"1")
 
 
 def original(**changes: Any) -> reproducing.Original:
@@ -677,14 +617,3 @@ def test_a_copy_leaves_another_dataset_alone(place: Path) -> None:
     with pytest.raises(ConfigError, match="choose another --out"):
         reproducing.export_as_original(original(export=ExportOptions(verify=False)), result)
     assert files_of(copy) == before
-
-
-@pytest.mark.parametrize("command", ["render", "replay"])
-def test_a_file_where_the_folder_of_results_would_be_is_told(
-    place: Path, command: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    before = files_of(place)
-    assert exit_code(command, place / "alone.mcap", "--out", place / "thesis.tex") == 2
-    said = [line for line in capsys.readouterr().err.splitlines() if not line.startswith("Note: ")]
-    assert len(said) == 1
-    assert files_of(place) == before

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -91,25 +88,3 @@ def test_the_file_of_a_user_is_exit_code_2(
     assert str(tmp_path) in said(capsys)
     assert target.read_text() == "years of work"
     assert list(tmp_path.iterdir()) == [target]
-
-
-@contextmanager
-def full_disk() -> Iterator[None]:
-    """Let no file take a byte: like a full disk, files and folders can still be made."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (0, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-
-
-@pytest.mark.parametrize("name", [name for name in CALLS if not name.startswith("generate")])
-def test_a_full_disk_is_exit_code_1(
-    name: str, sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    words = call(name, sources, tmp_path / "new")
-    with full_disk():
-        assert exit_code(*words) == 1
-    assert "unexpected" not in said(capsys)
-    assert not (tmp_path / words[words.index("--save" if name == "view" else "--out") + 1]).is_file()

@@ -9,7 +9,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -171,23 +171,6 @@ def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path],
     assert done == [(count, 2 * len(BAD)) for count in range(2 * len(BAD) + 1)]
 
 
-def test_an_interrupted_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
-    """Ctrl-C after each bag, with whatever number of processes before and after it."""
-    for moment in range(0, len(BAD), 3):
-        run, seen = tmp_path / f"run_{moment}", iter(range(100))
-
-        def interrupt(report: BagReport, moment: int = moment, seen: Iterator[int] = seen) -> None:
-            if next(seen) == moment:
-                raise KeyboardInterrupt
-
-        with pytest.raises(KeyboardInterrupt):
-            import_bags([batch[0]], batch[1], run, skip_bad=True, tell=interrupt, workers=2 if moment == 3 else 1)
-        result = import_bags([batch[0]], batch[1], run, skip_bad=True)
-        assert result.num_new == len(BAD) - moment - 1
-        assert _content(run) == _content(alone)
-        assert load_any_run_file(run).digest == load_any_run_file(alone).digest
-
-
 def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_again(tmp_path: Path) -> None:
     folder, mapping = _batch(tmp_path)
     run = tmp_path / "run"
@@ -279,20 +262,6 @@ def _importing(batch: tuple[Path, Path], run: Path) -> subprocess.Popen[str]:
 def _workers(program: subprocess.Popen[str]) -> list[psutil.Process]:
     found = psutil.Process(program.pid).children(recursive=True)
     return [process for process in found if any("spawn_main" in word for word in process.cmdline())]
-
-
-def test_a_killed_worker_is_told_in_one_sentence(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
-    with _importing(batch, tmp_path / "run") as program:
-        while not (workers := _workers(program)):
-            assert program.poll() is None
-            time.sleep(0.005)
-        workers[0].kill()
-        _, err = program.communicate()
-    assert program.returncode == 1
-    (line,) = [line for line in err.splitlines() if not line.startswith("importing: ")]  # told of a slow import
-    assert "A process of this command was killed" in line
-    import_bags([batch[0]], batch[1], tmp_path / "run", skip_bad=True)
-    assert _content(tmp_path / "run") == _content(alone)
 
 
 def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:

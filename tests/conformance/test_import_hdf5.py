@@ -28,8 +28,7 @@ from support.hdf5 import (
 from demorec.datasets.hdf5.foreign import Hdf5Error
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources.frames_writer import FramesImport, Image
-from demorec.sources.hdf5_arrays import StoredCamera
+from demorec.sources.frames_writer import FramesImport
 from demorec.sources.hdf5_import import import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 
@@ -155,29 +154,6 @@ def test_distances_stay(kind: str, tmp_path: Path) -> None:
         found = np.array(list(recording.distances("cam_high_depth")))
     assert found.dtype == given.dtype.newbyteorder("=")
     np.testing.assert_array_equal(found, given)
-
-
-def test_interrupting_leaves_nothing_half_written(
-    robomimic: tuple[Path, Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    source, run = robomimic
-    words = ("import", "hdf5", source, "--mapping", source.with_suffix(".toml"), "--out", tmp_path / "run")
-    given, calls = StoredCamera._ordered, iter(range(1000))
-
-    def interrupted(self: StoredCamera, image: NDArray[np.uint8]) -> Image:
-        if next(calls) == 19:  # in the second episode
-            raise KeyboardInterrupt
-        return given(self, image)
-
-    with monkeypatch.context() as patched:
-        patched.setattr(StoredCamera, "_ordered", interrupted)
-        assert exit_code(*words) == 130
-    assert [path.name for path in (tmp_path / "run/episodes").iterdir()] == ["episode_000000.mcap"]
-    assert exit_code(*words) == 0
-    assert "1 of 3 episodes had been imported before." in capsys.readouterr().err
-    assert [path.read_bytes() for path in recordings(tmp_path / "run")] == [
-        path.read_bytes() for path in recordings(run)
-    ]
 
 
 def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:

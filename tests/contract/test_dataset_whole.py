@@ -188,13 +188,6 @@ def test_the_checks_judge_the_other_episodes(spoilt: tuple[Path, Path]) -> None:
     assert found["finite_numbers"].level == "pass"
 
 
-def test_info_names_the_file_once(spoilt: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
-    root, path = spoilt
-    assert exit_code("info", root) == 0
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("problem"))
-    assert path.relative_to(root).as_posix() in line
-
-
 def test_the_other_episodes_are_shown(spoilt: tuple[Path, Path], tmp_path: Path) -> None:
     root, _ = spoilt
     assert exit_code("view", root, "--episodes", "2:4", "--save", tmp_path / "shown.rrd") == 0

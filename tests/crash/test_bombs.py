@@ -9,7 +9,6 @@ import zlib
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-import numpy as np
 import pytest
 import zstandard
 from support.export import export
@@ -122,43 +121,6 @@ def test_files_without_checksums_are_read(good: Path, tmp_path: Path) -> None:
     assert struct.unpack("<I", path.read_bytes()[-12:-8]) == (0,)
     with Recording(path) as recording, Recording(good) as original:
         assert recording.digest() == original.digest()
-
-
-def _bomb_table(path: Path) -> None:
-    """Nine million rows of one value, which a dictionary makes small."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    schema = pq.read_schema(path)
-    rows = 9_000_000
-    arrays = [
-        pa.DictionaryArray.from_arrays(pa.array(np.zeros(rows, dtype=np.int8)), pa.array(["x" * 1000]))
-        if item.name == "task"
-        else pa.array(np.zeros(rows, dtype=np.int64))
-        for item in schema
-    ]
-    pq.write_table(pa.Table.from_arrays(arrays, names=schema.names), path, compression="zstd")
-
-
-def _bomb_strings(path: Path) -> None:
-    """One long string, in a hundred thousand rows."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
-
-    text = pa.DictionaryArray.from_arrays(pa.array(np.zeros(100_000, dtype=np.int8)), pa.array(["x" * 200_000]))
-    table = pa.Table.from_arrays([text, pa.array(np.zeros(100_000, dtype=np.int64))], names=["task", "task_index"])
-    pq.write_table(table, path, compression="zstd")
-
-
-@pytest.mark.parametrize("bomb", [_bomb_table, _bomb_strings])
-def test_tables_that_claim_very_much(
-    bomb: Callable[[Path], None], good: Path, commands: LimitedCommands, tmp_path: Path
-) -> None:
-    export([good], tmp_path / "dataset")
-    path = tmp_path / "dataset" / "meta" / "tasks.parquet"
-    bomb(path)
-    assert path.stat().st_size < 1_000_000
-    commands.refused("check", tmp_path / "dataset", "--only", "dataset_readable")
 
 
 def _box(kind: bytes, content: bytes) -> bytes:

@@ -305,6 +305,7 @@ def test_a_full_disk(name: str, sources: Path, tmp_path: Path) -> None:
         ended = run_command(case.words, case.folder, max_bytes=largest // 3)
         assert ended.code == 1
         assert len(ended.said) == 1
+        assert "unexpected" not in ended.said[0]
         case.check_whole("full disk")
         if not case.row.resumes:
             assert case.everything() == case.all_before

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import random
 import shutil
 import signal
 import subprocess
@@ -56,11 +55,6 @@ def wait_until_busy(process: subprocess.Popen[str], out: Path) -> None:
     """Until both workers have begun an episode that never ends."""
     wait_for(lambda: len(list((out / "unfinished").glob("busy-*"))) == 2 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
-
-
-def wait_for_progress(process: subprocess.Popen[str], out: Path, count: int) -> None:
-    enough = num_finished(out) + count
-    wait_for(lambda: num_finished(out) >= enough or process.poll() is not None)
 
 
 @pytest.fixture(scope="module")
@@ -266,13 +260,6 @@ def test_a_vanished_folder_is_told(tmp_path: Path) -> None:
     assert num_finished(tmp_path / "elsewhere") > 0
 
 
-@pytest.mark.parametrize("place", ["a-file/run", "/proc/demorec-run"])
-def test_an_impossible_folder_is_told(tmp_path: Path, place: str) -> None:
-    (tmp_path / "a-file").touch()
-    with pytest.raises(ConfigError, match="cannot be written"):
-        run_fake(tmp_path / place)
-
-
 def test_two_runs_into_one_folder_exclude_each_other_until_the_owner_dies(tmp_path: Path) -> None:
     out = tmp_path / "run"
     first = driver(out, "make_for_ever", 4)
@@ -355,33 +342,3 @@ def test_a_killed_driver_leaves_no_orphans(tmp_path: Path) -> None:
     process.kill()
     process.communicate()
     assert_gone(workers)
-
-
-@pytest.mark.parametrize("kills", [4, pytest.param(40, marks=pytest.mark.long)])
-def test_runs_that_are_killed_again_and_again_come_to_the_same_end(tmp_path: Path, kills: int) -> None:
-    """SIGKILL to the driver or to a worker, at moments spread over the run."""
-    num_episodes, chance = 20 * kills, random.Random(kills)
-    reference = run_fake(tmp_path / "reference", num_episodes=num_episodes)
-    out = tmp_path / "run"
-    killed = {"driver": 0, "worker": 0}
-    process = driver(out, "make_quickly", num_episodes)
-    while sum(killed.values()) < kills and process.poll() is None:
-        wait_for_progress(process, out, chance.randrange(12))
-        time.sleep(chance.random() * 0.05)
-        workers = workers_of(process)
-        if process.poll() is not None:
-            break
-        if workers and chance.random() < 0.5:
-            chance.choice(workers).kill()
-            killed["worker"] += 1
-        else:
-            process.kill()
-            process.communicate()
-            killed["driver"] += 1
-            process = driver(out, "make_quickly", num_episodes)
-    process.communicate(timeout=PATIENCE_S)
-    assert sum(killed.values()) == kills, f"the run ended before it was killed often enough: {killed}"
-    assert min(killed.values()) > 0
-    result = run_fake(out, num_episodes=num_episodes)
-    assert result.run.digest == reference.run.digest
-    assert attempts_of(result) == expected_attempts(num_episodes)

@@ -6,8 +6,6 @@ import json
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from rerun.chunk import RrdReader
 from support.export import export, make_run
@@ -141,22 +139,3 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
             list(episode.depth["front"]())
         with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json says av1"):
             list(episode.videos["front"].packets())
-
-
-@pytest.mark.parametrize(
-    ("lengths", "words"),
-    [
-        ([8, 13], "its table of episodes has 2 of 21"),
-        ([9, 7], "rows of episode 1 are not its own"),
-    ],
-)
-def test_an_episode_of_another_length_than_its_rows_is_one_sentence(
-    lengths: list[int], words: str, tmp_path: Path
-) -> None:
-    export(make_run(tmp_path / "run", (8, 8), cameras=("front",)), tmp_path / "d")
-    (path,) = (tmp_path / "d" / "meta" / "episodes").glob("*/*.parquet")
-    table = pq.read_table(path)
-    column = pa.array(lengths, table.schema.field("length").type)
-    pq.write_table(table.set_column(table.schema.get_field_index("length"), "length", column), path)
-    with pytest.raises(ExportError, match=words), open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1):
-        pass

@@ -27,16 +27,6 @@ def write_all(writer: EpisodeWriter, frames: list[Frame], outcome: Outcome | Non
         writer.finish(outcome)
 
 
-def test_nothing_is_overwritten(tmp_path: Path) -> None:
-    path = tmp_path / "a.mcap"
-    path.write_bytes(b"mine")
-    info, _, _ = make_episode(num_frames=1)
-    with pytest.raises(ConfigError, match="there already"):
-        EpisodeWriter(path, info)
-    assert path.read_bytes() == b"mine"
-    assert names(tmp_path) == ["a.mcap"]
-
-
 def test_an_unfinished_recording_is_not_overwritten(tmp_path: Path) -> None:
     part = tmp_path / "a.mcap.part"
     part.write_bytes(b"what a crash left")
