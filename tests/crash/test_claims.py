@@ -1,8 +1,15 @@
-"""Datasets and HDF5 files of less than a megabyte that claim very much: one sentence, limited memory and CPU time."""
+"""Datasets and HDF5 files of less than a megabyte that claim very much: one sentence, limited memory and CPU time.
+
+Texts of HDF5's attributes are in its global heap (HDF5 File Format Specification, III.E): a reference to one is its
+length, the address of a collection, and a number in it. The library cannot refuse what is changed there.
+"""
 
 from __future__ import annotations
 
 import json
+import struct
+import subprocess
+import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -14,6 +21,7 @@ import pyarrow.parquet as pq
 import pytest
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 from support.fuzz import LimitedCommands, problem_of
+from support.hdf5 import write_robomimic
 
 pytestmark = pytest.mark.slow
 
@@ -179,3 +187,45 @@ def test_whole_numbers_are_looked_at_within_limits(commands: LimitedCommands, tm
     pq.write_table(table.append_column("counted", text), root / DATA, compression="zstd")
     assert len(table) >= 16
     _told(commands, "import", "lerobot", root, "--out", tmp_path / "run")
+
+
+_SIZE_OF_FIRST = 24
+"""Where a collection says how long its first object is: after its own head (16), number, references and reserved."""
+
+
+@pytest.fixture
+def file(tmp_path: Path, commands: LimitedCommands) -> Path:
+    path = write_robomimic(tmp_path / "demo.hdf5")
+    assert commands.run("import", "hdf5", path, "--suggest").code == 0
+    return path
+
+
+def heap_of(data: bytes | bytearray) -> int:
+    assert data.count(b"GCOL") == 1
+    return data.index(b"GCOL")
+
+
+def test_a_text_that_claims_gigabytes(file: Path, commands: LimitedCommands) -> None:
+    with h5py.File(file, "r") as opened:
+        text = opened["data"].attrs["env_args"]
+    assert json.loads(text)["env_name"] == "Lift"
+    data = file.read_bytes()
+    reference = struct.pack("<IQ", len(text), heap_of(data))
+    assert data.count(reference) == 1
+    file.write_bytes(data.replace(reference, struct.pack("<IQ", 2**31 - 1, heap_of(data))))
+    assert commands.refused("import", "hdf5", file, "--suggest").count("\n") == 1
+
+
+@pytest.mark.long
+@pytest.mark.timeout(400)
+def test_a_file_with_which_the_library_never_ends(file: Path, commands: LimitedCommands) -> None:
+    data = bytearray(file.read_bytes())
+    assert data[heap_of(data) + _SIZE_OF_FIRST + 1] == 0
+    data[heap_of(data) + _SIZE_OF_FIRST + 1] = 1
+    file.write_bytes(data)
+    reading = f"import h5py; h5py.File({str(file)!r})['data'].attrs['env_args']"
+    with pytest.raises(subprocess.TimeoutExpired):
+        subprocess.run([sys.executable, "-c", reading], check=True, timeout=8)
+    said = commands.refused("import", "hdf5", file, "--suggest")
+    assert " s of CPU time" in said
+    assert said.count("\n") == 1

@@ -1,0 +1,40 @@
+"""Bags, datasets, HDF5 files, mappings, runs, recordings and policies, fuzzed: a sentence or success within bounds."""
+
+from __future__ import annotations
+
+import pytest
+from support.fuzz import Fuzzed, problems_within_limits, results_here
+from support.fuzz_bags import FuzzedBags
+from support.fuzz_data import FuzzedData
+
+KINDS = {"bags": FuzzedBags, "data": FuzzedData}
+COUNTS = {"bags": 220, "data": 100}
+"""Kind -> cases of the quick test."""
+_MODULES = (
+    "demorec.check.run", "demorec.sources.suggest", "demorec.sources.import_run", "demorec.sources.dataset_import",
+    "demorec.sources.hdf5_import", "demorec.sources.hdf5_suggest", "demorec.datasets.lerobot.inspect",
+    "demorec.datasets.lerobot.export", "demorec.datasets.hdf5.export", "demorec.report.gather",
+    "demorec.learn.evaluate.rollouts", "ruamel.yaml", "google.protobuf.descriptor_pool",
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def all_fuzzed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Fuzzed]:
+    return {name: kind(tmp_path_factory.mktemp(name)) for name, kind in KINDS.items()}
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_hundred_inputs(kind: str, all_fuzzed: dict[str, Fuzzed]) -> None:
+    results = results_here(all_fuzzed[kind], range(COUNTS[kind]))
+    assert min(results["done"], results["refused"]) > COUNTS[kind] // 7, results
+
+
+@pytest.mark.slow
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("numbers", [range(1000, 1200), *(range(k, k + 460) for k in range(1200, 3500, 460))])
+def test_two_and_a_half_thousand_inputs(kind: str, numbers: range, all_fuzzed: dict[str, Fuzzed]) -> None:
+    found = problems_within_limits(all_fuzzed[kind], numbers, _MODULES)
+    assert not found, "\n".join(found)
