@@ -253,20 +253,10 @@ def test_only_bags_are_skipped(kind: str, tmp_path: Path, capsys: pytest.Capture
         assert "Only bags can be skipped" in capsys.readouterr().err
 
 
-def _importing(batch: tuple[Path, Path], run: Path) -> subprocess.Popen[str]:
-    words = ["import", str(batch[0]), "--mapping", str(batch[1]), "--out", str(run), "--skip-bad", "--workers", "2"]
-    pipes = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE}
-    return subprocess.Popen([sys.executable, "-m", "demorec", *words], text=True, **pipes)  # type: ignore[call-overload,no-any-return]
-
-
-def _workers(program: subprocess.Popen[str]) -> list[psutil.Process]:
-    found = psutil.Process(program.pid).children(recursive=True)
-    return [process for process in found if any("spawn_main" in word for word in process.cmdline())]
-
-
 def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    with _importing(batch, run) as program:
+    words = ["import", batch[0], "--mapping", batch[1], "--out", run, "--skip-bad", "--workers", "2"]
+    with subprocess.Popen([sys.executable, "-m", "demorec", *words], stdout=subprocess.DEVNULL) as program:
         while not list(run.glob("episodes/*.mcap")) and program.poll() is None:
             time.sleep(0.001)
         children = psutil.Process(program.pid).children(recursive=True)
