@@ -1,11 +1,12 @@
 """Every command that reads episodes, on every kind of episode: it names the user's path, leaves nothing behind, and
-gives each episode and frame."""
+gives each episode and frame. And every other command, on what was imported: it works, or says why it cannot."""
 
 from __future__ import annotations
 
 import errno
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -22,11 +23,13 @@ import pytest
 from conformance.test_import_v21 import write_v21
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags, hdf5
+from support.check import edit_json
 from support.commands import ON_A_PATH, ON_EVERYTHING, exit_code
 from support.export import export, make_run, without_verification
 from support.external import TOP, make_external, write_external
 from support.foreign_dataset import write_foreign
 
+from demorec import cli
 from demorec.mcap import open_recording
 from demorec.sources import import_run
 
@@ -38,6 +41,8 @@ ROWS = {
     "simulation": (1, 24),
     "run of simulations": (2, 44),
     "dataset of simulations": (2, 44),
+    "imported run": (1, 24),
+    "imported dataset": (1, 24),
     "recorder": (1, 45),
     "mcap": (1, 48),
     "mcap with --mapping": (1, 48),
@@ -45,6 +50,7 @@ ROWS = {
     "folder of bags": (2, 96),
     "robomimic": (3, 18),
     "aloha": (1, 12),
+    "lerobot v2.0": (2, 11),
     "lerobot v2.1": (2, 11),
     "lerobot v3.0": (2, 16),
 }
@@ -53,14 +59,34 @@ CASES = [
     (command, kind)
     for command in COMMANDS
     for kind in ROWS
-    if command != "import" or "simulation" not in kind or "dataset" in kind  # a simulated recording needs no import
+    if command != "import" or kind not in ("simulation", "run of simulations", "imported run")  # which need none
 ]
-FORMATS = {"robomimic": "hdf5", "aloha": "hdf5", "dataset of simulations": "lerobot"} | dict.fromkeys(
-    ("lerobot v2.1", "lerobot v3.0"), "lerobot"
+FORMATS = {"robomimic": "hdf5", "aloha": "hdf5"} | dict.fromkeys(
+    ("dataset of simulations", "imported dataset", "lerobot v2.0", "lerobot v2.1", "lerobot v3.0"), "lerobot"
 )
 """Kind -> word of `demorec import`; bags and recordings, which are bags too, have none."""
 FRAMES_OF = {"run of simulations": (24, 20)}
 """Kind -> frames of each episode, where they are listed so."""
+EXTERNAL = "recorded by another robot or program"
+OF_IMPORTED: dict[str, tuple[int, str]] = {
+    "check RUN": (0, "2 checked, 0 failed, 0 with warnings."),
+    "check DATASET": (0, "1 checked, 0 failed, 0 with warnings."),
+    "check RUN --deep": (1, EXTERNAL),
+    "check DATASET --deep": (1, EXTERNAL),
+    "replay RECORDING": (1, EXTERNAL),
+    "replay DATASET": (2, EXTERNAL),
+    "render RECORDING --out NEW": (1, EXTERNAL),
+    "dataset select DATASET --episodes 0 --out NEW": (0, "1 of 1 episode, 24 of 24 frames"),
+    "evaluate --policy RUN": (2, "No policy"),
+    "correct --policy RUN": (2, "No policy"),
+    "generate --config RUN --out NEW": (2, EXTERNAL),
+    "generate --config DATASET --out NEW": (2, EXTERNAL),
+    "generate --config RECORDING --out NEW": (2, EXTERNAL),
+    "import BAG --mapping MAPPING --out RUN": (0, "1 of 1 bags had been imported before."),
+    "recover RECORDING --out NEW.mcap": (0, "Complete: all 24 frames"),
+    "info RECORDING": (0, "/frames "),
+}
+"""Command -> exit code, and words of what it says."""
 
 
 @pytest.fixture(scope="module")
@@ -75,7 +101,17 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path | st
     bag = bags.write_mcap(notes, folder / "stack.mcap")
     run = make_run(folder / "run", (24, 20))
     export(run, folder / "dataset")
+    trossen = bags.write_trossen(bags.in_order(bags.trossen(0.8)), folder / "trossen.mcap")
+    of_trossen = bag_mappings.write_mapping(bag_mappings.TROSSEN, folder / "trossen.toml")
+    import_run.import_bags([trossen], of_trossen, folder / "imported")
+    export(folder / "imported", folder / "imported-dataset")
+    v20 = write_v21(folder / "older")
+    edit_json(v20 / "meta" / "info.json", lambda info: info.update(codebase_version="v2.0"))
     return {
+        "imported run": [folder / "imported"],
+        "imported dataset": [folder / "imported-dataset"],
+        "trossen": [trossen, "--mapping", of_trossen],
+        "lerobot v2.0": [v20],
         "simulation": [run / "episodes" / "episode_000000.mcap"],
         "run of simulations": [run],
         "dataset of simulations": [folder / "dataset"],
@@ -155,6 +191,30 @@ def test_a_command_reads_it(
         assert "failed:" not in page  # nobody said so
     if command == "view":
         assert len(list(tmp_path.glob("new*.rrd"))) == episodes
+
+
+def test_every_command_has_a_row() -> None:
+    tried = {call.split()[0] for call in (*COMMANDS.values(), *OF_IMPORTED)}
+    assert {*tried, "list"} == set(cli.COMMANDS.names())  # which takes no path
+
+
+@pytest.mark.parametrize("row", OF_IMPORTED)
+def test_what_was_imported_works_or_it_is_said_why_not(
+    row: str, places: dict[str, list[Path | str]], scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (run,), (dataset,), (bag, _, mapping) = (places[kind] for kind in ("imported run", "imported dataset", "trossen"))
+    words = {"RUN": run, "DATASET": dataset, "BAG": bag, "MAPPING": mapping, "NEW": tmp_path / "new"}
+    words["RECORDING"] = Path(run) / "episodes" / "episode_000000.mcap"
+    args = [re.sub(r"\b[A-Z]{3,}\b", lambda found: str(words[found[0]]), word) for word in row.split()]
+    code, told = OF_IMPORTED[row]
+    assert exit_code(*args) == code
+    printed = capsys.readouterr()
+    assert told in printed.out + printed.err
+    assert "Traceback" not in printed.err
+    if code == 2:
+        (sentence,) = printed.err.strip().splitlines()
+        assert sentence.startswith(f"demorec {args[0]}: ")
+        assert list(tmp_path.iterdir()) == [scratch]
 
 
 def _num_frames(recording: Path) -> int:
