@@ -6,16 +6,16 @@ import re
 from pathlib import Path
 
 import pytest
+from support.commands import exit_code
 
-from demorec.cli import generate_dataset_main, main
+from demorec.cli import generate_dataset_main
 from demorec.cli.generate import Generate
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        generate_dataset_main(list(args))
+    code = exit_code(*args, program=generate_dataset_main)
     told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
+    return code, told.out, told.err
 
 
 @pytest.mark.parametrize(
@@ -111,9 +111,7 @@ def parsed(monkeypatch: pytest.MonkeyPatch, args: list[str]) -> Generate:
         return 0
 
     monkeypatch.setattr(Generate, "run", remember)
-    with pytest.raises(SystemExit) as ended:
-        generate_dataset_main(args)
-    assert ended.value.code == 0
+    assert exit_code(*args, program=generate_dataset_main) == 0
     return seen[0]
 
 
@@ -164,9 +162,7 @@ def test_the_demo_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], what: str, names: str) -> None:
     from demorec.core import tables
 
-    with pytest.raises(SystemExit) as ended:
-        main(["list", what])
-    assert ended.value.code == 0
+    assert exit_code("list", what) == 0
     lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines] == list(getattr(tables, what.upper()).rows)
     assert any(line.startswith(names + " ") for line in lines)

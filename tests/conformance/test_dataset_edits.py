@@ -1,35 +1,85 @@
-"""`demorec dataset` on datasets that LeRobot wrote and on our own, with the installed LeRobot as the judge."""
+"""`demorec dataset` on datasets that LeRobot wrote, of all kinds, with the installed LeRobot as the judge."""
 
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import av
 import numpy as np
 import pytest
+from av.video.stream import VideoStream
+from lerobot_datasets import DEPTH, write_by_lerobot
 from support.check import checked
 from support.commands import exit_code
 from support.datasets import TOP, items, same, write_with_lerobot
 from support.export import data_table
 
-pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
-KINDS: dict[str, dict[str, Any]] = {
-    "video": {},
-    "images": {"video": False},
-    "streaming": {"streaming_encoding": True},
-}
-
-
+pytestmark = [
+    pytest.mark.usefixtures("hf_datasets_cache"),
+    pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning"),
+]
+LENGTHS = [12 + number for number in range(6)]
 edit = partial(exit_code, "dataset")
 
 
+def reordered(root: Path) -> Path:
+    """A dataset whose images are stored in another order than they are shown in."""
+    write_with_lerobot(root)
+    (path,) = root.glob(f"videos/{TOP}/*/*.mp4")
+    with av.open(str(path)) as container:
+        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
+    begins = np.cumsum([0, *LENGTHS])
+    with av.open(str(path), "w") as out:
+        # A group of images for each episode, as libx264 chooses it: with up to three images between two others.
+        stream = out.add_stream("libx264", rate=10, options={"g": "250", "bf": "3", "qp": "12", "b-adapt": "0"})
+        assert isinstance(stream, VideoStream)
+        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
+        for number, image in enumerate(images):
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts = number
+            if number in begins:
+                frame.pict_type = av.video.frame.PictureType.I
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    with av.open(str(path)) as container:
+        packets = [packet for packet in container.demux(video=0) if packet.size]
+    assert any(a.pts > b.pts for a, b in pairwise(packets))  # type: ignore[operator]
+    return root
+
+
+def in_small_files(root: Path) -> Path:
+    """A dataset with several files of rows and of images."""
+    write_with_lerobot(root, data_files_size_in_mb=0.002, video_files_size_in_mb=0.004)
+    assert min(len(list(root.glob(f"{kind}/**/file-*"))) for kind in ("data", "videos")) > 2
+    return root
+
+
+def of_all_types(root: Path) -> Path:
+    """A dataset with depth, arrays of two dimensions, texts and several files."""
+    return write_by_lerobot(root, LENGTHS, depth=True)
+
+
+KINDS: dict[str, Callable[[Path], Path]] = {
+    "video": write_with_lerobot,
+    "images": partial(write_with_lerobot, video=False),
+    "streaming": partial(write_with_lerobot, streaming_encoding=True),
+    "reordered": reordered,
+    "small files": in_small_files,
+    "all types": of_all_types,
+}
+
+
 @pytest.fixture(
-    scope="module", params=["video", *(pytest.param(kind, marks=pytest.mark.slow) for kind in ("images", "streaming"))]
+    scope="module",
+    params=[kind if kind == "video" else pytest.param(kind, marks=pytest.mark.slow) for kind in KINDS],
 )
 def dataset(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return write_with_lerobot(tmp_path_factory.mktemp("made") / "d", **KINDS[request.param])
+    return KINDS[request.param](tmp_path_factory.mktemp("made") / "d")
 
 
 @pytest.fixture(scope="module")
@@ -50,22 +100,62 @@ def statistics_are_exact(root: Path) -> None:
 
 
 def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None:
-    before = items(dataset)
-    edits: dict[str, tuple[list[object], list[tuple[int, int, int]]]] = {
-        "select": (["--where", 'num_frames < 16 and "there" in task'], [(0, 0, 12), (2, 0, 14)]),
-        "drop": (["--episodes", "0,2:4"], [(number, 0, 12 + number) for number in (1, 4, 5)]),
-        "trim": (["--head", 3, "--tail", 2], [(number, 3, 10 + number) for number in range(6)]),
-        "reorder": (["--order", "5,3,1,0,2,4"], [(number, 0, 12 + number) for number in (5, 3, 1, 0, 2, 4)]),
-    }
-    for command, (flags, expected) in edits.items():
-        out = tmp_path / command
+    before, fps = items(dataset), json.loads((dataset / "meta/info.json").read_text())["fps"]
+    word = str(before[0][0]["task"]).split()[-1]
+    there = [number for number in range(4) if word in str(before[number][0]["task"])]
+    edits: list[tuple[str, list[object], list[tuple[int, int, int]]]] = [
+        ("select", ["--where", f'num_frames < 16 and "{word}" in task'], [(k, 0, 12 + k) for k in there]),
+        ("drop", ["--episodes", "0,2:4"], [(number, 0, 12 + number) for number in (1, 4, 5)]),
+        ("trim", ["--head", 3, "--tail", 2], [(number, 3, 10 + number) for number in range(6)]),
+        ("trim", ["--head", 1], [(number, 1, 12 + number) for number in range(6)]),
+        ("reorder", ["--order", "5,3,1,0,2,4"], [(number, 0, 12 + number) for number in (5, 3, 1, 0, 2, 4)]),
+    ]
+    for place, (command, flags, expected) in enumerate(edits):
+        out = tmp_path / str(place)
         assert edit(command, dataset, *flags, "--out", out) == 0
         found = items(out)
         assert len(found) == len(expected)
         for episode, (number, first, last) in zip(found, expected, strict=True):
             assert same(episode, before[number][first:last], but=("timestamp",)), (command, number)
-            assert [float(item["timestamp"]) for item in episode] == pytest.approx(np.arange(last - first) / 10)
+            assert [float(item["timestamp"]) for item in episode] == pytest.approx(np.arange(last - first) / fps)
         statistics_are_exact(out)
+
+
+def test_in_another_order_and_in_parts(dataset: Path, tmp_path: Path) -> None:
+    before = items(dataset)
+    assert edit("reorder", dataset, "--order", "5,0,3,1,4,2", "--out", tmp_path / "r") == 0
+    assert edit("split", tmp_path / "r", "--shares", "a=0.5", "b=0.5", "--out", tmp_path / "s") == 0
+    assert edit("merge", tmp_path / "s/a", tmp_path / "s/b", "--out", tmp_path / "m") == 0
+    assert edit("drop", tmp_path / "m", "--where", "num_frames == 14", "--out", tmp_path / "d") == 0
+    found = {len(episode): episode for episode in items(tmp_path / "d")}
+    assert sorted(found) == [12, 13, 15, 16, 17]
+    assert all(same(found[len(was)], was) for was in before if len(was) != 14)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("dataset", ["all types"], indirect=True)
+def test_statistics_of_arrays_are_those_of_their_last_dimension(dataset: Path, tmp_path: Path) -> None:
+    """As LeRobot has them, whose own dataset is the model; with depth, whose mean is that of what LeRobot decodes."""
+    assert edit("trim", dataset, "--head", 1, "--out", tmp_path / "t") == 0
+    shapes = [
+        {name: [np.shape(value) for value in entry.values()] for name, entry in statistics(path).items()}
+        for path in (dataset, tmp_path / "t")
+    ]
+    assert shapes[0] == shapes[1]
+    found, shown = statistics(tmp_path / "t"), [item for episode in items(tmp_path / "t") for item in episode]
+    grids = np.stack([item["observation.grid"] for item in shown]).reshape(-1, 3).astype(np.float64)
+    assert found["observation.grid"]["count"] == [len(shown)]
+    for quantity, value in {"mean": grids.mean(0), "max": grids.max(0), "q90": np.quantile(grids, 0.9, 0)}.items():
+        assert np.allclose(found["observation.grid"][quantity], value, rtol=1e-9), quantity
+    depth = np.stack([item[DEPTH] for item in shown]).astype(np.float64)
+    assert depth.mean() / 1000 == pytest.approx(np.ravel(found[DEPTH]["mean"])[0], rel=1e-5)  # LeRobot decodes to mm
+    results = {result.check: result.level for result in checked(tmp_path / "t", "dataset", images=False).results}
+    assert results["dataset_statistics"] == "pass"
+
+
+def statistics(root: Path) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((root / "meta/stats.json").read_text())
+    return found
 
 
 @pytest.mark.parametrize("images", [False, pytest.param(True, marks=[pytest.mark.slow, pytest.mark.long])])

@@ -13,10 +13,9 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-from support.check import checked, simulate, simulate_run
+from numpy.typing import NDArray
+from support.check import checked, edit_column, simulate, simulate_run
 from support.commands import exit_code
 from support.export import data_table, export, info
 
@@ -182,13 +181,12 @@ def test_a_real_arm_beyond_its_limits_is_found(
 ) -> None:
     shutil.copytree(dataset, tmp_path / "d")
     shutil.rmtree(tmp_path / "d" / "demorec")
-    path = next((tmp_path / "d" / "data").glob("*/*.parquet"))
-    table = pq.read_table(path)
-    state = np.array(table["observation.state"].to_pylist(), dtype=np.float32)
-    state[5, 3] = 107.0  # degrees; the wrist ends at 95
-    rows = pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 6)
-    place = table.column_names.index("observation.state")
-    pq.write_table(table.set_column(place, table.schema.field(place), rows), path)
+
+    def bent(state: NDArray[Any]) -> NDArray[Any]:
+        state[5, 3] = 107.0  # degrees; the wrist ends at 95
+        return state
+
+    edit_column(tmp_path / "d", "observation.state", bent)
     chosen = ("--only", "joint_limits")
     assert exit_code("check", tmp_path / "d", *chosen) == 0
     capsys.readouterr()

@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.check import simulate, simulate_run
+from support.check import edit_column, simulate, simulate_run
 from support.commands import exit_code
+from support.export import data_table
 
 from demorec.robots.motors import CALIBRATIONS
 from demorec.robots.so101 import SO101
@@ -53,14 +53,14 @@ def changed(dataset: Path, out: Path, change: Any) -> Path:
     """A copy whose states (T, 6) have been changed, the first row of each episode kept."""
     shutil.copytree(dataset, out)
     (path,) = (out / "data").glob("*/*.parquet")
-    table = pq.read_table(path)
-    number = np.array(table["episode_index"].to_pylist())
-    state = np.array(table["observation.state"].to_pylist(), dtype=np.float32)
-    for episode in set(number.tolist()):
-        state[number == episode] = change(state[number == episode])
-    rows = pa.FixedSizeListArray.from_arrays(pa.array(state.ravel()), 6)
-    place = table.column_names.index("observation.state")
-    pq.write_table(table.set_column(place, table.schema.field(place), rows), path)
+    number = np.array(pq.read_table(path)["episode_index"].to_pylist())
+
+    def of_each(state: Any) -> Any:
+        for episode in set(number.tolist()):
+            state[number == episode] = change(state[number == episode])
+        return state
+
+    edit_column(out, "observation.state", of_each)
     return out
 
 
@@ -139,15 +139,10 @@ def test_other_robots_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_the_jaw_turns_as_far_as_a_real_one(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """LeRobot's 100 is the joint's stop, far beyond what tasks use."""
     shutil.copytree(dataset, tmp_path / "d")
-    (path,) = (tmp_path / "d" / "data").glob("*/*.parquet")
-    table = pq.read_table(path)
-    action = np.array(table["action"].to_pylist(), dtype=np.float32)
+    action = np.array(data_table(dataset)["action"].to_pylist())
     action[:, 5] = 100.0
-    for name, values in (("action", action), ("observation.state", action)):
-        rows = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), 6)
-        place = table.column_names.index(name)
-        table = table.set_column(place, table.schema.field(place), rows)
-    pq.write_table(table, path)
+    for name in ("action", "observation.state"):
+        edit_column(tmp_path / "d", name, lambda _: action)
     for tracking in replayed(capsys, tmp_path / "d", *DEGREES):
         assert tracking["gripper"][0] < 1e-3
     assert SO101.gripper.width(np.array([1.74533])) > 2 * SO101.gripper.open_width

@@ -11,13 +11,23 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from support.check import checked, copy, edit_column, edit_json, edit_parquet, level_of, simulate, simulate_run
+from support.check import (
+    change_table,
+    checked,
+    copy,
+    edit_column,
+    edit_json,
+    edit_parquet,
+    level_of,
+    simulate,
+    simulate_run,
+)
+from support.commands import exit_code
 from support.export import rewrite_video
 from support.external import make_external, write_external
 from support.mcap import rewritten
 
 from demorec.check.dataset import CheckedDataset
-from demorec.cli import main
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
@@ -66,14 +76,7 @@ def of_column(name: str, change: Callable[[Rows], Any]) -> Fault:
 
 
 def of_table(place: str, change: Callable[[pa.Table], pa.Table]) -> Fault:
-    def spoil(dataset: Path) -> None:
-        path = next(dataset.glob(f"{place}/*/*.parquet"))
-        table = pq.read_table(path)
-        changed = change(table)
-        assert not changed.equals(table)
-        pq.write_table(changed, path)
-
-    return spoil
+    return lambda dataset: change_table(dataset, place, change)
 
 
 def value_of(name: str, row: int, value: Any, place: str = "data") -> Fault:
@@ -269,18 +272,14 @@ def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
 
 @pytest.mark.slow
 def test_deep_makes_the_episodes_of_a_dataset_again(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    def told(*flags: str) -> tuple[object, list[str]]:
-        with pytest.raises(SystemExit) as ended:
-            main(["check", str(dataset), "--deep", "--only", "dataset_readable", *flags])
-        return ended.value.code, capsys.readouterr().out.splitlines()
-
-    code, lines = told()
-    assert code in (0, None)
+    command = ("check", dataset, "--deep", "--only", "dataset_readable")
+    assert exit_code(*command) == 0
+    lines = capsys.readouterr().out.splitlines()
     assert len([line for line in lines if "the same to the bit" in line]) == 3
     value_of("observation.velocity", 20, 0.123)(dataset)
     value_of("failure_reason", 1, "bad luck", "demorec/episodes")(dataset)
-    code, lines = told()
-    assert code == 1
+    assert exit_code(*command) == 1
+    lines = capsys.readouterr().out.splitlines()
     assert [line.split()[0] for line in lines if "made again" in line][:3] == ["fail", "fail", "pass"]
     assert any("observation.velocity at frame 20" in line for line in lines)
     assert any("sidecar's failure_reason" in line for line in lines)

@@ -3,16 +3,14 @@ only its own episode."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
-from support.check import checked
+from support.check import change_table, checked, edit_json, edit_parquet
 from support.commands import exit_code, words_of
 from support.export import content_of, export, make_run, recordings
 
@@ -61,14 +59,6 @@ def apart(run: Path) -> Path:
     return run.parent / "apart"
 
 
-def change_table(root: Path, place: str, change: Callable[[pa.Table], pa.Table]) -> None:
-    (path,) = root.glob(f"{place}/*/*.parquet")
-    table = pq.read_table(path)
-    changed = change(table)
-    assert not changed.equals(table)
-    pq.write_table(changed, path)
-
-
 def without_table(root: Path) -> None:
     shutil.rmtree(root / "meta/episodes")
 
@@ -80,14 +70,13 @@ def short_table(root: Path) -> None:
 def short_table_and_info(root: Path) -> None:
     """The counts of info.json fit, and only the rows show that an episode is missing."""
     short_table(root)
-    info = json.loads((root / "meta/info.json").read_text())
-    info |= {"total_episodes": NUM_EPISODES - 1, "total_frames": (NUM_EPISODES - 1) * LENGTH}
-    (root / "meta/info.json").write_text(json.dumps(info))
+    totals = {"total_episodes": NUM_EPISODES - 1, "total_frames": (NUM_EPISODES - 1) * LENGTH}
+    edit_json(root / "meta/info.json", lambda info: info.update(totals))
 
 
 def longer_episode(root: Path) -> None:
-    lengths = pa.array([LENGTH] * (NUM_EPISODES - 1) + [LENGTH + 1])
-    change_table(root, "meta/episodes", lambda t: t.set_column(t.schema.get_field_index("length"), "length", lengths))
+    (path,) = root.glob("meta/episodes/*/*.parquet")
+    edit_parquet(path, "length", lambda lengths: [*lengths[:-1], LENGTH + 1])
 
 
 def exchanged_rows(root: Path) -> None:

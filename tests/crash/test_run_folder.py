@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 from support import generate as generating
+from support.commands import exit_code
 from support.generate import Remembers, attempts_of, expected_attempts, run_fake
 
-from demorec.cli import main
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
 from demorec.generate import contents
@@ -188,9 +188,7 @@ def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(
 ) -> None:
     make(tmp_path / "run.json")
     words = [str(tmp_path)] if command != "generate" else ["--config", str(tmp_path), "--out", str(tmp_path / "copy")]
-    with pytest.raises(SystemExit) as ended:
-        main([command, *words])
-    assert ended.value.code in (1, 2)
+    assert exit_code(command, *words) in (1, 2)
     told = capsys.readouterr()
     assert "Traceback" not in told.err
     assert len((told.err or told.out).splitlines()) <= 8

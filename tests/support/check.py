@@ -233,6 +233,15 @@ def edit_column(dataset: Path, name: str, change: Callable[[np.ndarray[Any, Any]
     edit_parquet(next((dataset / "data").glob("*/*.parquet")), name, of_array)
 
 
+def change_table(dataset: Path, place: str, change: Callable[[pa.Table], pa.Table]) -> None:
+    """Change the first table below a folder of a dataset."""
+    path = next(dataset.glob(f"{place}/*/*.parquet"))
+    table = pq.read_table(path)
+    changed = change(table)
+    assert not changed.equals(table)
+    pq.write_table(changed, path)
+
+
 def edit_json(path: Path, change: Callable[[Any], object]) -> None:
     """Change a JSON file in place."""
     data = json.loads(path.read_text())

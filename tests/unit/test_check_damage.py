@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 from support.check import flip_bits
+from support.commands import exit_code
 from support.export import export, make_run
 from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.cli import main
 from demorec.mcap.container import Container
 
 
@@ -25,9 +25,7 @@ def damaged(tmp_path: Path) -> Path:
 
 
 def check(path: Path, capsys: pytest.CaptureFixture[str], *flags: str) -> tuple[int, str]:
-    with pytest.raises(SystemExit) as done:
-        main(["check", str(path), *flags])
-    return int(done.value.code or 0), capsys.readouterr().out
+    return exit_code("check", path, *flags), capsys.readouterr().out
 
 
 def test_a_flipped_bit_is_one_finding(damaged: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from support.commands import exit_code
 from support.external import FORCE, TOP, Episode, make_external, write_external
 
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.cli import main
 from demorec.episode.episode import Sample, SampledFrame
 from demorec.runs.external import episode_path, open_external_run
 
@@ -150,11 +150,8 @@ def test_a_fault_is_named_by_its_check_alone(tmp_path: Path, fault: str) -> None
     assert {name: found for name, found in found.items() if found not in ("pass", "skip")} == {check: level}
 
 
-def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str, str]:
-    with pytest.raises(SystemExit) as ended:
-        main([str(arg) for arg in args])
-    told = capsys.readouterr()
-    return int(ended.value.code or 0), told.out, told.err
+def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:
+    return exit_code(*args), capsys.readouterr().out
 
 
 @pytest.fixture(scope="module")
@@ -167,14 +164,14 @@ def external_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_is_told_and_checked(external_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, told, _ = run(capsys, "check", external_run)
+    code, told = run(capsys, "check", external_run)
     assert (code, "3 checked, 0 failed, 0 with warnings" in told) == (0, True)
-    code, told, _ = run(capsys, "info", external_run)
+    code, told = run(capsys, "info", external_run)
     assert (code, "2 (2 success)" in told, "stack the cups" in told) == (0, True, True)
-    code, told, _ = run(capsys, "info", external_run / "episodes" / "episode_000001.mcap", "--json")
+    code, told = run(capsys, "info", external_run / "episodes" / "episode_000001.mcap", "--json")
     plain = json.loads(told)
     assert (plain["kind"], plain["frames"], plain["robot"]) == ("external recording", 20, "two_joints")
-    code, told, _ = run(capsys, "info", external_run / "episodes")
+    code, told = run(capsys, "info", external_run / "episodes")
     assert (code, told.count("(external)")) == (0, 2)
 
 
@@ -191,12 +188,8 @@ def test_a_run_of_other_files_is_a_failure(external_run: Path, tmp_path: Path) -
 def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
     with open_external_run(tmp_path / "run") as opened:
         for index in range(2):
-            opened.add(
-                write_external(episode_path(opened.path, index), replace(steady(num_frames=20), info=numbered(index)))
-            )
+            episode = steady(num_frames=20)
+            episode = replace(episode, info=replace(episode.info, episode_index=index))
+            opened.add(write_external(episode_path(opened.path, index), episode))
     report = check_subject(Subject(path=tmp_path / "run", kind="run"), CheckOptions(only=("duplicates",)))
     assert [result.level for result in report.results] == ["fail"]
-
-
-def numbered(index: int) -> Any:
-    return replace(steady(num_frames=20).info, episode_index=index)

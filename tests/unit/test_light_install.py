@@ -8,10 +8,11 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from support.commands import exit_code
 from support.export import make_run
 
 from demorec.check.dataset import CheckedDataset
-from demorec.cli import COMMANDS, main
+from demorec.cli import COMMANDS
 from demorec.core.errors import ExportError, MissingDependencyError
 from demorec.core.tables import CHECKS
 from demorec.datasets.lerobot.export import export_lerobot, push_to_hub
@@ -52,9 +53,7 @@ def test_the_lists_of_packages_agree() -> None:
 def test_an_export_says_that_nothing_was_verified(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["export", "lerobot", str(run), "--out", str(tmp_path / "d")])
-    assert ended.value.code == 0
+    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d") == 0
     out = capsys.readouterr().out
     assert f"Not verified: LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'." in out
     assert "Verified:" not in out
