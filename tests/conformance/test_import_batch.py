@@ -255,7 +255,7 @@ def test_only_bags_are_skipped(kind: str, tmp_path: Path, capsys: pytest.Capture
 
 def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    words = ["import", batch[0], "--mapping", batch[1], "--out", run, "--skip-bad", "--workers", "2"]
+    words = ["import", *map(str, (batch[0], "--mapping", batch[1], "--out", run)), "--skip-bad", "--workers", "2"]
     with subprocess.Popen([sys.executable, "-m", "demorec", *words], stdout=subprocess.DEVNULL) as program:
         while not list(run.glob("episodes/*.mcap")) and program.poll() is None:
             time.sleep(0.001)

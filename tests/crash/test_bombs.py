@@ -80,7 +80,8 @@ def test_a_small_recording_never_becomes_large(
     path = tmp_path / "bomb.mcap"
     bomb(good, path)
     assert path.stat().st_size < 1_000_000
-    told = commands.run(command, path, *(["--out", tmp_path / "kept.mcap"] if command == "recover" else []))
+    flags = ["--out", str(tmp_path / "kept.mcap")] if command == "recover" else []
+    told = commands.run(command, path, *flags)
     assert problem_of(told) == "", told
     assert told.code == 1 or command == "recover"
 

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import pytest
 from support.fuzz import Fuzzed, problems_within_limits, results_here
 from support.fuzz_bags import FuzzedBags
 from support.fuzz_data import FuzzedData
 
-KINDS = {"bags": FuzzedBags, "data": FuzzedData}
+KINDS: dict[str, Callable[[Path], Fuzzed]] = {"bags": FuzzedBags, "data": FuzzedData}
 COUNTS = {"bags": 220, "data": 100}
 """Kind -> cases of the quick test."""
 _MODULES = (
