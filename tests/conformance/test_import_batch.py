@@ -246,11 +246,19 @@ def test_a_folder_stands_for_the_bags_in_it_in_their_natural_order(tmp_path: Pat
         import_bags([folder / "photos"], mapping, tmp_path / "run")
 
 
-@pytest.mark.parametrize("kind", ["hdf5", "lerobot"])
-def test_only_bags_are_skipped(kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for flags in (["--skip-bad"], ["--workers", "2"]):
-        assert exit_code("import", kind, tmp_path / "x", "--mapping", "x", "--out", tmp_path / "run", *flags) == 2
-        assert "Only bags can be skipped" in capsys.readouterr().err
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["hdf5", "x", "--mapping", "x", "--skip-bad"],
+        ["hdf5", "x", "--workers", "2"],
+        ["lerobot", "x", "--workers", "2"],
+    ],
+)
+def test_only_bags_and_episodes_of_datasets_are_skipped(
+    words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code("import", *words, "--out", tmp_path / "run") == 2
+    assert "Only bags can be imported by several workers" in capsys.readouterr().err
 
 
 def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:

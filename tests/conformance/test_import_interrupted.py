@@ -11,7 +11,7 @@ from support import bag_mappings, bags
 from support.commands import exit_code
 from support.export import export, make_run
 
-from demorec.mcap import EpisodeWriter
+from demorec.mcap.sampled_writer import SampledWriter
 
 pytestmark = pytest.mark.slow
 
@@ -59,16 +59,16 @@ def test_an_interrupted_import_says_what_is_missing(
         Path(str(words[3])).write_text(capsys.readouterr().out)
     run, undisturbed = tmp_path / "run", tmp_path / "undisturbed"
     finished: list[Path] = []
-    finish = EpisodeWriter.finish
+    finish = SampledWriter.finish
 
-    def interrupted(self: EpisodeWriter, *arguments: Any) -> Any:
+    def interrupted(self: SampledWriter, *arguments: Any) -> Any:
         if len(finished) == num_done:
             raise KeyboardInterrupt
         finished.append(run)
         return finish(self, *arguments)
 
     with monkeypatch.context() as patch:
-        patch.setattr(EpisodeWriter, "finish", interrupted)
+        patch.setattr(SampledWriter, "finish", interrupted)
         assert exit_code("import", *words, "--out", run) == 130
     if num_done:
         missing = planned[num_done:]

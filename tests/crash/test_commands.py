@@ -20,11 +20,15 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
+from support import bags
+from support.bag_mappings import SO101, write_mapping
 from support.check import simulate
 from support.crash import Running, run_command
 from support.export import content_of, export, files_of, make_run
+from support.hdf5 import write_robomimic
 
 from demorec.core.limited import VARIABLE
+from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 
 KILLS = 8
 MINE = "years of work"
@@ -89,6 +93,22 @@ ROWS = {
         resumes=True,
         keeps=False,
         runs=SLOW,
+    ),
+    "import hdf5": Row(
+        call="import hdf5 SOURCES/demo.hdf5 --mapping SOURCES/hdf5.toml --out new",
+        targets=("new/episodes/*.mcap",),
+        surprise="new/episodes/episode_000001.mcap",
+        resumes=True,
+        keeps=False,
+        runs=LONG,
+    ),
+    "import bags": Row(
+        call="import SOURCES/bags --mapping SOURCES/bags.toml --workers 1 --out new",
+        targets=("new/episodes/*.mcap",),
+        surprise="new/episodes/episode_000001.mcap",
+        resumes=True,
+        keeps=False,
+        runs=LONG,
     ),
     "export lerobot": Row(
         call="export lerobot SOURCES/run --no-verify --out new",
@@ -186,6 +206,12 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     simulate(folder / "e.mcap", fps=10, max_episode_seconds=0.5, cameras=("front",), width=32, height=32)
     for name, source in (("cut", "run/episodes/episode_000000"), ("other_cut", "run/episodes/episode_000001")):
         (folder / f"{name}.mcap").write_bytes((folder / f"{source}.mcap").read_bytes()[:-400])
+    hdf5 = write_robomimic(folder / "demo.hdf5")
+    (folder / "hdf5.toml").write_text("\n".join(suggested_hdf5_mapping(hdf5)))
+    (folder / "bags").mkdir()
+    for number in range(2):
+        bags.write_mcap(bags.in_order(bags.so101(0.5)), folder / "bags" / f"cups_{number}.mcap")
+    write_mapping(SO101, folder / "bags.toml")
     return folder
 
 
