@@ -20,8 +20,6 @@ from typing import Any
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from support import bags
-from support.bag_mappings import SO101, write_mapping
 from support.check import simulate
 from support.crash import Running, run_command
 from support.export import content_of, export, files_of, make_run
@@ -96,14 +94,6 @@ ROWS = {
     ),
     "import hdf5": Row(
         call="import hdf5 SOURCES/demo.hdf5 --mapping SOURCES/hdf5.toml --out new",
-        targets=("new/episodes/*.mcap",),
-        surprise="new/episodes/episode_000001.mcap",
-        resumes=True,
-        keeps=False,
-        runs=LONG,
-    ),
-    "import bags": Row(
-        call="import SOURCES/bags --mapping SOURCES/bags.toml --workers 1 --out new",
         targets=("new/episodes/*.mcap",),
         surprise="new/episodes/episode_000001.mcap",
         resumes=True,
@@ -188,7 +178,7 @@ ROWS = {
         runs=LONG,
     ),
 }
-"""All commands that write, but for evaluate and correct, which need a policy, and screenshots, which need a viewer."""
+"""All commands that write, but for imports of bags, evaluate and correct (they need a policy), screenshots (a viewer)."""
 NAMES = [pytest.param(name, marks=row.runs) for name, row in ROWS.items()]
 KILLED = [pytest.param(name, marks=LONG if row.runs and row.old else row.runs) for name, row in ROWS.items()]
 """Replacing is killed, too, which is more."""
@@ -208,10 +198,6 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
         (folder / f"{name}.mcap").write_bytes((folder / f"{source}.mcap").read_bytes()[:-400])
     hdf5 = write_robomimic(folder / "demo.hdf5")
     (folder / "hdf5.toml").write_text("\n".join(suggested_hdf5_mapping(hdf5)))
-    (folder / "bags").mkdir()
-    for number in range(2):
-        bags.write_mcap(bags.in_order(bags.so101(0.5)), folder / "bags" / f"cups_{number}.mcap")
-    write_mapping(SO101, folder / "bags.toml")
     return folder
 
 
