@@ -178,7 +178,7 @@ ROWS = {
         runs=LONG,
     ),
 }
-"""All commands that write, but for imports of bags, evaluate and correct (they need a policy), screenshots (a viewer)."""
+"""All commands that write, but for imports of bags, screenshots, and evaluate and correct, which need a policy."""
 NAMES = [pytest.param(name, marks=row.runs) for name, row in ROWS.items()]
 KILLED = [pytest.param(name, marks=LONG if row.runs and row.old else row.runs) for name, row in ROWS.items()]
 """Replacing is killed, too, which is more."""
