@@ -19,6 +19,7 @@ from support.commands import exit_code
 from support.export import recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
+from demorec.datasets.lerobot.episode_table import are_on_grid
 from demorec.mcap import Recording
 
 TEXTS = ("open the drawer", "close the drawer", "valid", "invalid", "push it")
@@ -150,6 +151,15 @@ def test_measured_timestamps_stay(
         with Recording(path) as recording:
             assert recording.time_ns.tolist() == np.rint(stamps.astype(np.float64) * 1e9).astype(np.int64).tolist()
     assert exit_code("view", source, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 10.0, 1500.0, 3000.0])
+def test_the_grid_of_a_long_episode_is_one(begin_s: float) -> None:
+    """float32 rounds times beyond 1,024 s by more than LeRobot's tolerance."""
+    seconds = (begin_s + np.arange(300) / 30).astype(np.float32).astype(np.float64)
+    assert are_on_grid(seconds, 30, float(seconds[0]))
+    seconds[7] += 0.002
+    assert not are_on_grid(seconds, 30, float(seconds[0]))
 
 
 def test_doubles_under_float32_stay_doubles(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -108,7 +108,7 @@ def test_a_mesh_is_found_where_ros_would_find_it(
     package.rename(installed)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path / "install"))
     relative = name.removeprefix("package://")
-    for wanted in (name, f"file:///root/ws/install/vendor_description/share/{relative}"):
+    for wanted in (name, f"file:///home/me/ws/install/vendor_description/share/{relative}"):
         assert mesh_path(elsewhere, wanted).is_relative_to(installed)
 
 

@@ -22,7 +22,7 @@ from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
 from demorec.datasets.editing.episode_records import episode_statistics
 from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan
 from demorec.datasets.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
-from demorec.datasets.lerobot.episode_table import TIME_TOLERANCE_S, EpisodePlace
+from demorec.datasets.lerobot.episode_table import EpisodePlace, are_on_grid
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -128,7 +128,8 @@ class _Reader:
         names = {mapping.feature for mapping in self._mappings.values()}
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
         self._rows = self.source.rows([*self._names, "task_index", "timestamp"])
-        self._task_numbers = new_task_numbers(plan, number) if reference_columns(info) else None
+        self._references = reference_columns(info)
+        self._task_numbers = new_task_numbers(plan, number) if self._references else np.zeros(0, np.int64)
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
         tables = tables_in(self.source.root, "meta/episodes") if self.source.fact_types else ()
         self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
@@ -152,7 +153,7 @@ class _Reader:
             if feature.dtype == "language":
                 language = self._language(rows, cut)
                 continue
-            if self._task_numbers is not None and mapping.feature in reference_columns(self.source.info):
+            if mapping.feature in self._references:
                 values = column_numbers(self._column(rows, mapping, feature))
                 columns[name] = renumbered(values, self._task_numbers)
                 continue
@@ -191,8 +192,7 @@ class _Reader:
         stored = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
         seconds = stored.astype(np.float64)
         first = seconds[0] if cut.first else 0.0
-        off = np.abs(seconds - first - np.arange(len(seconds)) / self._fps)
-        if (off <= TIME_TOLERANCE_S).all():
+        if are_on_grid(seconds, self._fps, first):
             return None
         return stored.astype(np.float32) if not cut.first else (seconds - first).astype(np.float32)
 

@@ -9,7 +9,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.files import read_json_lines, read_table, tables_in
@@ -28,6 +30,13 @@ _MAX_VALUE = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
 _VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")
 """Columns that locate the images of an episode, for each camera."""
+
+
+def are_on_grid(seconds: NDArray[np.float64], fps: int, first_s: float = 0.0) -> bool:
+    """Whether float32 timestamps (T,) are `first_s` and multiples of 1/fps, within LeRobot's tolerance and rounding."""
+    precision_s = float(np.spacing(np.float32(np.abs(seconds).max(initial=0.0))))
+    off = np.abs(seconds - first_s - np.arange(len(seconds)) / fps)
+    return bool((off <= TIME_TOLERANCE_S + precision_s).all())
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import Box
-from demorec.datasets.lerobot.episode_table import TIME_TOLERANCE_S
+from demorec.datasets.lerobot.episode_table import are_on_grid
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
@@ -134,7 +134,7 @@ class DatasetRecording:
     def measured_ns(self) -> NDArray[np.int64] | None:
         """(T,) stamps of rows whose timestamps were measured; None for multiples of 1/fps."""
         seconds, fps = self._rows["timestamp"][:, 0].astype(np.float64), int(self.dataset.info.fps)
-        if (np.abs(seconds - np.arange(self.num_frames) / fps) <= TIME_TOLERANCE_S).all():
+        if are_on_grid(seconds, fps):
             return None
         wrong = np.flatnonzero(
             ~(np.diff(seconds, prepend=-1.0) > 0) | ~(seconds >= 0) | ~(seconds < MAX_STAMP_NS / 1e9)
