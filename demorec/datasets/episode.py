@@ -31,7 +31,7 @@ from demorec.episode.features import (
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.simulated import on_request, scene_of
-from demorec.mcap import Recording, channels
+from demorec.mcap import Recording
 
 REWARD = "next.reward"
 DONE = "next.done"
@@ -150,9 +150,7 @@ class ExportEpisode[O: CommonOptions]:
     @property
     def urdf(self) -> str:
         """The robot's URDF as text; "" if unknown."""
-        recording = self.recording
-        is_described = not self.info.urdf and channels.description_topic() in recording.topics
-        return recording.description() if is_described else self.info.urdf
+        return self.info.urdf or self.recording.description()
 
     def traits(self) -> dict[str, str]:
         """Return the properties that all recordings of a dataset share, by name, in words."""

@@ -17,6 +17,7 @@ from demorec.core.errors import RecordingError
 from demorec.core.plain import to_json
 from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointSample, Table, Trajectory
 from demorec.episode.info import NOT_SIMULATED
+from demorec.episode.protocol import Box, SceneMotion
 from demorec.episode.simulated import simulated_table
 from demorec.mcap import channels, messages, notebook
 from demorec.mcap.chunks import Block
@@ -25,6 +26,7 @@ from demorec.mcap.episode_file import EpisodeFile
 from demorec.mcap.frames import frames_of, pose_of
 from demorec.mcap.lossless import LabelDecoder, from_labels
 from demorec.mcap.streams import FrameStream, TimedMessages
+from demorec.mcap.transforms import measured_motion
 from demorec.mcap.video import Rgb, is_keyframe
 from demorec.robots.urdf import check_primitives
 
@@ -104,14 +106,25 @@ class Recording(EpisodeFile):
     def _image_topic(self, camera: str) -> str:
         return channels.video_topic(camera, self.video_settings(camera).codec)
 
+    def motion(self) -> SceneMotion:
+        """Read the motion of the robot, and of a simulated scene."""
+        if not isinstance(self._numbers, Trajectory):
+            return measured_motion(self.info, self._numbers)
+        trajectory = self._numbers
+        return SceneMotion(
+            joint_position=dict(zip(self.info.simulated.robot.joint_names, trajectory.joint_position.T, strict=True)),
+            base_from_tcp=trajectory.base_from_tcp,
+            object_poses=trajectory.object_poses,
+            world_from_camera=trajectory.world_from_camera,
+        )
+
     def description(self, body: str = "") -> str:
-        """URDF of the robot, or of the body of that name: primitives only, complete without any other file."""
-        topic = channels.description_topic(body)
-        for _, text in self._read(topic, messages.read_string):
+        """URDF of the robot, or of a body: primitives only, complete without any other file; "" if unknown."""
+        for _, text in self._read(channels.description_topic(body), messages.read_string):
             with damage_as_recording_error(self.path):
                 check_primitives(text)
             return text
-        raise RecordingError(f"The recording has no description on {topic}: {self.path}")
+        return ""
 
     def joint_samples(self) -> Iterator[JointSample]:
         """Every recorded joint state of a simulation in order of time: the frames' own and those between them."""
@@ -171,6 +184,10 @@ class Recording(EpisodeFile):
             values = from_labels(np.array(list(names), dtype=np.uint16)).tolist()
             return dict(zip(values, names.values(), strict=True))
         return {}
+
+    def boxes(self, camera: str) -> Iterator[Box]:
+        """No boxes: recordings have none."""
+        return iter(())
 
     def _shown(self, camera: str) -> NDArray[np.int64]:
         """(T,) number of the image of a camera that each frame holds."""

@@ -13,8 +13,9 @@ from typing import Any
 import numpy as np
 
 from demorec.core.geometry import Array, Pose, quat_multiply
-from demorec.episode.episode import Vector
-from demorec.episode.info import Camera, Feature
+from demorec.episode.episode import Table, Vector
+from demorec.episode.info import Camera, EpisodeInfo, Feature
+from demorec.episode.protocol import SceneMotion
 from demorec.episode.scene import Scene
 from demorec.mcap import messages
 from demorec.mcap.cdr import Slot, layout
@@ -157,3 +158,12 @@ def joint_positions(places: Mapping[str, tuple[Feature, int]], features: Mapping
     used = {feature.name: feature for feature, _ in places.values()}
     values = {name: feature.in_si(features[name]) for name, feature in used.items()}
     return np.stack([values[feature.name][..., index] for feature, index in places.values()], axis=-1)
+
+
+def measured_motion(info: EpisodeInfo, table: Table) -> SceneMotion:
+    """The motion of the joints that features give the positions of."""
+    places = joint_places(info.features)
+    if not places:
+        return SceneMotion()
+    positions = joint_positions(places, table.features).T
+    return SceneMotion(joint_position=dict(zip(places, positions, strict=True)))

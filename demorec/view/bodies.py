@@ -21,7 +21,7 @@ from demorec.render.procedural import texture_pixels
 from demorec.robots.assets import asset_path, surface_file
 from demorec.robots.known_models import known_model
 from demorec.robots.urdf import MAX_BYTES, Urdf
-from demorec.view.episode import PlayedEpisode
+from demorec.view.episode import Playback
 from demorec.view.meshes import (
     SurfaceMesh,
     found_meshes,
@@ -43,7 +43,7 @@ _SAME_SIZE = 0.1
 
 
 def log_bodies(
-    recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, scene: Scene, tint: Rgba | None = None
+    recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene, tint: Rgba | None = None
 ) -> None:
     """Every body at its place or along its way, and as wire frames the goals and the known ends of objects.
 
@@ -54,12 +54,12 @@ def log_bodies(
         if tint is not None and body.role in ("support", "fixture"):
             continue  # the other episode's table, which would lie in the same place
         recording.log(entity, _visible(body, episode, tint), static=True)
-        poses = episode.object_poses.get(body.name)
+        poses = episode.motion.object_poses.get(body.name)
         if poses is not None:
             send_poses(recording, entity, episode.time_ns, poses)
         else:
             log_pose(recording, entity, body.world_from_body.vector())
-    for name, pose in episode.end_poses.items():
+    for name, pose in episode.motion.end_poses.items():
         wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
         log_pose(recording, paths.end(name), pose)
         recording.log(paths.end(name), wire, static=True)
@@ -69,7 +69,7 @@ def log_bodies(
         recording.log(paths.goal(goal.object), wire, static=True)
 
 
-def _visible(body: Body, episode: PlayedEpisode, tint: Rgba | None) -> rr.Mesh3D:
+def _visible(body: Body, episode: Playback, tint: Rgba | None) -> rr.Mesh3D:
     if body.shape.kind == "box" and body.texture is not None:
         return _textured_box(np.array(body.shape.size), body.texture)
     color = body.mean_color
@@ -80,8 +80,7 @@ def _visible(body: Body, episode: PlayedEpisode, tint: Rgba | None) -> rr.Mesh3D
         if color != _OWN_COLOR:  # instead of the model's own colours, as in the simulator
             mesh = replace(mesh, colors=np.full_like(mesh.colors, 255))
         return as_mesh3d(mesh.placed(Pose(), np.ones(3), color), tint)
-    description = episode.body_description(body.name)
-    if description is not None:  # in the body's colours already
+    if description := episode.data.description(body.name):  # in the body's colours already
         return as_mesh3d(joined(list(urdf_meshes(description, None).values())), tint)
     return as_mesh3d(_unit_mesh("box").placed(Pose(), np.array(body.shape.extents), color), tint)
 
@@ -153,7 +152,7 @@ _SAME_PLACE = 1e-3
 """How far joints of the installed model may be from those of the recorded description, metres."""
 
 
-def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, tint: Rgba | None = None) -> None:
+def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Playback, tint: Rgba | None = None) -> None:
     """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
 
     Joints whose positions are not known stay at 0; a robot without a description is not shown.
@@ -161,10 +160,11 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
     Raises:
         RecordingError: A mesh of the robot's model cannot be read.
     """
-    info, description, positions = episode.info, episode.robot_description, episode.joint_position
+    info, positions = episode.info, episode.motion.joint_position
+    description = info.urdf or episode.data.description()
     if episode.scene is not None:
         urdf, meshes = robot_model(info.simulated.robot.urdf, episode.scene.robot.scale, description)
-    elif description is not None:
+    elif description:
         urdf, meshes = _external_model(description)
     else:
         return
@@ -217,7 +217,7 @@ def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:
 
 
 @functools.lru_cache(maxsize=4)
-def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
+def robot_model(urdf: str, scale: float, description: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
     """The joint tree and the links' meshes: the installed model, or else the recorded description.
 
     The installed model is used when all of it is there and its joints are where the recording has them.
@@ -225,7 +225,7 @@ def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf,
     Raises:
         SceneError, MissingDependencyError, RecordingError: The model is not installed and there is no description.
     """
-    recorded = None if description is None else Urdf.parse(description)
+    recorded = Urdf.parse(description) if description else None
     try:
         path = asset_path(urdf)
         text = path.read_text()
@@ -239,7 +239,6 @@ def robot_model(urdf: str, scale: float, description: str | None) -> tuple[Urdf,
         if recorded is None or _same_joints(installed, recorded):
             return installed, meshes
         reason = f"the model installed here has other joints ({urdf})"
-    assert description is not None
     assert recorded is not None
     log.warning("The robot is drawn as the boxes of the recording, since %s.", reason)
     return recorded, urdf_meshes(description, None)

@@ -11,7 +11,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from demorec.episode.scene import Scene
-from demorec.view.episode import Distances, PlayedEpisode, Video, timed
+from demorec.view.episode import Distances, Playback
 from demorec.view.paths import Paths, indexes, log_pose, send_poses
 from demorec.view.style import FRUSTUM, segment_colors
 
@@ -21,19 +21,19 @@ _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 
 
-def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
     """Every camera with what it saw; the coded images are passed on as they are."""
     if episode.scene is not None:
         _log_calibrations(recording, paths, episode, episode.scene)
         _log_segmentations(recording, paths, episode, episode.scene)
     for name in episode.cameras:
         if name in episode.videos:
-            _send_video(recording, paths.camera(name), episode.time_ns, episode.videos[name])
+            _send_video(recording, paths.camera(name), episode, name)
         if name in episode.depth:
-            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, episode.depth[name]())
+            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, episode.distances(name))
 
 
-def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, scene: Scene) -> None:
+def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene) -> None:
     for camera in scene.cameras:
         entity = paths.camera(camera.name)
         pinhole = rr.Pinhole(
@@ -45,24 +45,25 @@ def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: Play
             line_width=-1.0,
         )
         recording.log(entity, pinhole, static=True)
-        poses = episode.world_from_camera.get(camera.name)
+        poses = episode.motion.world_from_camera.get(camera.name)
         if camera.mount == "world":
             log_pose(recording, entity, camera.mount_from_camera.vector())
         elif poses is not None:
             send_poses(recording, entity, episode.time_ns, poses)
 
 
-def _send_video(recording: rr.RecordingStream, entity: str, frame_times: NDArray[np.int64], video: Video) -> None:
+def _send_video(recording: rr.RecordingStream, entity: str, episode: Playback, camera: str) -> None:
     """Coded images as they are, each at its time."""
-    if video.codec in _CODECS:
-        recording.log(entity, rr.VideoStream(codec=_CODECS[video.codec]), static=True)
-    for batch in batched(video.packets(), _PACKETS_AT_ONCE):
+    codec = episode.data.video_settings(camera).codec
+    if codec in _CODECS:
+        recording.log(entity, rr.VideoStream(codec=_CODECS[codec]), static=True)
+    for batch in batched(episode.packets(camera), _PACKETS_AT_ONCE):
         times, samples, are_keyframes = zip(*batch, strict=True)
-        if video.codec in _CODECS:
+        if codec in _CODECS:
             columns = rr.VideoStream.columns(sample=samples, is_keyframe=np.array(are_keyframes))
         else:
             columns = rr.EncodedImage.columns(blob=samples, media_type=["image/jpeg"] * len(samples))
-        recording.send_columns(entity, indexes(np.array(times), frame_times), columns)
+        recording.send_columns(entity, indexes(np.array(times), episode.time_ns), columns)
 
 
 def _send_images(
@@ -85,18 +86,19 @@ def _send_images(
         recording.send_columns(entity, indexes(np.array([time_ns for time_ns, _ in batch]), frame_times), columns)
 
 
-def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode, scene: Scene) -> None:
+def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene) -> None:
     """Segments by small numbers, the smallest of theirs (the background) 0, and what the numbers mean."""
-    known = np.array(sorted(episode.segment_names))
+    segment_names = episode.data.segment_names()
+    known = np.array(sorted(segment_names))
     for camera in scene.cameras:
-        if camera.name not in episode.segmentation:
+        if not episode.data.has_segmentation(camera.name):
             continue
-        images = timed(episode.time_ns, episode.segmentation[camera.name])
+        images = zip(episode.time_ns.tolist(), episode.data.segmentation(camera.name), strict=False)
         numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in images)
         entity = paths.camera(camera.name, "/segmentation")
         _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
-    if episode.segmentation:
-        names = {number: episode.segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}
+    if segment_names:
+        names = {number: segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}
         colors = segment_colors(names.values())
         labels = [rr.AnnotationInfo(number, name, colors[name]) for number, name in names.items()]
         recording.log(paths.world, rr.AnnotationContext(labels), static=True)

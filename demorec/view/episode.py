@@ -1,30 +1,29 @@
-"""An episode as playback sees it, whether it comes from a recording or from an exported dataset."""
+"""An episode as playback shows it: what its source knows, its motion, and numbers over time as curves."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Event, Outcome
-from demorec.episode.info import EpisodeInfo, Feature
+from demorec.episode.episode import NO_IMAGE, Table
+from demorec.episode.features import ACTION, DEPTH_SUFFIX, EE_POSE, STATE, VELOCITY
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.protocol import Episode, SceneMotion
+from demorec.episode.roles import ROLES, Roles
 from demorec.episode.scene import Scene
-from demorec.episode.simulated import scene_of
-from demorec.robots.robot import RobotSpec
+from demorec.episode.simulated import on_request, scene_of
 
 Distances = NDArray[np.uint16] | NDArray[np.float32]
 """(H, W) millimetres or metres."""
-Depth = Callable[[], Iterator[tuple[int, Distances]]]
-"""Reads the distances of a camera, each image with its time_ns."""
 EFFORT_CURVES = "effort (N m)"
 FORCE_CURVES = "contact_force (N)"
-Box = tuple[float, float, float, float]
 Statements = tuple[tuple[int, str, str], ...]
-"""(time_ns, kind, sentence), each holds until the next one of its kind."""
+"""(frame, kind, sentence), each holds until the next one of its kind."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -43,77 +42,36 @@ class Curves:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Video:
-    """Coded images of a camera.
-
-    Attributes:
-        codec: "h264", "h265", "av1" or "jpeg".
-        packets: Reads them anew: (time_ns, an access unit of the codec or a whole JPEG file, whether it is a keyframe).
-    """
-
-    codec: str
-    packets: Callable[[], Iterator[tuple[int, bytes, bool]]]
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class PlayedEpisode:
-    """What is shown of an episode. What a source does not have is None or empty.
-
-    The curves of a simulated one are "position" and "velocity" of the joints, "gripper" (m), "ee" (m) and those that
-    `sensed_curves` names; "target" and "gripper target" are what was asked for. Those of any other are the elements of
-    its features, by the features' names.
+class Playback:
+    """An open episode to be shown.
 
     Attributes:
         name: In the list of recordings.
         group: Run or dataset that it belongs to.
         identity: Distinguishes it from all others.
         source: Where it was read from, for people.
-        info: What is known before the first frame.
-        outcome: How it ended, None when nobody knows.
-        time_ns: (T,) of the frames, since the first one.
-        curves: Name -> measured values.
-        roles: Curve that is a feature -> its role (`demorec.episode.roles`), where it has one.
-        videos: Camera -> encoded images.
-        depth: Camera -> reads (time_ns, distances) of each of its images.
+        data: The episode.
+        motion: Of its robot and scene.
+        roles: Of its features.
+        curves: Name -> measured values; of a simulated episode as of `simulated_curves`, of any other the elements of
+            its features, by the features' names.
         statements: What is said of it.
-        robot_description: URDF; of a simulated robot primitives, for where the original model is not installed.
-        joint_position: Joint of the URDF -> (T,) rad or m.
-        body_description: URDF of the body of a name, None where the source has none.
-        base_from_tcp: (T, 7), None where it is not known.
-        object_poses: name -> (T, 7), world_from_object.
-        end_poses: name -> (7,) where an object ended, for sources that may not know its way there.
-        world_from_camera: name -> (T, 7).
-        phase: T names, or none.
-        events: (time_ns, event).
-        segmentation: Camera -> reads (H, W) segment numbers of every frame.
-        segment_names: Segment number -> name.
-        boxes: Camera -> frame -> (name, (x, y, width, height) px) of what it sees.
     """
 
     name: str
     group: str
     identity: str
     source: str
-    info: EpisodeInfo
-    outcome: Outcome | None
-    time_ns: NDArray[np.int64]
+    data: Episode
+    motion: SceneMotion
+    roles: Roles
     curves: Mapping[str, Curves]
-    videos: Mapping[str, Video]
-    roles: Mapping[str, str] = field(default_factory=dict)
-    depth: Mapping[str, Depth] = field(default_factory=dict)
     statements: Statements = ()
-    robot_description: str | None = None
-    joint_position: Mapping[str, Array] = field(default_factory=dict)
-    body_description: Callable[[str], str | None] = lambda _: None
-    base_from_tcp: Array | None = None
-    object_poses: Mapping[str, Array] = field(default_factory=dict)
-    end_poses: Mapping[str, Array] = field(default_factory=dict)
-    world_from_camera: Mapping[str, Array] = field(default_factory=dict)
-    phase: tuple[str, ...] = ()
-    events: tuple[tuple[int, Event], ...] = ()
-    segmentation: Mapping[str, Callable[[], Iterator[NDArray[np.int32]]]] = field(default_factory=dict)
-    segment_names: Mapping[int, str] = field(default_factory=dict)
-    boxes: Mapping[str, Mapping[int, Sequence[tuple[str, Box]]]] = field(default_factory=dict)
+
+    @property
+    def info(self) -> EpisodeInfo:
+        """What is known before the first frame."""
+        return self.data.info
 
     @property
     def scene(self) -> Scene | None:
@@ -125,6 +83,24 @@ class PlayedEpisode:
         """Where the robot stands; at the origin where nobody knows."""
         return Pose() if self.scene is None else self.scene.robot.world_from_base
 
+    @cached_property
+    def time_ns(self) -> NDArray[np.int64]:
+        """(T,) of the frames, since the first one."""
+        return times_from_start(self.data)
+
+    @cached_property
+    def videos(self) -> tuple[str, ...]:
+        """Cameras with images in colour."""
+        return tuple(camera for camera in self.data.cameras if len(self._stamps[camera]))
+
+    @cached_property
+    def depth(self) -> Mapping[str, str]:
+        """Camera -> its stream of distances; datasets of simulated episodes name that apart from its colours."""
+        placed = () if self.scene is None else [camera.name for camera in self.scene.cameras]
+        streams = [stream for stream in self.data.depth_cameras if len(self._stamps[stream])]
+        owner = {stream: stream.removesuffix(DEPTH_SUFFIX) for stream in streams if stream not in placed}
+        return {owner[stream] if owner.get(stream) in placed else stream: stream for stream in streams}
+
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the cameras that there are images of, or that the scene has."""
@@ -132,9 +108,25 @@ class PlayedEpisode:
         return tuple(dict.fromkeys([*placed, *self.videos, *self.depth]))
 
     @property
+    def _stamps(self) -> Mapping[str, NDArray[np.int64]]:
+        return self.data.table().image_stamps
+
+    def packets(self, camera: str) -> Iterator[tuple[int, bytes, bool]]:
+        """Yield the encoded images of a camera: time_ns at which each is shown, data, whether it is a keyframe."""
+        shown_ns = shown_at(self.data.table(), camera, self.time_ns)
+        for packet in self.data.packets(camera):
+            yield int(shown_ns[packet.frame_index]), packet.data, packet.is_keyframe
+
+    def distances(self, camera: str) -> Iterator[tuple[int, Distances]]:
+        """Yield the distances of a camera, each image with its time_ns."""
+        stream = self.depth[camera]
+        shown_ns = shown_at(self.data.table(), stream, self.time_ns)
+        return zip(shown_ns.tolist(), self.data.distances(stream), strict=False)
+
+    @property
     def num_frames(self) -> int:
         """Length."""
-        return len(self.time_ns)
+        return self.data.num_frames
 
     @property
     def duration(self) -> float:
@@ -144,56 +136,68 @@ class PlayedEpisode:
     @property
     def verdict(self) -> str:
         """The outcome in a word or two."""
-        if self.outcome is None or self.outcome.success is None:
+        outcome = self.data.outcome
+        if outcome is None or outcome.success is None:
             return "outcome unknown"
-        return "success" if self.outcome.success else f"failure: {self.outcome.failure_reason or 'no reason given'}"
+        return "success" if outcome.success else f"failure: {outcome.failure_reason or 'no reason given'}"
 
 
-def simulated_curves(
-    robot: RobotSpec,
-    time_ns: NDArray[np.int64],
-    values: Mapping[str, NDArray[Any]],
-    sensed: Sequence[Feature],
-    *,
-    joints: Mapping[str, Array],
-    opening: Array,
-    target: Array,
-    base_from_tcp: Array,
-) -> dict[str, Curves]:
+def times_from_start(episode: Episode) -> NDArray[np.int64]:
+    """(T,) ns since the first frame."""
+    times = episode.time_ns
+    return times - times[0] if len(times) else times
+
+
+def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(P,) when each image of a camera is shown: with the first frame that holds it, or the next one after it.
+
+    Not at its own stamp, which may be of another clock.
+    """
+    frames = np.flatnonzero(table.images[camera] != NO_IMAGE)
+    numbers = np.maximum.accumulate(table.images[camera][frames])
+    count = len(table.image_stamps[camera])
+    places = np.minimum(np.searchsorted(numbers, np.arange(count)), max(len(frames) - 1, 0))
+    return time_ns[frames[places]] if len(frames) else np.zeros(count, dtype=np.int64)
+
+
+def feature_curves(episode: Episode, roles: Roles) -> dict[str, Curves]:
+    """The elements of each feature, in the order of roles."""
+    features, time_ns = episode.table().features, times_from_start(episode)
+    ordered = sorted(episode.info.features, key=lambda feature: ROLES.index(roles.of[feature.name]))
+    return {
+        feature.name: Curves(time_ns=time_ns, values=features[feature.name].astype(np.float64), names=feature.names)
+        for feature in ordered
+    }
+
+
+def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool = True) -> dict[str, Curves]:
     """The curves of a simulated episode.
 
+    They are "position" and "velocity" of the arm's joints, "gripper" (m), "ee" (m) and those of its sensors, split by
+    unit ("wrench (N)"); "target" and "gripper target" are what was asked for.
+
     Args:
-        robot: The robot.
-        time_ns: (T,) of the frames.
-        values: Feature -> (T, D).
-        sensed: Features that have curves of their own.
-        joints: Name of the curves -> (T, ...) of the arm's joints, and maybe of others behind them.
-        opening, target: (T,) of the gripper: measured, and what was asked for, metres.
-        base_from_tcp: (T, 7).
+        episode: The episode; an observation that it lacks has no curves.
+        motion: Its motion.
+        has_targets: Whether its actions are joint targets.
     """
-    shown = [(name, values, robot.arm_joints) for name, values in joints.items()]
-    for feature in sensed:
-        shown += sensed_curves(feature, values[feature.name])
-    shown.append(("gripper", opening[:, None], ("opening",)))
-    shown.append(("gripper target", target[:, None], ("target",)))
-    shown.append(("ee", base_from_tcp, ("x", "y", "z")))
-    return {name: Curves(time_ns=time_ns, values=values[:, : len(names)], names=names) for name, values, names in shown}
-
-
-def sensed_curves(feature: Feature, values: NDArray[Any]) -> Iterator[tuple[str, NDArray[Any], tuple[str, ...]]]:
-    """Split a feature's values (T, D) by unit: name of the curves as "wrench (N)", values and names of elements."""
-    for unit in dict.fromkeys(feature.units):
-        columns = [number for number, other in enumerate(feature.units) if other == unit]
-        names = tuple(feature.names[number] for number in columns)
-        yield f"{feature.name.removeprefix('observation.')} ({unit})", values[:, columns], names
-
-
-def timed[Image](time_ns: NDArray[np.int64], read: Callable[[], Iterator[Image]]) -> Iterator[tuple[int, Image]]:
-    """Images with their times (P,), as far as there are any."""
-    return zip(time_ns.tolist(), read(), strict=False)
-
-
-def millimetres(read: Callable[[], Iterator[NDArray[np.float32]]]) -> Iterator[NDArray[np.uint16]]:
-    """Distances in metres as whole millimetres, which take half the space."""
-    for metres in read():
-        yield np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
+    info, time_ns = episode.info, times_from_start(episode)
+    features = {name: values.astype(np.float64) for name, values in episode.table().features.items()}
+    joints = info.simulated.robot.arm_joints
+    count = len(joints)
+    shown: list[tuple[str, Array, tuple[str, ...]]] = [("position", features[STATE][:, :count], joints)]
+    if VELOCITY in features:
+        shown.append(("velocity", features[VELOCITY][:, :count], joints))
+    if has_targets:
+        shown.append(("target", features[ACTION][:, :count], joints))
+    for feature in on_request(info):
+        for unit in dict.fromkeys(feature.units) if feature.name in features else ():
+            columns = [number for number, other in enumerate(feature.units) if other == unit]
+            title = f"{feature.name.removeprefix('observation.')} ({unit})"
+            names = tuple(feature.names[number] for number in columns)
+            shown.append((title, features[feature.name][:, columns], names))
+    shown.append(("gripper", features[STATE][:, count : count + 1], ("opening",)))
+    shown.append(("gripper target", features[ACTION][:, -1:], ("target",)))
+    tcp = features[EE_POSE] if motion.base_from_tcp is None else motion.base_from_tcp
+    shown.append(("ee", tcp[:, :3], ("x", "y", "z")))
+    return {name: Curves(time_ns=time_ns, values=values, names=names) for name, values, names in shown}

@@ -12,7 +12,7 @@ import hashlib
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -27,20 +27,20 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
 from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SuccessCheck
-from demorec.episode.features import DEPTH_SUFFIX, ENVIRONMENT_STATE, STATE_KINDS, state_names
+from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, STATE_KINDS, state_names
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.protocol import SceneMotion
 from demorec.episode.scene import Scene
-from demorec.episode.simulated import on_request
 from demorec.episode.validity import read_episode_info
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
+from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf, check_primitives
-from demorec.view.episode import Box, PlayedEpisode, millimetres, simulated_curves, timed
-from demorec.view.from_recording import played_episode
+from demorec.view.episode import Playback, feature_curves, simulated_curves
 
 
 @contextmanager
-def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[PlayedEpisode]:
+def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playback]:
     """One episode of a dataset, by its place in it from 0.
 
     Raises:
@@ -55,95 +55,121 @@ def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Played
     yield episode
 
 
-def _read_episode(dataset: LeRobotFolder, number: int) -> PlayedEpisode:
-    root, episode_index = dataset.root, dataset.places[number].episode_index
-    recording = DatasetRecording(dataset, number)
-    group = root.resolve().name
-    last, fps, times = recording.num_frames - 1, dataset.info.fps, recording.table().time_ns
-    known = {
-        "name": f"episode_{episode_index:06d}",
-        "group": group,
-        "source": str(recording.known.get("source", group)),
-        "statements": tuple(
-            (int(times[min(round(row["timestamp"] * fps), last)] - times[0]), str(row["style"]), str(row["content"]))
-            for row in recording.spoken.persistent
-        ),
-    }
-    if recording.known.get("root_seed") is not None:
-        (row,) = dataset.sidecar_rows("episodes", episode_index)
-        return _simulated(recording, row, known | {"identity": f"dataset-{group}-{episode_index}"})
-    info, robot = recording.info, recording.robot
-    if not info.urdf and robot is not None:
-        info = with_robot(info, robot, recording.dataset.roles)
-    known["identity"] = hashlib.sha256(f"{root.resolve()} {episode_index}".encode()).hexdigest()[:16]
-    return played_episode(recording, known, info, recording.dataset.roles)
-
-
-def _simulated(recording: DatasetRecording, row: dict[str, Any], known: dict[str, Any]) -> PlayedEpisode:
-    dataset, root = recording.dataset, recording.path
-    described, columns = dataset.info, recording.table()
-    export = dict(read_json(root / SIDECAR_DIR / "export.json"))
-    info = read_episode_info(row["episode_info"])
-    missing = {"observation.state", "action"} - described.features.keys()
-    if missing:
-        raise RecordingError(f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {root}")
-    data = {name: values.astype(np.float64) for name, values in columns.features.items()}
-    num_arm = len(info.simulated.robot.arm_joints)
-    widths = {len(state_names(info.simulated.robot, kind)) for kind in STATE_KINDS}
-    state = data["observation.state"]
-    if not len(state) or state.shape[1] not in widths:
-        raise RecordingError(
-            f"The dataset has no rows of episode {recording.place.episode_index}, or of another robot: {root}"
-        )
-    robot = recording.robot
-    if robot is not None:
-        check_primitives(robot.urdf)
-    base_from_tcp = data["observation.ee_pose"] if "observation.ee_pose" in data else _tcp_poses(info, state, robot)
-    fingers = info.simulated.robot.gripper.joint_position(state[:, num_arm])
-    ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in row["objects"]}
-    joints = {"position": state}
-    if "observation.velocity" in data:
-        joints["velocity"] = data["observation.velocity"]
-    if export.get("action") == "joint":
-        joints["target"] = data["action"]
-    shown = replace(info, features=recording.info.features)
-    episode = played_episode(recording, known, shown, recording.dataset.roles)
-    return replace(
-        episode,
-        outcome=_outcome(row, len(state)),
-        robot_description=None if robot is None else robot.urdf,
-        joint_position=dict(zip(info.simulated.robot.joint_names, [*state[:, :num_arm].T, *fingers.T], strict=True)),
-        base_from_tcp=base_from_tcp,
-        object_poses=_object_poses(info, ends, data, described, base_from_tcp),
-        end_poses=ends,
-        world_from_camera=_camera_poses(recording),
-        phase=_phases(row, len(state)),
-        curves=simulated_curves(
-            info.simulated.robot,
-            episode.time_ns,
-            data,
-            [feature for feature in on_request(info) if feature.name in data],
-            joints=joints,
-            opening=state[:, num_arm],
-            target=data["action"][:, -1],
-            base_from_tcp=base_from_tcp,
-        ),
-        depth={
-            name.removesuffix(DEPTH_SUFFIX): partial(
-                timed, episode.time_ns, partial(millimetres, partial(recording.distances, name))
-            )
-            for name in recording.depth_cameras
-        },
-        boxes={name: _boxes(recording, name) for name in recording.cameras},
+def _read_episode(dataset: LeRobotFolder, number: int) -> Playback:
+    root, group = dataset.root, dataset.root.resolve().name
+    index, last = dataset.places[number].episode_index, dataset.places[number].length - 1
+    episode: ShownEpisode | SimulatedEpisode = ShownEpisode(dataset, number)
+    if episode.known.get("root_seed") is not None:
+        episode = SimulatedEpisode(dataset, number)
+        motion, identity = episode.motion(), f"dataset-{group}-{index}"
+        curves = simulated_curves(episode, motion, has_targets=episode.has_targets)
+    else:
+        motion, identity = episode.motion(), hashlib.sha256(f"{root.resolve()} {index}".encode()).hexdigest()[:16]
+        curves = feature_curves(episode, dataset.roles)
+    statements = tuple(
+        (min(round(row["timestamp"] * dataset.info.fps), last), str(row["style"]), str(row["content"]))
+        for row in episode.spoken.persistent
+    )
+    return Playback(
+        name=f"episode_{index:06d}",
+        group=group,
+        identity=identity,
+        source=str(episode.known.get("source", group)),
+        data=episode,
+        motion=motion,
+        roles=dataset.roles,
+        curves=curves,
+        statements=statements,
     )
 
 
-def _boxes(recording: DatasetRecording, camera: str) -> dict[int, list[tuple[str, Box]]]:
-    """Frame -> what a camera sees there."""
-    seen: dict[int, list[tuple[str, Box]]] = {}
-    for frame, name, box in recording.boxes(camera):
-        seen.setdefault(frame, []).append((name, box))
-    return seen
+class ShownEpisode(DatasetRecording):
+    """An episode with the arm that its joints name, where it describes none."""
+
+    @cached_property
+    def info(self) -> EpisodeInfo:
+        """As of `DatasetRecording`, with that arm."""
+        info, robot = super().info, self.robot
+        return info if info.urdf or robot is None else with_robot(info, robot, self.dataset.roles)
+
+
+class SimulatedEpisode(DatasetRecording):
+    """An episode that demorec simulated, with the scene and the outcome that the sidecar keeps.
+
+    Attributes:
+        outcome, phases: As in the sidecar.
+        has_targets: Whether its actions are joint targets.
+
+    Raises:
+        RecordingError: It lacks state or action, or they are of another robot.
+        ValueError, TypeError, KeyError, IndexError: Odd values in its tables.
+    """
+
+    def __init__(self, dataset: LeRobotFolder, number: int) -> None:
+        super().__init__(dataset, number)
+        (self._row,) = dataset.sidecar_rows("episodes", self.place.episode_index)
+        self.has_targets = read_json(self.path / SIDECAR_DIR / "export.json").get("action") == "joint"
+        self._check()
+        self._phases = _phases(self._row, self.num_frames)
+        if self.robot is not None:
+            check_primitives(self.robot.urdf)
+
+    def _check(self) -> None:
+        missing = {STATE, ACTION} - self.dataset.info.features.keys()
+        if missing:
+            raise RecordingError(
+                f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {self.path}"
+            )
+        state = self.table().features[STATE]
+        if not len(state) or state.shape[1] not in {len(state_names(self._spec, kind)) for kind in STATE_KINDS}:
+            raise RecordingError(
+                f"The dataset has no rows of episode {self.place.episode_index}, or of another robot: {self.path}"
+            )
+
+    @cached_property
+    def info(self) -> EpisodeInfo:
+        """As the sidecar keeps it, with the features of the dataset."""
+        return replace(read_episode_info(self._row["episode_info"]), features=super().info.features)
+
+    @property
+    def _spec(self) -> RobotSpec:
+        return self.info.simulated.robot
+
+    @cached_property
+    def outcome(self) -> Outcome:
+        """How it ended."""
+        names = ("success", "failure_phase", "failure_reason", "num_retries", "final_state_digest")
+        checks = tuple(SuccessCheck(**check) for check in self._row["checks"])
+        return Outcome(num_frames=self.num_frames, checks=checks, **{name: self._row[name] for name in names})
+
+    @property
+    def phases(self) -> tuple[str, ...]:
+        """T phases of the motion."""
+        return self._phases
+
+    def description(self, body: str = "") -> str:
+        """URDF of the robot; "" if unknown, and for bodies."""
+        return "" if body or self.robot is None else self.robot.urdf
+
+    def distances(self, camera: str) -> Iterator[Any]:
+        """The images of a depth camera in order, (H, W) uint16 millimetres, which take half the space of metres."""
+        for metres in super().distances(camera):
+            yield np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
+
+    def motion(self) -> SceneMotion:
+        """The motion of the robot; objects and cameras as the dataset has them, or as the hand carries them."""
+        data = {name: values.astype(np.float64) for name, values in self.table().features.items()}
+        state, count = data[STATE], len(self._spec.arm_joints)
+        fingers = self._spec.gripper.joint_position(state[:, count])
+        base_from_tcp = data[EE_POSE] if EE_POSE in data else _tcp_poses(self.info, state, self.robot)
+        ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in self._row["objects"]}
+        return SceneMotion(
+            joint_position=dict(zip(self._spec.joint_names, [*state[:, :count].T, *fingers.T], strict=True)),
+            base_from_tcp=base_from_tcp,
+            object_poses=_object_poses(self.info, ends, data, self.dataset.info, base_from_tcp),
+            end_poses=ends,
+            world_from_camera=_camera_poses(self),
+        )
 
 
 def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
@@ -165,7 +191,7 @@ def _object_poses(
 ) -> dict[str, Array]:
     """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
     if ENVIRONMENT_STATE not in data:
-        opening, target = data["observation.state"][:, len(info.simulated.robot.arm_joints)], data["action"][:, -1]
+        opening, target = data[STATE][:, len(info.simulated.robot.arm_joints)], data[ACTION][:, -1]
         return held_object_poses(info.simulated.scene, ends, base_from_tcp, opening, target, int(described.fps))
     first = {name: column for column, name in enumerate(described.features[ENVIRONMENT_STATE].names or ())}
     base, values = info.simulated.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
@@ -183,12 +209,6 @@ def _pose_row(values: Any) -> Array:
     if pose.shape != (7,) or not np.isfinite(pose).all():
         raise ValueError(f"{str(values)[:40]} is no pose")
     return pose
-
-
-def _outcome(row: dict[str, Any], num_frames: int) -> Outcome:
-    names = ("success", "failure_phase", "failure_reason", "num_retries", "final_state_digest")
-    checks = tuple(SuccessCheck(**check) for check in row["checks"])
-    return Outcome(num_frames=num_frames, checks=checks, **{name: row[name] for name in names})
 
 
 def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:

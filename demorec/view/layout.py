@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from demorec.episode.features import ACTION, STATE
-from demorec.view.episode import EFFORT_CURVES, FORCE_CURVES, PlayedEpisode
+from demorec.view.episode import EFFORT_CURVES, FORCE_CURVES, Playback
 from demorec.view.paths import FRAMES, SECONDS, Paths
 from demorec.view.scene import DIFFERENCES, A, B
 
@@ -33,27 +33,31 @@ _FLOOR = 3.0
 """Bodies wider than this (metres) are the floor, which would only hide the grid."""
 
 
-def episode_layout(episode: PlayedEpisode, *, is_alone: bool = False) -> rrb.Blueprint:
+def episode_layout(episode: Playback, *, is_alone: bool = False) -> rrb.Blueprint:
     """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
     paths = Paths()
     title = episode.info.robot_name if episode.scene is None else f"{episode.info.simulated.task}: the world"
-    is_known = episode.scene is not None or episode.robot_description is not None
+    is_known = episode.scene is not None or bool(episode.info.urdf)
     return _blueprint(
         episode,
         is_alone=is_alone,
         three_d=_view_3d(episode, [paths], title) if is_known else None,
         cameras=_camera_views(episode, paths),
         curves=_curve_views([paths], episode),
-        states=[rrb.StateTimelineView(origin=paths.phase, name="phases")] if any(episode.phase) else [],
+        states=[rrb.StateTimelineView(origin=paths.phase, name="phases")] if any(episode.data.phases) else [],
         texts=[
             *([rrb.TextDocumentView(origin=paths.words, name="in words")] if episode.statements else []),
             rrb.TextDocumentView(origin=paths.summary, name="episode"),
-            *([rrb.TextLogView(origin=paths.events, name="events")] if any(episode.phase) or episode.events else []),
+            *(
+                [rrb.TextLogView(origin=paths.events, name="events")]
+                if any(episode.data.phases) or any(episode.data.events())
+                else []
+            ),
         ],
     )
 
 
-def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
+def comparison_layout(a: Playback, b: Playback) -> rrb.Blueprint:
     """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
     roots = [A, B]
     images: list[rrb.View | rrb.Container] = [
@@ -87,7 +91,7 @@ def comparison_layout(a: PlayedEpisode, b: PlayedEpisode) -> rrb.Blueprint:
 
 
 def _blueprint(
-    episode: PlayedEpisode,
+    episode: Playback,
     *,
     is_alone: bool,
     three_d: rrb.View | None,
@@ -120,7 +124,7 @@ def _blueprint(
     )
 
 
-def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spatial3DView:
+def _view_3d(episode: Playback, roots: list[Paths], name: str) -> rrb.Spatial3DView:
     contents = []
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
@@ -153,15 +157,15 @@ def _view_3d(episode: PlayedEpisode, roots: list[Paths], name: str) -> rrb.Spati
     )
 
 
-def _eye(episode: PlayedEpisode) -> rrb.EyeControls3D | None:
+def _eye(episode: Playback) -> rrb.EyeControls3D | None:
     """Where the 3D view looks from and to: at the gripper's way from the side, with the arm in the image.
 
     None where that way is not known: the viewer finds a place itself.
     """
-    if episode.base_from_tcp is None:
+    if episode.motion.base_from_tcp is None:
         return None
     base = episode.world_from_base
-    points = base.apply(episode.base_from_tcp[:, :3])
+    points = base.apply(episode.motion.base_from_tcp[:, :3])
     middle = (points.min(axis=0) + points.max(axis=0)) / 2 if len(points) else base.apply((0.5, 0.0, 0.2))
     target = 0.7 * middle + 0.3 * base.apply((0.2, 0.0, 0.4))
     side = base.rotation[:, 1]
@@ -175,17 +179,17 @@ def _eye(episode: PlayedEpisode) -> rrb.EyeControls3D | None:
     )
 
 
-def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.Container]:
+def _camera_views(episode: Playback, paths: Paths) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
     for name in episode.cameras:
-        boxes = [paths.camera(name, "/boxes")] if name in episode.boxes else []
+        boxes = [paths.camera(name, "/boxes")] if any(episode.data.boxes(name)) else []
         tabs: list[rrb.View] = []
         if name in episode.videos:
             contents = ["$origin", *boxes]
             tabs.append(rrb.Spatial2DView(origin=paths.camera(name), contents=contents, name=f"{name} camera"))
         if name in episode.depth:
             tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/depth"), name=f"{name} depth"))
-        if name in episode.segmentation:
+        if name in episode.data.cameras and episode.data.has_segmentation(name):
             tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/segmentation"), name=f"{name} segments"))
         if tabs:
             views.append(tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0))
@@ -194,7 +198,7 @@ def _camera_views(episode: PlayedEpisode, paths: Paths) -> list[rrb.View | rrb.C
     return views
 
 
-def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
+def _curve_views(roots: list[Paths], episode: Playback) -> rrb.Container:
     def view(title: str, *names: str) -> rrb.TimeSeriesView | None:
         shown = [name for name in names if name in episode.curves]
         if not shown:
@@ -214,7 +218,8 @@ def _curve_views(roots: list[Paths], episode: PlayedEpisode) -> rrb.Container:
     plots = _PLOTS if len(roots) == 1 else _COMPARED_PLOTS
     known = {name for names in plots.values() for name in names} | {"target", "gripper target"}
     # A feature whose name is not the usual one of its role has both as its title.
-    titles = {name: f"{role}: {name}" for name, role in episode.roles.items() if name not in (STATE, ACTION)}
+    roles = episode.roles.of.items()
+    titles = {name: f"{role}: {name}" for name, role in roles if role is not None and name not in (STATE, ACTION)}
     tabs = [item for title, names in plots.items() if title not in _SIDE and (item := view(title, *names)) is not None]
     others = [view(titles.get(name, name), name) for name in episode.curves if name not in known]
     beside = [item for title in _SIDE if (item := view(title, *plots[title])) is not None]

@@ -7,7 +7,6 @@ from itertools import groupby
 
 import numpy as np
 import rerun as rr
-from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array
@@ -16,7 +15,7 @@ from demorec.episode.scene import Rgba
 from demorec.episode.simulated import simulation_facts
 from demorec.view.bodies import log_bodies, log_robot
 from demorec.view.cameras import log_cameras
-from demorec.view.episode import FORCE_CURVES, Curves, PlayedEpisode, Statements
+from demorec.view.episode import FORCE_CURVES, Curves, Playback
 from demorec.view.paths import Paths, indexes
 from demorec.view.style import (
     ASKED,
@@ -40,7 +39,7 @@ _LEVEL_COLORS: dict[str, Color] = {"info": (200, 200, 200), "warning": (255, 200
 
 def log_episode(
     recording: rr.RecordingStream,
-    episode: PlayedEpisode,
+    episode: Playback,
     *,
     root: str = "",
     label: str = "",
@@ -62,11 +61,11 @@ def log_episode(
     log_phases(recording, paths, episode)
     log_events(recording, paths, episode)
     log_boxes(recording, paths, episode)
-    log_words(recording, paths, episode.statements, episode.time_ns)
+    log_words(recording, paths, episode)
     recording.log(paths.summary, rr.TextDocument(summary(episode), media_type="text/markdown"), static=True)
 
 
-def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
+def new_recording(episode: Playback) -> rr.RecordingStream:
     """An empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
@@ -74,18 +73,18 @@ def new_recording(episode: PlayedEpisode) -> rr.RecordingStream:
     return recording
 
 
-def application_id(episode: PlayedEpisode) -> str:
+def application_id(episode: Playback) -> str:
     """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
     words = ["" if episode.scene is None else episode.info.simulated.task, *episode.cameras]
     return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in (episode.group, *words) if word)
 
 
-def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
     """The gripper's path: one piece a frame, so that a view can show what lies behind; coloured by phase."""
-    if episode.num_frames < 2 or episode.base_from_tcp is None:
+    if episode.num_frames < 2 or episode.motion.base_from_tcp is None:
         return
-    points = episode.world_from_base.apply(episode.base_from_tcp[:, :3])
-    phases = episode.phase or ("",) * episode.num_frames
+    points = episode.world_from_base.apply(episode.motion.base_from_tcp[:, :3])
+    phases = episode.data.phases or ("",) * episode.num_frames
     colors = phase_colors(phases)
     recording.log(paths.ee_path, rr.LineStrips3D.from_fields(radii=[-2.0]), static=True)
     columns = rr.LineStrips3D.columns(
@@ -97,7 +96,7 @@ def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpis
 def log_curves(
     recording: rr.RecordingStream,
     paths: Paths,
-    episode: PlayedEpisode,
+    episode: Playback,
     label: str = "",
     *,
     is_second: bool = False,
@@ -135,37 +134,37 @@ def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
     return [_COLORS[name]] * count if name in _COLORS else series_colors(count)
 
 
-def log_phases(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
     """The phases of the motion as states over time."""
-    colors = phase_colors(episode.phase)
+    colors = phase_colors(episode.data.phases)
     if not colors or set(colors) == {""}:
         return
     recording.log(paths.phase, rr.StateConfiguration(values=list(colors), colors=list(colors.values())), static=True)
     starts = _phase_starts(episode)
-    columns = rr.StateChange.columns(state=[episode.phase[i] for i in starts])
+    columns = rr.StateChange.columns(state=[episode.data.phases[i] for i in starts])
     recording.send_columns(paths.phase, indexes(episode.time_ns[starts], episode.time_ns), columns)
 
 
-def _phase_starts(episode: PlayedEpisode) -> list[int]:
+def _phase_starts(episode: Playback) -> list[int]:
     """The frames at which the phase is another than before."""
-    return [i for i, name in enumerate(episode.phase) if i == 0 or name != episode.phase[i - 1]]
+    return [i for i, name in enumerate(episode.data.phases) if i == 0 or name != episode.data.phases[i - 1]]
 
 
-def log_events(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+def log_events(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
     """Changes of phase and what happened, in order."""
-    colors = phase_colors(episode.phase)
+    colors = phase_colors(episode.data.phases)
     rows: list[tuple[int, str, str, Color]] = [
-        (int(episode.time_ns[i]), "INFO", episode.phase[i], colors[episode.phase[i]])
+        (int(episode.time_ns[i]), "INFO", episode.data.phases[i], colors[episode.data.phases[i]])
         for i in _phase_starts(episode)
-        if episode.phase[i]
+        if episode.data.phases[i]
     ]
     rows += [
         (time, _LEVELS[event.level], event.message or event.name, _LEVEL_COLORS[event.level])
-        for time, event in episode.events
+        for time, event in episode.data.events()
     ]
-    if episode.outcome is not None and episode.num_frames:
+    if episode.data.outcome is not None and episode.num_frames:
         end = int(episode.time_ns[-1])
-        level, color = ("INFO", (60, 230, 120)) if episode.outcome.success else ("ERROR", (255, 80, 80))
+        level, color = ("INFO", (60, 230, 120)) if episode.data.outcome.success else ("ERROR", (255, 80, 80))
         rows.append((end, level, episode.verdict, color))
     if not rows:
         return
@@ -176,39 +175,35 @@ def log_events(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpiso
     recording.send_columns(paths.events, indexes(np.array([row[0] for row in rows]), episode.time_ns), columns)
 
 
-def log_words(
-    recording: rr.RecordingStream, paths: Paths, statements: Statements, frames_ns: NDArray[np.int64]
-) -> None:
-    """The page of what holds, anew whenever something changes; `frames_ns` (T,) are the times of all frames."""
+def log_words(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
+    """The page of what holds, written again whenever something changes."""
     holds: dict[str, str] = {}
-    times, pages = [], []
-    shown = sorted((item for item in statements if item[1] in _HEADINGS), key=lambda item: item[0])
-    for time_ns, group in groupby(shown, key=lambda item: item[0]):
+    frames, pages = [], []
+    shown = sorted((item for item in episode.statements if item[1] in _HEADINGS), key=lambda item: item[0])
+    for frame, group in groupby(shown, key=lambda item: item[0]):
         holds |= {kind: text for _, kind, text in group}
-        times.append(time_ns)
+        frames.append(frame)
         pages.append("\n\n".join(f"**{title}**\n\n{holds[kind]}" for kind, title in _HEADINGS.items() if kind in holds))
     if pages:
         columns = rr.TextDocument.columns(text=pages, media_type=["text/markdown"] * len(pages))
-        recording.send_columns(paths.words, indexes(np.array(times, dtype=np.int64), frames_ns), columns)
+        recording.send_columns(paths.words, indexes(episode.time_ns[frames], episode.time_ns), columns)
 
 
-def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisode) -> None:
+def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
     """Boxes around what each camera sees, frame by frame; their names, which would hide small images, on pointing."""
-    names = sorted({name for frames in episode.boxes.values() for seen in frames.values() for name, _ in seen})
-    colors = segment_colors(names)
-    for camera, frames in episode.boxes.items():
-        seen = [frames.get(frame, ()) for frame in range(episode.num_frames)]
-        flat = [item for items in seen for item in items]
-        if not flat:
+    found = {camera: list(episode.data.boxes(camera)) for camera in episode.data.cameras}
+    colors = segment_colors(sorted({name for boxes in found.values() for _, name, _ in boxes}))
+    for camera, boxes in found.items():
+        if not boxes:
             continue
         recording.log(paths.camera(camera, "/boxes"), rr.Boxes2D.from_fields(show_labels=False), static=True)
         columns = rr.Boxes2D.columns(
-            half_sizes=[(width / 2, height / 2) for _, (_, _, width, height) in flat],
-            centers=[(x + width / 2, y + height / 2) for _, (x, y, width, height) in flat],
-            labels=[name for name, _ in flat],
-            colors=[colors[name] for name, _ in flat],
+            half_sizes=[(width / 2, height / 2) for _, _, (_, _, width, height) in boxes],
+            centers=[(x + width / 2, y + height / 2) for _, _, (x, y, width, height) in boxes],
+            labels=[name for _, name, _ in boxes],
+            colors=[colors[name] for _, name, _ in boxes],
         )
-        lengths = [len(items) for items in seen]
+        lengths = np.bincount([frame for frame, _, _ in boxes], minlength=episode.num_frames)
         recording.send_columns(
             paths.camera(camera, "/boxes"), indexes(episode.time_ns, episode.time_ns), columns.partition(lengths)
         )
@@ -217,18 +212,18 @@ def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: PlayedEpisod
 _OF_A_RUN = re.compile(r"episode_0*(?P<number>\d+)(?:\.attempt_(?P<attempt>\d+))?")
 
 
-def entry(episode: PlayedEpisode) -> str:
+def entry(episode: Playback) -> str:
     """A few characters for the viewer's narrow list: "3 ok", "0.1 FAIL place" (the attempt after the dot)."""
-    match, outcome = _OF_A_RUN.fullmatch(episode.name), episode.outcome
+    match, outcome = _OF_A_RUN.fullmatch(episode.name), episode.data.outcome
     name = episode.name if match is None else ".".join(part for part in match.groups() if part is not None)
     if outcome is None or outcome.success is None:
         return f"{name} ?"
     return f"{name} ok" if outcome.success else f"{name} FAIL {outcome.failure_phase}".rstrip()
 
 
-def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
+def properties(episode: Playback) -> dict[str, str | int | float | bool]:
     """What the viewer lists beside the recording's name."""
-    info, outcome = episode.info, episode.outcome
+    info, outcome = episode.info, episode.data.outcome
     values: dict[str, str | int | float | bool] = {
         "instruction": info.instruction,
         "outcome": episode.verdict,
@@ -249,19 +244,19 @@ def properties(episode: PlayedEpisode) -> dict[str, str | int | float | bool]:
     return values
 
 
-def _origin(episode: PlayedEpisode) -> str:
+def _origin(episode: Playback) -> str:
     """Where it comes from, "" for a generated one."""
     origin = episode.info.origin
     return origin if isinstance(origin, str) else ", ".join([origin.kind, *(file.name for file in origin.files)])
 
 
-def summary(episode: PlayedEpisode) -> str:
+def summary(episode: Playback) -> str:
     """Markdown: task, outcome and its checks, the failed ones first."""
     info, facts = episode.info, simulation_facts(episode.info)
     about = [facts.get("task", info.robot_name), f"episode {info.episode_index}"]
     about += [f"seed {facts['root_seed']}"] if facts else []
     length = f"{episode.duration:.1f} s · {episode.num_frames} frames (nominal {info.fps} Hz)"
-    origin, checks = _origin(episode), [] if episode.outcome is None else _checks(episode.outcome)
+    origin, checks = _origin(episode), [] if episode.data.outcome is None else _checks(episode.data.outcome)
     parts = [f"**{info.instruction}**", " · ".join(about), length, f"Outcome: **{episode.verdict}**"]
     return "\n\n".join([*parts, *([f"Origin: {origin}"] if origin else []), *checks]) + "\n"
 
@@ -282,7 +277,7 @@ A, B = Paths("/a"), Paths("/b")
 DIFFERENCES = "/differences"
 
 
-def new_comparison(a: PlayedEpisode, b: PlayedEpisode) -> rr.RecordingStream:
+def new_comparison(a: Playback, b: Playback) -> rr.RecordingStream:
     """An empty Rerun recording named after both."""
     recording = rr.RecordingStream("demorec-compare", recording_id=f"{a.identity}-{b.identity}")
     recording.send_recording_name(f"A {entry(a)}, B {entry(b)}")
@@ -291,7 +286,7 @@ def new_comparison(a: PlayedEpisode, b: PlayedEpisode) -> rr.RecordingStream:
     return recording
 
 
-def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpisode) -> None:
+def log_comparison(recording: rr.RecordingStream, a: Playback, b: Playback) -> None:
     """Send both episodes and how far they are apart.
 
     Raises:
@@ -303,7 +298,7 @@ def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpi
             "Only simulated episodes can be laid over each other: of others nobody knows that their robots stand "
             "alike. View them without --compare."
         )
-    if [*a.joint_position] != [*b.joint_position]:
+    if [*a.motion.joint_position] != [*b.motion.joint_position]:
         raise ConfigError(
             f"The episodes have different robots, {a.info.robot_name} and {b.info.robot_name}: "
             "compare two of the same robot."
@@ -317,19 +312,19 @@ def log_comparison(recording: rr.RecordingStream, a: PlayedEpisode, b: PlayedEpi
         recording.send_columns(entity, times, rr.Scalars.columns(scalars=curves.values))
 
 
-def differences(a: PlayedEpisode, b: PlayedEpisode) -> dict[str, Curves]:
+def differences(a: Playback, b: Playback) -> dict[str, Curves]:
     """Frame by frame, as long as both last: the gripper's and the objects' distance (mm), the joints' largest (rad)."""
     count = min(a.num_frames, b.num_frames)
     time_ns = a.time_ns[:count]
-    first, second = (np.stack([*episode.joint_position.values()])[:, :count] for episode in (a, b))
+    first, second = (np.stack([*episode.motion.joint_position.values()])[:, :count] for episode in (a, b))
     joints = np.abs(first - second).max(axis=0, initial=0.0)
-    assert a.base_from_tcp is not None
-    assert b.base_from_tcp is not None
-    names, columns = ["gripper"], [_distance(a.base_from_tcp[:count], b.base_from_tcp[:count])]
-    for name in a.object_poses:
-        if name in b.object_poses:
+    assert a.motion.base_from_tcp is not None
+    assert b.motion.base_from_tcp is not None
+    names, columns = ["gripper"], [_distance(a.motion.base_from_tcp[:count], b.motion.base_from_tcp[:count])]
+    for name, poses in a.motion.object_poses.items():
+        if name in b.motion.object_poses:
             names.append(name)
-            columns.append(_distance(a.object_poses[name][:count], b.object_poses[name][:count]))
+            columns.append(_distance(poses[:count], b.motion.object_poses[name][:count]))
     return {
         "distance": Curves(time_ns=time_ns, values=1000 * np.stack(columns, axis=1), names=tuple(names)),
         "joints": Curves(time_ns=time_ns, values=joints[:, None], names=("largest joint difference",)),

@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
+import hashlib
+import os
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from demorec.core.errors import ConfigError, OptionError
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
+from demorec.episode.simulated import scene_of
+from demorec.mcap import Recording
+from demorec.mcap.channels import JOINT_STATES
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
-from demorec.view.episode import PlayedEpisode
+from demorec.runs.run_file import EPISODES, FAILED
+from demorec.view.episode import EFFORT_CURVES, Curves, Playback, feature_curves, simulated_curves
 from demorec.view.from_dataset import open_dataset_episode
-from demorec.view.from_recording import open_recorded
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,7 +34,7 @@ class PlaybackSource:
     """
 
     name: str
-    open: Callable[[], AbstractContextManager[PlayedEpisode]]
+    open: Callable[[], AbstractContextManager[Playback]]
 
 
 def find_episodes(
@@ -65,6 +72,46 @@ def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[Play
         raise ConfigError(f"The folder holds failed attempts only, which --include-failures shows: {path}")
     expect_recordings(found, files)
     return [PlaybackSource(name=str(file), open=partial(open_recorded, file, named)) for file in files]
+
+
+@contextmanager
+def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback]:
+    """The episode of a recording; its images can be read until the context is left.
+
+    Raises:
+        ConfigError: It lacks a feature whose role the user names, or is simulated.
+        RecordingError: It cannot be read.
+    """
+    folder = path.resolve().parent
+    with Recording(path) as recording:
+        roles, motion = roles_of_recording(recording.info, named), recording.motion()
+        is_simulated = scene_of(recording.info) is not None
+        curves = simulated_curves(recording, motion) if is_simulated else feature_curves(recording, roles)
+        if is_simulated and recording.topics[JOINT_STATES][1] > recording.num_frames:
+            curves |= _joint_curves(recording, curves)
+        yield Playback(
+            name=path.name.removesuffix(".mcap"),
+            group=folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
+            identity=hashlib.sha256(os.fsencode(path.resolve())).hexdigest()[:16],
+            source=path.name,
+            data=recording,
+            motion=motion,
+            roles=roles,
+            curves=curves,
+            statements=tuple((frame, "subtask", text) for frame, text in recording.subtasks),
+        )
+
+
+def _joint_curves(recording: Recording, of_frames: Mapping[str, Curves]) -> dict[str, Curves]:
+    """The curves of the joints at the rate of the physics."""
+    samples = list(recording.joint_samples())
+    time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
+    found = {}
+    for name, quantity in (("position", "position"), ("velocity", "velocity"), (EFFORT_CURVES, "effort")):
+        names = of_frames[name].names
+        values = np.array([getattr(sample, f"joint_{quantity}") for sample in samples])
+        found[name] = Curves(time_ns=time_ns, values=values[:, : len(names)], names=names)
+    return found
 
 
 def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSource]:

@@ -125,7 +125,7 @@ def test_it_is_imported_and_shown(version: str, tmp_path: Path) -> None:
     with open_dataset_episode(LeRobotFolder(root), 1) as episode:
         assert episode.info.simulation is None
         np.testing.assert_array_equal(episode.curves["observation.state"].values, state(1))
-        assert len(list(episode.videos["top"].packets())) == LENGTHS[1]
+        assert len(list(episode.packets("top"))) == LENGTHS[1]
 
 
 def test_its_copy_in_the_new_format_is_the_same(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -175,7 +175,7 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Imag
             shown = [_pixels(frame) for frame in container.decode(video=0)]
         assert_equal([shown[len(packets) - place.length :]], [images])
         with open_dataset_episode(LeRobotFolder(dataset), place.episode_index) as episode:
-            times = np.array([time_ns for time_ns, _, _ in episode.videos["high"].packets()])
+            times = np.array([time_ns for time_ns, _, _ in episode.packets("high")])
         assert len(times) == len(packets)
         lead = len(packets) - place.length
         assert times[: lead + 1].tolist() == [episode.time_ns[0]] * (lead + 1)

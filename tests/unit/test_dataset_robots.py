@@ -194,8 +194,8 @@ def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
         assert episode.info.simulation is None
         state = np.array([frame.samples["observation.state"].vector for frame in given.frames])
-        np.testing.assert_allclose(episode.joint_position["shoulder"], np.deg2rad(state[:, 0]), atol=1e-7)
-        np.testing.assert_array_equal(episode.joint_position["elbow"], state[:, 1])
+        np.testing.assert_allclose(episode.motion.joint_position["shoulder"], np.deg2rad(state[:, 0]), atol=1e-7)
+        np.testing.assert_array_equal(episode.motion.joint_position["elbow"], state[:, 1])
     save(find_episodes([tmp_path / "d"])[0], tmp_path / "a.rrd")
     assert meshes_in(tmp_path / "a.rrd") == {"base", "upper", "lower"}
 
@@ -211,7 +211,7 @@ def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(e
     with open_dataset_episode(LeRobotFolder(strange), 0) as episode:
         assert episode.info.simulation is None
         for name in arm_joints:
-            np.testing.assert_array_equal(episode.joint_position[name], known.joint_position[name])
+            np.testing.assert_array_equal(episode.motion.joint_position[name], known.motion.joint_position[name])
         assert (episode.info.instruction, episode.verdict) == (known.info.instruction, known.verdict)
         assert list(episode.videos) == list(known.videos)
     (source,) = find_episodes([strange])
@@ -239,4 +239,4 @@ def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
     assert (imported.num_new, "demorec/robots" in imported.left_out) == (4, True)
     with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1) as played:
         assert played.info.simulation is None
-        assert 'xyz="0.4 0 0"' in str(played.robot_description)
+        assert 'xyz="0.4 0 0"' in str(played.data.description())

@@ -22,10 +22,10 @@ def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
         times = [frame.time_ns - given.frames[0].time_ns for frame in given.frames]
         assert episode.time_ns.tolist() == times
         assert set(episode.curves) == {"observation.state", "action", "observation.force"}
-        assert set(episode.joint_position) == {"shoulder", "elbow"}
+        assert set(episode.motion.joint_position) == {"shoulder", "elbow"}
         expected = [float(frame.samples["observation.state"].vector[1]) for frame in given.frames]
-        assert episode.joint_position["elbow"].tolist() == expected
-        shown = [time_ns for time_ns, _, _ in episode.videos["wrist"].packets()]
+        assert episode.motion.joint_position["elbow"].tolist() == expected
+        shown = [time_ns for time_ns, _, _ in episode.packets("wrist")]
         assert shown == times[1::2]  # each with the first frame that holds it
 
 

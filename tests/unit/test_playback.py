@@ -215,7 +215,7 @@ def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> 
     with first.open() as a, second.open() as b:
         result = differences(a, b)
         expected = np.max(
-            [np.abs(a.joint_position[name][:12] - b.joint_position[name]) for name in a.joint_position], 0
+            [np.abs(joint[:12] - b.motion.joint_position[name]) for name, joint in a.motion.joint_position.items()], 0
         )
     assert len(result["distance"].time_ns) == 12  # as long as both last
     assert expected.min() > 0.001

@@ -40,7 +40,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> None:
     with open_dataset_episode(LeRobotFolder(dataset), 0) as episode:
         assert episode.info.simulation is not None
-        drawn = episode.object_poses["red_cube"]
+        drawn = episode.motion.object_poses["red_cube"]
     assert np.ptp(recorded[:, 2]) > 0.1  # lifted
     assert drawn.shape == recorded.shape
     np.testing.assert_allclose(drawn[:, :3], recorded[:, :3], atol=2e-3)
@@ -53,7 +53,7 @@ def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path
     export(SAMPLE, tmp_path / "cubes", privileged=True)
     with open_dataset_episode(LeRobotFolder(tmp_path / "cubes"), 0) as episode:
         assert episode.info.simulation is not None
-        np.testing.assert_allclose(episode.object_poses["red_cube"], recorded, atol=1e-6)
+        np.testing.assert_allclose(episode.motion.object_poses["red_cube"], recorded, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -76,10 +76,10 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
     export(run, tmp_path / "d", depth=True)
     with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 1) as episode:  # the second in its file
         assert episode.info.simulation is not None
-        times, images = zip(*episode.depth["front"](), strict=True)
+        times, images = zip(*episode.distances("front"), strict=True)
         shown = np.array(images)
         assert list(times) == episode.time_ns.tolist()
-        packets = list(episode.videos["front"].packets())
+        packets = list(episode.packets("front"))
     with Recording(run / "episodes" / "episode_000001.mcap") as recording:
         measured = np.array(list(recording.depth("front")))
     assert shown.shape == measured.shape
@@ -106,7 +106,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     info.write_text(json.dumps(written))
     with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
         assert episode.info.simulation is not None
-        _, shown = list(episode.depth["front"]())[2]
+        _, shown = list(episode.distances("front"))[2]
     with Recording(tmp_path / "e.mcap") as recording:
         measured = list(recording.depth("front"))[2]
     low, high = np.log(3.51), np.log(13.5)
@@ -136,6 +136,6 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
     with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
         assert episode.info.simulation is not None
         with pytest.raises(ExportError, match=f"it has {width}x{height} pixels, and meta/info.json says 9x8"):
-            list(episode.depth["front"]())
+            list(episode.distances("front"))
         with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json says av1"):
-            list(episode.videos["front"].packets())
+            list(episode.packets("front"))

@@ -23,9 +23,11 @@ from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Event, Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
+from demorec.episode.protocol import SceneMotion
 from demorec.episode.roles import Roles
 from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.streams import frame_times
+from demorec.mcap.transforms import measured_motion
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, make_encoder, settings_of_coded
 
 _SUCCESS = "next.success"
@@ -179,6 +181,26 @@ class DatasetRecording:
             images={name: np.arange(lead, lead + self.num_frames) for name, lead in leads.items()},
             image_stamps={name: times[begin - lead :] for name, lead in leads.items()},
         )
+
+    def motion(self) -> SceneMotion:
+        """The motion of the joints that are known."""
+        return measured_motion(self.info, self.table())
+
+    def description(self, body: str = "") -> str:
+        """URDF of the robot; "" if unknown, and for bodies."""
+        return "" if body else self.info.urdf
+
+    def has_segmentation(self, camera: str) -> bool:
+        """Return False: datasets have no segmentation images."""
+        return False
+
+    def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
+        """No images, as of `has_segmentation`."""
+        return iter(())
+
+    def segment_names(self) -> Mapping[int, str]:
+        """No names, as of `has_segmentation`."""
+        return {}
 
     def _lead(self, camera: str) -> int:
         """How many images of a camera come before the first frame: what that is decoded from."""

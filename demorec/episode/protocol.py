@@ -2,16 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.core.geometry import Array
 from demorec.episode.episode import Event, Outcome, Table
 from demorec.episode.info import EpisodeInfo
-from demorec.mcap.video import Rgb, VideoPacket, VideoSettings
+
+if TYPE_CHECKING:
+    from demorec.mcap.video import Rgb, VideoPacket, VideoSettings
+
+Box = tuple[int, str, tuple[float, float, float, float]]
+"""Frame, name, and x, y, width and height of what a camera sees, pixels."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SceneMotion:
+    """The motion of a robot and of what is around it, over T frames; unknown parts are empty.
+
+    Attributes:
+        joint_position: Joint of the URDF -> (T,) rad or m.
+        base_from_tcp: (T, 7), None if unknown.
+        object_poses: Name -> (T, 7), world_from_object.
+        end_poses: Name -> (7,) pose of an object at the end, for sources that may not know its path.
+        world_from_camera: Name -> (T, 7).
+    """
+
+    joint_position: Mapping[str, Array] = field(default_factory=dict)
+    base_from_tcp: Array | None = None
+    object_poses: Mapping[str, Array] = field(default_factory=dict)
+    end_poses: Mapping[str, Array] = field(default_factory=dict)
+    world_from_camera: Mapping[str, Array] = field(default_factory=dict)
 
 
 class Episode(Protocol):
@@ -61,6 +87,12 @@ class Episode(Protocol):
     def table(self) -> Table:
         """Read the features of every frame, and which images the frames show."""
 
+    def motion(self) -> SceneMotion:
+        """Read the motion of the robot, and of what is around it."""
+
+    def description(self, body: str = "") -> str:
+        """Read the URDF of the robot, or of a body; "" if unknown."""
+
     def images(self, camera: str) -> Iterator[Rgb]:
         """Yield the decoded images of a camera in order, (H, W, 3) uint8 RGB."""
 
@@ -75,3 +107,15 @@ class Episode(Protocol):
 
     def distances(self, camera: str) -> Iterator[NDArray[Any]]:
         """Yield the images of a depth camera in order, (H, W) uint16 millimetres or float32 metres."""
+
+    def has_segmentation(self, camera: str) -> bool:
+        """Return whether there are segmentation images of a camera."""
+
+    def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
+        """Yield the segmentation images of a camera in order, (H, W) int32."""
+
+    def segment_names(self) -> Mapping[int, str]:
+        """Read the names of the segments: number -> name."""
+
+    def boxes(self, camera: str) -> Iterator[Box]:
+        """Yield boxes around what a camera sees, frame by frame."""
