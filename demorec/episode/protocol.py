@@ -18,12 +18,12 @@ if TYPE_CHECKING:
     from demorec.mcap.video import Rgb, VideoPacket, VideoSettings
 
 Box = tuple[int, str, tuple[float, float, float, float]]
-"""Frame, name, and x, y, width and height of what a camera sees, pixels."""
+"""Frame, name, and x, y, width and height in pixels, of a thing in a camera's image."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneMotion:
-    """The motion of a robot and of what is around it, over T frames; unknown parts are empty.
+    """The motion of a robot, its scene and its cameras over T frames; unknown parts are empty.
 
     Attributes:
         joint_position: Joint of the URDF -> (T,) rad or m.
@@ -41,7 +41,7 @@ class SceneMotion:
 
 
 class Episode(Protocol):
-    """An episode that can be read, whoever recorded it; what is not known is absent.
+    """An open episode of any source; unknown parts are absent.
 
     Attributes:
         path: File, or folder of the dataset.
@@ -88,7 +88,7 @@ class Episode(Protocol):
         """Read the features of every frame, and which images the frames show."""
 
     def motion(self) -> SceneMotion:
-        """Read the motion of the robot, and of what is around it."""
+        """Read the motion of the robot, its scene and its cameras."""
 
     def description(self, body: str = "") -> str:
         """Read the URDF of the robot, or of a body; "" if unknown."""
@@ -118,4 +118,4 @@ class Episode(Protocol):
         """Read the names of the segments: number -> name."""
 
     def boxes(self, camera: str) -> Iterator[Box]:
-        """Yield boxes around what a camera sees, frame by frame."""
+        """Yield the boxes in a camera's images, frame by frame."""

@@ -22,10 +22,10 @@ _FRUSTUM_ON_ROBOT = 0.04
 
 
 def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """Every camera with what it saw; the coded images are passed on as they are."""
+    """Every camera with its images; encoded images are passed on unchanged."""
     if episode.scene is not None:
         _log_calibrations(recording, paths, episode, episode.scene)
-        _log_segmentations(recording, paths, episode, episode.scene)
+        _log_segmentations(recording, paths, episode)
     for name in episode.cameras:
         if name in episode.videos:
             _send_video(recording, paths.camera(name), episode, name)
@@ -53,7 +53,7 @@ def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: Play
 
 
 def _send_video(recording: rr.RecordingStream, entity: str, episode: Playback, camera: str) -> None:
-    """Coded images as they are, each at its time."""
+    """Encoded images, unchanged, each at its time."""
     codec = episode.data.video_settings(camera).codec
     if codec in _CODECS:
         recording.log(entity, rr.VideoStream(codec=_CODECS[codec]), static=True)
@@ -86,16 +86,14 @@ def _send_images(
         recording.send_columns(entity, indexes(np.array([time_ns for time_ns, _ in batch]), frame_times), columns)
 
 
-def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene) -> None:
-    """Segments by small numbers, the smallest of theirs (the background) 0, and what the numbers mean."""
+def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
+    """Segments under small numbers, 0 for the background, and the numbers' names."""
     segment_names = episode.data.segment_names()
     known = np.array(sorted(segment_names))
-    for camera in scene.cameras:
-        if not episode.data.has_segmentation(camera.name):
-            continue
-        images = zip(episode.time_ns.tolist(), episode.data.segmentation(camera.name), strict=False)
+    for camera in filter(episode.data.has_segmentation, episode.data.cameras):
+        images = zip(episode.time_ns.tolist(), episode.data.segmentation(camera), strict=False)
         numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in images)
-        entity = paths.camera(camera.name, "/segmentation")
+        entity = paths.camera(camera, "/segmentation")
         _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
     if segment_names:
         names = {number: segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}

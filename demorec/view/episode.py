@@ -1,4 +1,4 @@
-"""An episode as playback shows it: what its source knows, its motion, and numbers over time as curves."""
+"""An episode as playback shows it: images, motion, and numbers over time as curves."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Playback:
 
     @property
     def world_from_base(self) -> Pose:
-        """Where the robot stands; at the origin where nobody knows."""
+        """Pose of the robot's base; the origin if unknown."""
         return Pose() if self.scene is None else self.scene.robot.world_from_base
 
     @cached_property

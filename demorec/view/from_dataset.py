@@ -1,9 +1,9 @@
-"""Episodes out of exported datasets: numbers from the data files, the scene from demorec's own tables beside them.
+"""Episodes of exported datasets: numbers from the data files, the scene from demorec's own tables.
 
-A dataset without environment state does not carry the way of objects: what the hand holds moves with the hand. Known
-are every object's pose at the start and at the end, the gripper's pose and opening, and what was asked of it. So an
-object stands at its start until fingers that are told to close stop around it, then moves with the hand, and when it is
-let go for the last time it is at its end. A push, a fall or a slip between the fingers is not in the data.
+A dataset without environment state has no trajectories of objects. It has every object's first and last pose, the
+gripper's pose and opening, and the gripper's target. So an object stays at its first pose until closing fingers stop
+around it, then moves with the hand, and takes its last pose when it is released for the last time. A push, a fall or a
+slip between the fingers is not in the data.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ class ShownEpisode(DatasetRecording):
 
     @cached_property
     def info(self) -> EpisodeInfo:
-        """As of `DatasetRecording`, with that arm."""
+        """The description of `DatasetRecording`, with that arm."""
         info, robot = super().info, self.robot
         return info if info.urdf or robot is None else with_robot(info, robot, self.dataset.roles)
 
@@ -207,7 +207,7 @@ def _pose_row(values: Any) -> Array:
     """(7,) position and quaternion of a table; ValueError for others."""
     pose = np.array(values, dtype=np.float64)
     if pose.shape != (7,) or not np.isfinite(pose).all():
-        raise ValueError(f"{str(values)[:40]} is no pose")
+        raise ValueError(f"{str(values)[:40]} is not a pose")
     return pose
 
 
@@ -234,7 +234,7 @@ _STANDS_STILL = 0.015
 _SNAPS_SHUT = 0.06
 """Speed of the opening above which they have lost it, m/s; between the two it gives way."""
 _WITHIN_REACH = 0.02
-"""How far from the TCP the surface of what is held may be, metres."""
+"""Maximum distance of a held object's surface from the TCP, metres."""
 
 
 def held(opening: Array, target: Array, fps: int) -> NDArray[np.bool_]:
@@ -242,7 +242,7 @@ def held(opening: Array, target: Array, fps: int) -> NDArray[np.bool_]:
 
     Args:
         opening: (T,) measured, metres.
-        target: (T,) what was asked for, metres.
+        target: (T,) target of the opening, metres.
         fps: Frames per second.
     """
     speed = fps * np.abs(np.diff(opening, prepend=opening[:1]))

@@ -182,14 +182,15 @@ def _eye(episode: Playback) -> rrb.EyeControls3D | None:
 def _camera_views(episode: Playback, paths: Paths) -> list[rrb.View | rrb.Container]:
     views: list[rrb.View | rrb.Container] = []
     for name in episode.cameras:
-        boxes = [paths.camera(name, "/boxes")] if any(episode.data.boxes(name)) else []
+        is_recorded = name in episode.data.cameras
+        boxes = [paths.camera(name, "/boxes")] if is_recorded and any(episode.data.boxes(name)) else []
         tabs: list[rrb.View] = []
         if name in episode.videos:
             contents = ["$origin", *boxes]
             tabs.append(rrb.Spatial2DView(origin=paths.camera(name), contents=contents, name=f"{name} camera"))
         if name in episode.depth:
             tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/depth"), name=f"{name} depth"))
-        if name in episode.data.cameras and episode.data.has_segmentation(name):
+        if is_recorded and episode.data.has_segmentation(name):
             tabs.append(rrb.Spatial2DView(origin=paths.camera(name, "/segmentation"), name=f"{name} segments"))
         if tabs:
             views.append(tabs[0] if len(tabs) == 1 else rrb.Tabs(*tabs, active_tab=0))

@@ -45,7 +45,7 @@ def log_episode(
     label: str = "",
     tint: Rgba | None = None,
 ) -> None:
-    """Send all of an episode below `root`; `label` goes before the names of its curves, `tint` colours its robot.
+    """Send all of an episode below `root`; `label` is a prefix of its curves' names, `tint` colours its robot.
 
     Raises:
         DemorecError: The source is damaged, or a model is neither installed nor recorded.
@@ -80,7 +80,7 @@ def application_id(episode: Playback) -> str:
 
 
 def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """The gripper's path: one piece a frame, so that a view can show what lies behind; coloured by phase."""
+    """The gripper's path: one piece per frame, so that a view can show the past; coloured by phase."""
     if episode.num_frames < 2 or episode.motion.base_from_tcp is None:
         return
     points = episode.world_from_base.apply(episode.motion.base_from_tcp[:, :3])
@@ -101,7 +101,7 @@ def log_curves(
     *,
     is_second: bool = False,
 ) -> None:
-    """All plots; `label` goes before the names of the curves, a second episode's have other colours."""
+    """All plots; `label` is a prefix of the curves' names, a second episode has other colours."""
     for name, curves in episode.curves.items():
         entity = paths.curves(name)
         lines = rr.SeriesLines(
@@ -118,7 +118,7 @@ def log_curves(
 
 
 def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> list[str]:
-    """What a legend lists: curves of one name share a line, since it has room for eight."""
+    """Names for the legend: curves of one name share a line, since it has room for eight."""
     short = [curve.removeprefix("panda_") for curve in curves.names]
     if name == "target":
         short = ["target"] * len(short)
@@ -176,7 +176,7 @@ def log_events(recording: rr.RecordingStream, paths: Paths, episode: Playback) -
 
 
 def log_words(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """The page of what holds, written again whenever something changes."""
+    """The page of present statements, written again at each change."""
     holds: dict[str, str] = {}
     frames, pages = [], []
     shown = sorted((item for item in episode.statements if item[1] in _HEADINGS), key=lambda item: item[0])
@@ -222,7 +222,7 @@ def entry(episode: Playback) -> str:
 
 
 def properties(episode: Playback) -> dict[str, str | int | float | bool]:
-    """What the viewer lists beside the recording's name."""
+    """Properties that the viewer lists next to the recording's name."""
     info, outcome = episode.info, episode.data.outcome
     values: dict[str, str | int | float | bool] = {
         "instruction": info.instruction,
@@ -272,7 +272,7 @@ def _checks(outcome: Outcome) -> list[str]:
 
 
 _ORANGE = (1.0, 0.62, 0.25, 0.6)
-"""Translucent, so that an episode that lies exactly where the other one does hides nothing of it."""
+"""Translucent, so that an episode in exactly the same place hides nothing of the other one."""
 A, B = Paths("/a"), Paths("/b")
 DIFFERENCES = "/differences"
 
@@ -295,8 +295,8 @@ def log_comparison(recording: rr.RecordingStream, a: Playback, b: Playback) -> N
     """
     if a.scene is None or b.scene is None:
         raise ConfigError(
-            "Only simulated episodes can be laid over each other: of others nobody knows that their robots stand "
-            "alike. View them without --compare."
+            "Only simulated episodes can be compared: the place of other robots is unknown. View them without "
+            "--compare."
         )
     if [*a.motion.joint_position] != [*b.motion.joint_position]:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""What a path holds: one recording, the episodes of a run, or those of an exported dataset."""
+"""The episodes of a path: one recording, a run, or an exported dataset."""
 
 from __future__ import annotations
 

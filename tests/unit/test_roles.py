@@ -177,7 +177,10 @@ def test_playback_shows_the_state_first(tmp_path: Path) -> None:
     root = write_convention(tmp_path / "d", convention)
     with find_episodes([root])[0].open() as episode:
         assert [*episode.curves] == ["state", "actions", "a_sensor", "zoo"]
-        assert {name: role for name, role in episode.roles.of.items() if role} == {"state": "state", "actions": "action"}
+        assert {name: role for name, role in episode.roles.of.items() if role} == {
+            "state": "state",
+            "actions": "action",
+        }
     with find_episodes([root], named=NamedRoles(state=("zoo",), action=("state",)))[0].open() as episode:
         assert [*episode.curves][:2] == ["zoo", "state"]
 
