@@ -115,10 +115,10 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
         Recording(reference.folder / "episodes" / "episode_000001.mcap") as recording,
         open_dataset_episode(LeRobotFolder(tmp_path / "few"), 1) as shown,
     ):
-        assert shown.base_from_tcp is not None
+        assert shown.motion.base_from_tcp is not None
         recorded = recording.trajectory().base_from_tcp
         # The simulator's pose against that of the joints, which the dataset has as float32.
-        assert np.allclose(shown.base_from_tcp[:, :3], recorded[:, :3], atol=1e-5)
+        assert np.allclose(shown.motion.base_from_tcp[:, :3], recorded[:, :3], atol=1e-5)
         assert "velocity" not in shown.curves
         assert tuple(shown.videos) == ("wrist",)
 
