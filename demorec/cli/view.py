@@ -33,8 +33,10 @@ from demorec.runs.find import expect
 if TYPE_CHECKING:
     from demorec.view.sources import PlaybackSource
 
-_MOST, _MOST_REASONS = 50, 10
-"""How many episodes are shown unless --episodes asks for more, and of how many of --rank the reasons are shown."""
+_MOST = 50
+"""Maximum number of episodes to show unless --episodes asks for more."""
+_MOST_REASONS = 10
+"""Maximum number of episodes of --rank whose reasons are printed."""
 
 
 @dataclass(frozen=True, kw_only=True)

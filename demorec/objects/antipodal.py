@@ -18,7 +18,8 @@ from demorec.core.geometry import Array
 from demorec.episode.mesh import SolidMesh, decode_mesh
 from demorec.robots.robot import Gripper
 
-CANDIDATES, CLOUD = 300, 3000
+CANDIDATES = 300
+CLOUD = 3000
 KEPT = 40
 """Grasps, the best of all."""
 PAD = 0.010

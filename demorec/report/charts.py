@@ -10,8 +10,10 @@ from numpy.typing import NDArray
 
 from demorec.report.content import ReportedEpisode
 
-WIDTH, HEIGHT = 220, 70
-"""Of a chart without its labels, in units of its SVG."""
+WIDTH = 220
+"""Width of a chart without its labels, in units of its SVG."""
+HEIGHT = 70
+"""Height of the same."""
 _BINS = 48
 
 

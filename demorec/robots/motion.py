@@ -18,13 +18,19 @@ from demorec.robots.kinematics import WHOLE_POSE, ArmKinematics
 PEAK_VELOCITY = 1.875
 PEAK_ACCELERATION = 5.774
 
-LINEAR_ACCELERATION, ANGULAR_VELOCITY, ANGULAR_ACCELERATION = 1.5, 1.5, 6.0
-"""Of the TCP at most, m/s^2, rad/s, rad/s^2."""
+LINEAR_ACCELERATION = 1.5
+"""Maximum of the TCP, m/s^2."""
+ANGULAR_VELOCITY = 1.5
+"""Maximum of the TCP, rad/s."""
+ANGULAR_ACCELERATION = 6.0
+"""Maximum of the TCP, rad/s^2."""
 MIN_SECONDS = 0.2
 """Of the shortest motion."""
-_ROUNDS, _ROUNDS_WITH_FREEDOM = 5, 20
-"""How often a motion is slowed down at most. Where a joint of an arm of few joints meets its limit, the others take
-over from one step to the next, and at half the speed the acceleration of such a kink is half, not a quarter."""
+_ROUNDS = 5
+"""Maximum number of times that a motion is slowed down."""
+_ROUNDS_WITH_FREEDOM = 20
+"""The same of an arm of few joints: where a joint meets its limit, the others take over from one step to the next, and
+at half the speed the acceleration of such a kink is half, not a quarter."""
 _LONGEST_S = 60.0
 """Of a motion; a longer one leads through a jump of the joints, which is none the smaller for it, round by round."""
 

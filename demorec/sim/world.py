@@ -25,8 +25,10 @@ from demorec.sim.sensors import SENSORS
 
 SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""
-MAX_PRESS_FORCE, MAX_PRESS_DEPTH = 100.0, 1e-3
-"""N and metres: where a link of the robot presses on an object harder, or sinks in deeper, no real hand would do it."""
+MAX_PRESS_FORCE = 100.0
+"""N; no real hand presses on an object harder."""
+MAX_PRESS_DEPTH = 1e-3
+"""Metres; no link of a real hand sinks in deeper."""
 HULL_MARGIN = 1e-3
 """Metres by which Bullet's hull of a mesh stands out from it; boxes and cylinders have their margin inside."""
 

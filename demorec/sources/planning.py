@@ -32,8 +32,10 @@ from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, NoRowsErr
 from demorec.sources.streams import Text, read_streams
 from demorec.sources.words import task_in_name
 
-_SHOWN, _MOST_LISTED = 40, 5
-"""Characters of a marker, and markers, in an error."""
+_SHOWN = 40
+"""Characters of a marker in an error."""
+_MOST_LISTED = 5
+"""Maximum number of markers in an error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

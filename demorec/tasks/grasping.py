@@ -23,8 +23,10 @@ _GAP = 0.005
 """Air between the hand and what it shall not touch, metres."""
 _COST_OF_TURNING = 0.1
 """Of a radian that the hand turns, in the unit of `demorec.objects.antipodal.Grasp.cost`."""
-ABOVE_M, ABOVE_RAD = 0.01, 0.35
-"""How far the hand may be beside where it is going to be lowered to, so that it need not rise and come again."""
+ABOVE_M = 0.01
+"""Maximum distance of the hand from above its grasp at which it need not rise and come again."""
+ABOVE_RAD = 0.35
+"""Maximum angle between the two."""
 
 
 def hand_down(position: Sequence[float] | Array, yaw: float) -> Pose:

@@ -23,8 +23,10 @@ from demorec.tasks.success import placement_checks, resting_half_height
 
 TAKE_OVER = "take_over"
 """Phase in which the arm, stopped, is brought to where a script can begin."""
-_STOP_SECONDS, _STOPPED = 0.3, 0.05
-"""The arm is held for so long, or until no joint is faster (rad/s)."""
+_STOP_SECONDS = 0.3
+"""Maximum time for which the arm is held."""
+_STOPPED = 0.05
+"""rad/s; the arm is held until no joint is faster."""
 _CLEARANCE = 0.03
 """Metres of air between the finger tips and everything that lies about, above which the hand moves where it wants."""
 _HEIGHTS = (0.16, 0.12, 0.08, _CLEARANCE)

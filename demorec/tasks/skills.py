@@ -33,14 +33,20 @@ from demorec.tasks.script import Behaviour, Step, steady_width
 from demorec.tasks.success import goal_pose, on_support, placement_checks, rest_checks
 
 MAX_TRIES = 3
-FREE_SPEED, LIFT_SPEED, TOUCH_DOWN_SPEED = 0.6, 0.3, 0.08
+FREE_SPEED = 0.6
+LIFT_SPEED = 0.3
+TOUCH_DOWN_SPEED = 0.08
 """Peak speeds of the TCP, m/s."""
 MOST_BELOW_LINE = 0.02
 """Metres (of an arm of task_scale 1) that the TCP may come below the lower end of a line where the arm cannot follow it
 and goes joint by joint."""
-SETTLE_TOLERANCE, SETTLE_SECONDS = 0.03, 0.1
-"""Joint error, rad, at which a motion counts as finished; waited for at most so long."""
-ARRIVAL_TOLERANCE, ARRIVAL_SECONDS = 0.006, 0.34
+SETTLE_TOLERANCE = 0.03
+"""Joint error, rad, at which a motion counts as finished."""
+SETTLE_SECONDS = 0.1
+"""Maximum time to wait for that."""
+ARRIVAL_SECONDS = 0.34
+"""The same after a free motion."""
+ARRIVAL_TOLERANCE = 0.006
 """The same after a free motion: the expert goes on only where it wanted to be. If it went on while exploration noise
 still held the arm a centimetre off, a policy would learn that a centimetre off is good enough."""
 LOST_WIDTH = 0.012

@@ -16,7 +16,8 @@ from demorec.view.paths import Paths, indexes, log_pose, send_poses
 from demorec.view.style import FRUSTUM, segment_colors
 
 _CODECS = {"h264": rr.VideoCodec.H264, "h265": rr.VideoCodec.H265, "av1": rr.VideoCodec.AV1}
-_PACKETS_AT_ONCE, _IMAGES_AT_ONCE = 256, 64
+_PACKETS_AT_ONCE = 256
+_IMAGES_AT_ONCE = 64
 _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 

@@ -32,7 +32,9 @@ MAX_TRIANGLES = 2500
 """Of one mesh file."""
 _CREASE = np.radians(35.0)
 """Edges sharper than this stay sharp when a surface is shaded."""
-_ROD_RADIUS, _SHORTEST_ROD = 0.015, 1e-3
+_ROD_RADIUS = 0.015
+"""Metres."""
+_SHORTEST_ROD = 1e-3
 """Metres."""
 _CACHE_VERSION = b"3"
 _ARRAYS = ("vertices", "normals", "triangles", "colors")

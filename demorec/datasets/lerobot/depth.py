@@ -23,9 +23,12 @@ from demorec.core.geometry import Array
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.stats import PixelHistogram
 
-_NEAREST, _FARTHEST, _SHIFT = 0.01, 10.0, 3.5
+_NEAREST = 0.01
+_FARTHEST = 10.0
+_SHIFT = 3.5
 LARGEST_CODE = 4095
-_GOP, _CRF = 2, 30
+_GOP = 2
+_CRF = 30
 _PARAMETERS = "lossless=1"
 
 

@@ -97,8 +97,10 @@ def _place(observation: Observation) -> Array:
     return np.array([*observation.base_from_tcp.position, observation.gripper_width])
 
 
-_STILL_METRES, _STILL_WIDTH = 0.005, 0.002
-"""A hand is stuck while its TCP stays within so much along each axis, and its opening within so much."""
+_STILL_METRES = 0.005
+"""Maximum range of a stuck hand's TCP along each axis."""
+_STILL_WIDTH = 0.002
+"""Maximum range of its opening, metres."""
 
 
 class Watch:

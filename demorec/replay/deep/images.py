@@ -28,9 +28,15 @@ from demorec.sim.recorded_states import RecordedStates
 
 _BLOCK = 8
 """Pixels a side: those of a transform in H.264."""
-_TIMES_IN_A_BLOCK, _LEVELS_IN_A_BLOCK = 2.0, 2.0
-_LEAST_SHARP, _MOST_SHARP = 0.84, 1.2
-_LEVELS_OF_THE_MEAN = 3.0
+_BLOCK_RATIO = 2.0
+"""Maximum difference of a block, as a multiple of the coder's own."""
+_BLOCK_LEVELS = 2.0
+"""Levels that a block may differ beyond that."""
+_MIN_SHARPNESS = 0.84
+_MAX_SHARPNESS = 1.2
+"""Sharpness of an image, relative to the coder's own."""
+_MAX_MEAN_LEVELS = 3.0
+"""Maximum difference of an image's mean colour."""
 
 
 def image_differences(
@@ -138,7 +144,7 @@ def _colours(
 def _beyond_coding(image: Rgb, own: Rgb, true: Rgb) -> str:
     """In what an image is farther from the true one than the coder's own, in words; "" in nothing."""
     off, coders = _blocks(image, true), _blocks(own, true)
-    allowed = _TIMES_IN_A_BLOCK * _around(coders) + _LEVELS_IN_A_BLOCK
+    allowed = _BLOCK_RATIO * _around(coders) + _BLOCK_LEVELS
     beyond = off > allowed
     if beyond.any():
         row, column = np.unravel_index(int(np.argmax(off - allowed)), off.shape)
@@ -146,10 +152,10 @@ def _beyond_coding(image: Rgb, own: Rgb, true: Rgb) -> str:
         levels = f"{off[row, column]:.0f} levels where {allowed[row, column]:.0f} are allowed"
         return f"shows something else in {int(beyond.sum())} of {beyond.size} blocks, at {place} by {levels}"
     sharpness = (_edges(image) + 0.1) / (_edges(own) + 0.1)  # 0.1: of an image without edges nothing is asked
-    if not _LEAST_SHARP <= sharpness <= _MOST_SHARP:
+    if not _MIN_SHARPNESS <= sharpness <= _MAX_SHARPNESS:
         return f"has {sharpness:.0%} of the sharpness that the coder leaves"
     mean = np.abs(image.mean(axis=(0, 1)) - own.mean(axis=(0, 1))).max()
-    return f"has another mean colour, by {mean:.1f} levels" if mean > _LEVELS_OF_THE_MEAN else ""
+    return f"has another mean colour, by {mean:.1f} levels" if mean > _MAX_MEAN_LEVELS else ""
 
 
 def _decoded(settings: VideoSettings, coded: Sequence[bytes]) -> Iterator[Rgb]:

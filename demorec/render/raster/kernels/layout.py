@@ -18,7 +18,9 @@ ROWS = 20
 BLOCK = LANES * ROWS
 
 # Attributes, as distances from a vertex' address.
-POS_X, POS_Y, POS_Z = 0, LANES, 2 * LANES
+POS_X = 0
+POS_Y = LANES
+POS_Z = 2 * LANES
 NORMAL_X, NORMAL_Y, NORMAL_Z = 3 * LANES, 4 * LANES, 5 * LANES
 TEX_U, TEX_V = 6 * LANES, 7 * LANES
 CLIP_X, CLIP_Y, CLIP_W = 8 * LANES, 9 * LANES, 10 * LANES  # homogeneous, +-w is the image's border
@@ -28,16 +30,28 @@ TO_LIGHT, UPWARD, HALFWAY = 14 * LANES, 15 * LANES, 16 * LANES  # normal times l
 SHADOW_X, SHADOW_Y, SHADOW_Z = 17 * LANES, 18 * LANES, 19 * LANES  # texels, texels, 0..1 (greater is nearer)
 
 # Columns of a face's int32 and float32 tables.
-FACE_FLAGS, FACE_TEXTURE, FACE_SEGMENT, FACE_GROUP = 0, 1, 2, 3
-SMOOTH, TEXTURED = 1, 2  # bits of FACE_FLAGS
-FACE_RED, FACE_GREEN, FACE_BLUE, FACE_SPECULAR = 0, 1, 2, 3
+FACE_FLAGS = 0
+FACE_TEXTURE = 1
+FACE_SEGMENT = 2
+FACE_GROUP = 3
+SMOOTH = 1  # a bit of FACE_FLAGS
+TEXTURED = 2  # the next bit
+FACE_RED = 0
+FACE_GREEN = 1
+FACE_BLUE = 2
+FACE_SPECULAR = 3
 
 # Columns of a record: what a triangle needs while it is shaded. Each quantity q is a plane over the image, as
 # value at the origin, step in x, step in y; all but the first, the inverse depth, are divided by depth, so that they
 # are planes at all.
-SHADOW_X_PLANE, SHADOW_Y_PLANE, SHADOW_Z_PLANE = 3, 6, 9
-TO_LIGHT_PLANE, UPWARD_PLANE, HALFWAY_PLANE = 12, 15, 18
-TEX_U_PLANE, TEX_V_PLANE = 21, 24
+SHADOW_X_PLANE = 3
+SHADOW_Y_PLANE = 6
+SHADOW_Z_PLANE = 9
+TO_LIGHT_PLANE = 12
+UPWARD_PLANE = 15
+HALFWAY_PLANE = 18
+TEX_U_PLANE = 21
+TEX_V_PLANE = 24
 TEXEL_DENSITY = 27  # (texture widths / sample)^2 at inverse depth 1
 RECORD = 28
 
@@ -51,7 +65,11 @@ AMBIENT, AMBIENT_UP, DIFFUSE, IN_SHADOW, LIGHT_RED, LIGHT_GREEN, LIGHT_BLUE = ra
 LIGHT_SIZE = 7
 
 # Columns of the sky's table: ray = origin + x * step_x + y * step_y (world axes), colours at horizon and zenith.
-SKY_ORIGIN, SKY_STEP_X, SKY_STEP_Y, SKY_HORIZON, SKY_ZENITH = 0, 3, 6, 9, 12
+SKY_ORIGIN = 0
+SKY_STEP_X = 3
+SKY_STEP_Y = 6
+SKY_HORIZON = 9
+SKY_ZENITH = 12
 SKY_SIZE = 15
 
 # A pixel that stands still, with what its shading needs: ambient and direct colour, place in the shadow map.
