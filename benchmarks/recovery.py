@@ -22,7 +22,8 @@ from demorec.episode.episode import Action
 from demorec.learn.evaluate.statistics import Rate
 from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.sim.world import World
-from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.script import ExpertFailure
+from demorec.tasks.skills import Expert
 
 KINDS = ("script", "flailing", "moved")
 _FREE = 0.16
@@ -75,7 +76,7 @@ def outcome(world: World, episode: PreparedEpisode) -> str:
     try:
         for step in episode.task.resume(expert):
             world.apply(step.action)
-    except GaveUp as error:
+    except ExpertFailure as error:
         return f"{error.phase}: {error.reason}"
     return next((check.name for check in episode.task.evaluate(world) if not check.passed), "")
 

@@ -30,8 +30,8 @@ from demorec.render import Renderer
 from demorec.render.painter import Painter
 from demorec.sim.world import World
 from demorec.tasks.base import Task
-from demorec.tasks.script import Step
-from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.script import ExpertFailure, Step
+from demorec.tasks.skills import Expert
 
 
 class Agent(Protocol):
@@ -236,7 +236,7 @@ class ScriptAgent:
     def __init__(self, episode: PreparedEpisode) -> None:
         self._episode = episode
         self._expert: Expert | None = None
-        self._gave_up: GaveUp | None = None
+        self._gave_up: ExpertFailure | None = None
 
     @property
     def num_retries(self) -> int:
@@ -261,8 +261,8 @@ class ScriptAgent:
                 yield step
                 if name := expert.world.crushed():
                     expert.note("crush", f"pressed on {name} harder than a hand can", trouble=True)
-                    raise GaveUp(*expert.trouble)
-        except GaveUp as error:
+                    raise ExpertFailure(*expert.trouble)
+        except ExpertFailure as error:
             self._gave_up = error
             yield expert.step()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 
 import numpy as np
 
@@ -199,31 +199,36 @@ def places_of(body: Body, pose: Pose, wanted: Pose, *, hand: Pose, yaw_symmetry:
 
 
 def grasps_beside(
-    grasp: Pose, body: Body, pose: Pose, *, x: float, y: float, others: Iterable[tuple[Body, Pose]], robot: RobotSpec
-) -> list[Pose]:
-    """Where the open hand goes down beside a body, touching nothing: a grasp that misses.
+    grasps: Iterable[Pose],
+    body: Body,
+    pose: Pose,
+    *,
+    x: float,
+    y: float,
+    others: Collection[tuple[Body, Pose]],
+    robot: RobotSpec,
+) -> Iterator[Pose]:
+    """Yield poses of the open hand next to a body, where it touches nothing: grasps that miss.
 
     Args:
-        grasp: `world_from_tcp` of a grasp of it.
+        grasps: `world_from_tcp` of grasps of it.
         body, pose: What is missed, and its pose in the world.
         x, y: From the body's centre in the hand's frame, metres. x is made longer where the fingers would touch the
-            body. The side that it points to (for 0: forward) comes first in the result, then the other one; a side
-            where something else stands in the way is left out, so there may be none.
+            body. For each grasp the side that it points to (for 0: forward) comes first, then the other one; a side
+            where something else is in the way is left out, so there may be none.
         others: All the other bodies and their poses.
         robot: Whose hand it is.
     """
-    hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
-    distance = max(abs(x), half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
-    offset = robot.gripper.object_offset(2 * half_extent(body, pose, hand_y))
-    centre = np.array([*(pose.position - offset * hand_y)[:2], grasp.position[2]])
-    found = []
-    for side in (1.0, -1.0):
-        missed = Pose(
-            position=centre + side * math.copysign(distance, x) * hand_x + y * hand_y, quat_xyzw=grasp.quat_xyzw
-        )
-        if all(_is_clear(missed, other, at, robot) for other, at in others):
-            found.append(missed)
-    return found
+    for grasp in grasps:
+        hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
+        distance = max(abs(x), half_extent(body, pose, hand_x) + _FINGERS[0] + _GAP)
+        offset = robot.gripper.object_offset(2 * half_extent(body, pose, hand_y))
+        centre = np.array([*(pose.position - offset * hand_y)[:2], grasp.position[2]])
+        for side in (1.0, -1.0):
+            position = centre + side * math.copysign(distance, x) * hand_x + y * hand_y
+            missed = Pose(position=position, quat_xyzw=grasp.quat_xyzw)
+            if all(_is_clear(missed, other, at, robot) for other, at in others):
+                yield missed
 
 
 def _is_lower(body: Body, pose: Pose, height: float) -> bool:

@@ -17,8 +17,8 @@ from demorec.robots.motion import plan_joints
 from demorec.sim.world import World
 from demorec.tasks.grasping import hand_down, hand_yaw, is_above, nearest_first, symmetric_yaws
 from demorec.tasks.reach import JOINT_SPEED
-from demorec.tasks.script import Step
-from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.script import ExpertFailure, Step
+from demorec.tasks.skills import Expert
 from demorec.tasks.success import placement_checks, resting_half_height
 
 TAKE_OVER = "take_over"
@@ -43,7 +43,7 @@ def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
         goals: What shall be where in the end.
 
     Raises:
-        GaveUp: Something is out of reach, or several tries were not enough.
+        ExpertFailure: Something is out of reach, or several tries were not enough.
     """
     held = _held(expert)
     yield from _stop(expert, holding=bool(held))
@@ -60,7 +60,7 @@ def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
         if all(is_served(expert.world, goal) for goal in goals):
             return
     unserved = next(goal for goal in goals if not is_served(expert.world, goal))
-    raise GaveUp(expert.phase, f"unserved_{unserved.object}")
+    raise ExpertFailure(expert.phase, f"unserved_{unserved.object}")
 
 
 def _begun(expert: Expert, goals: Sequence[Goal]) -> Goal | None:
@@ -91,7 +91,7 @@ def _serve(expert: Expert, goal: Goal, *, is_begun: bool) -> Iterator[Step]:
     """Pick and place; once more from home where the arm stands so that no straight line leads on."""
     try:
         yield from expert.pick_and_place(goal, is_begun=is_begun)
-    except GaveUp as error:
+    except ExpertFailure as error:
         if error.reason != "unreachable":
             raise
         expert.phase = TAKE_OVER
@@ -143,7 +143,7 @@ def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[St
             break
     try:
         yield from expert.place(goal, is_begun=True)
-    except GaveUp:
+    except ExpertFailure:
         expert.phase = TAKE_OVER
 
 
@@ -177,7 +177,7 @@ def _rise(expert: Expert) -> Iterator[Step]:
                 continue
             try:
                 yield from expert.move(above, speed=0.3)
-            except GaveUp:
+            except ExpertFailure:
                 continue
             return
     yield from _go_home(expert)

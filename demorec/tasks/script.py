@@ -10,6 +10,14 @@ from demorec.episode.episode import Action, Event
 from demorec.sim.world import World
 
 
+class ExpertFailure(Exception):
+    """The expert cannot go on; ends the script with a failure."""
+
+    def __init__(self, phase: str, reason: str) -> None:
+        super().__init__(phase, reason)
+        self.phase, self.reason = phase, reason
+
+
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
     """How the expert does it in one episode; recorded as `EpisodeInfo.behaviour`.

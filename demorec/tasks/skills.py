@@ -29,7 +29,7 @@ from demorec.tasks.grasping import (
     symmetric_yaws,
 )
 from demorec.tasks.reach import ANY_YAW, DESCEND_SPEED, LEAST_ABOVE_GOAL, Reach, within
-from demorec.tasks.script import Behaviour, Step, steady_width
+from demorec.tasks.script import Behaviour, ExpertFailure, Step, steady_width
 from demorec.tasks.success import goal_pose, on_support, placement_checks, rest_checks
 
 MAX_TRIES = 3
@@ -41,12 +41,10 @@ MOST_BELOW_LINE = 0.02
 """Metres (of an arm of task_scale 1) that the TCP may come below the lower end of a line where the arm cannot follow it
 and goes joint by joint."""
 SETTLE_TOLERANCE = 0.03
-"""Joint error, rad, at which a motion counts as finished."""
 SETTLE_SECONDS = 0.1
-"""Maximum time to wait for that."""
-ARRIVAL_SECONDS = 0.34
-"""The same after a free motion."""
+"""Joint error, rad, at which a motion counts as finished, and the maximum time to wait for it."""
 ARRIVAL_TOLERANCE = 0.006
+ARRIVAL_SECONDS = 0.34
 """The same after a free motion: the expert goes on only where it wanted to be. If it went on while exploration noise
 still held the arm a centimetre off, a policy would learn that a centimetre off is good enough."""
 LOST_WIDTH = 0.012
@@ -55,14 +53,6 @@ ROCKING_SECONDS = 0.5
 """How long what the hand has let go of may rock."""
 CARRIED_ABOVE_M = 0.04
 """As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
-
-
-class GaveUp(Exception):
-    """The expert cannot go on; ends the script with a failure."""
-
-    def __init__(self, phase: str, reason: str) -> None:
-        super().__init__(phase, reason)
-        self.phase, self.reason = phase, reason
 
 
 class Expert:
@@ -99,11 +89,11 @@ class Expert:
         """The gripper's full opening, metres."""
         return self.world.robot.gripper.open_width
 
-    def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> GaveUp:
+    def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> ExpertFailure:
         """Note what is wrong with the first of the poses that cannot be reached, and return what is to be raised."""
         why = self.reach.why_not(poses[0], self.joint_target) if poses else ""
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
-        return GaveUp(self.phase, "unreachable")
+        return ExpertFailure(self.phase, "unreachable")
 
     def note(self, name: str, message: str, *, trouble: bool = False) -> None:
         """Record an event with the next step; `trouble` also keeps it as the reason of a failure."""
@@ -131,7 +121,7 @@ class Expert:
         return self.reach.tcp(self.joint_target)
 
     def reaches(self, world_from_tcp: Pose) -> bool:
-        """Whether the arm can get there from where it is."""
+        """Whether the arm can get there at once."""
         return self.reach.at_once(world_from_tcp, self.joint_target)
 
     def first_reachable(self, grasps: Sequence[Pose], above_by: float, *, lift_by: float = 0.0) -> Pose | None:
@@ -171,13 +161,13 @@ class Expert:
             until: Stop as soon as this holds.
 
         Raises:
-            GaveUp: The arm cannot get there so.
+            ExpertFailure: The arm cannot get there so.
         """
         self._free, self._clear_height = free, clear_height
         may_sink = MOST_BELOW_LINE * self._scale if free and clear_height == -math.inf else None
         path = self._path(world_from_tcp, speed=speed, may_sink=may_sink)
         if path is None:
-            raise GaveUp(self.phase, "unreachable")
+            raise ExpertFailure(self.phase, "unreachable")
         for joint_target in path:
             self.joint_target = joint_target
             yield self.step()
@@ -216,7 +206,7 @@ class Expert:
             is_begun: As of `pick`, at the first try.
 
         Raises:
-            GaveUp: Out of reach, or three tries were not enough.
+            ExpertFailure: Out of reach, or three tries were not enough.
         """
         for attempt in range(MAX_TRIES):
             if attempt > 0:
@@ -229,24 +219,20 @@ class Expert:
             placed = yield from self.place(goal)
             if placed:
                 return
-        raise GaveUp(*self.trouble)
+        raise ExpertFailure(*self.trouble)
 
     def reachable_grasp(self, name: str, *, above_by: float, lift_by: float = 0.0) -> Pose:
         """`world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and so many metres higher.
 
         Raises:
-            GaveUp: Out of reach at every yaw.
+            ExpertFailure: Out of reach at every yaw.
         """
         found = None
         if self._missing:
             world, x, y = self.world, self.behaviour.miss_x, self.behaviour.miss_y
-            body, pose = world.body(name), world.pose(name)
-            beside = (
-                missed
-                for grasp in self.grasps(name)
-                for missed in grasps_beside(grasp, body, pose, x=x, y=y, others=self._others(name), robot=world.robot)
-            )
-            found = next(within(self.reaches, beside, up_to=above_by), None)
+            body, pose, others = world.body(name), world.pose(name), self._others(name)
+            missing = grasps_beside(self.grasps(name), body, pose, x=x, y=y, others=others, robot=world.robot)
+            found = next(within(self.reaches, missing, up_to=above_by), None)
             self._missing = self._has_missed = found is not None
         found = found or self.first_reachable(self.grasps(name), above_by, lift_by=lift_by)
         if found is not None:
@@ -259,7 +245,7 @@ class Expert:
         """`world_from_tcp` at a position, the hand down at the nearest yaw to which a straight line leads from here.
 
         Raises:
-            GaveUp: Out of reach at every yaw.
+            ExpertFailure: Out of reach at every yaw.
         """
         now = hand_yaw(self.tcp())
         places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
@@ -313,8 +299,7 @@ class Expert:
             goal: Of the object.
             is_begun: Somebody else has brought the hand here: only lower it if it is above the goal already.
         """
-        world = self.world
-        name = goal.object
+        world, name = self.world, goal.object
         self.phase = "transport"
         wanted = self._place_pose(goal)
         is_there = is_begun and is_above(self.tcp(), wanted, beside=CARRIED_ABOVE_M)
@@ -343,13 +328,13 @@ class Expert:
         yield from self.open_gripper(max_seconds=max(1.0, self._stroke_seconds))
         self.phase = "retreat"
         here = self.tcp_target()
-        least = raised(here, self._scale * 0.1)
         away = raised(here, self._scale * max(0.1, self.behaviour.approach_height))
         clear_height = float(here.position[2]) + 0.07 * self._scale
         try:
             yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
-        except GaveUp:  # so much is enough to be clear of what was put down
-            yield from self.move(least, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
+        except ExpertFailure:  # so much is enough to be clear of what was put down
+            away = raised(here, self._scale * 0.1)
+            yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
         for _ in range(round(ROCKING_SECONDS * world.fps)):  # holds still while it rocks
             if all(check.passed for check in rest_checks(world, name)):
@@ -392,7 +377,7 @@ class Expert:
         """`world_from_tcp` that puts the held object at its goal, with the offset in the hand compensated.
 
         Raises:
-            GaveUp: Out of reach at every allowed yaw.
+            ExpertFailure: Out of reach at every allowed yaw.
         """
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
         symmetry = 0 if keep_yaw else goal.yaw_symmetry or ANY_YAW

@@ -20,8 +20,8 @@ from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
 from demorec.tasks.grasping import hand_down, hand_yaw, raised, symmetric_yaws
 from demorec.tasks.placing import on_table, random_cube
 from demorec.tasks.sampling import Region, Sampler, wording
-from demorec.tasks.script import Step, steady_width
-from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.script import ExpertFailure, Step, steady_width
+from demorec.tasks.skills import Expert
 from demorec.tasks.success import placement_checks
 
 STARTS = Region(x=(0.40, 0.48), y=(-0.12, 0.12))
@@ -78,7 +78,7 @@ class PushToMark(Task):
         hands = (hand_down(behind, turned) for turned in symmetric_yaws(yaw, 2))
         hand = next((hand for hand in hands if expert.reaches(hand)), None)
         if hand is None:
-            raise GaveUp(expert.phase, "unreachable")
+            raise ExpertFailure(expert.phase, "unreachable")
         yield from expert.move(raised(hand, expert.behaviour.approach_height), speed=0.5, free=True)
         expert.phase = "descend"
         yield from expert.move(hand, speed=0.25)

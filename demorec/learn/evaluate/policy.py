@@ -18,7 +18,7 @@ from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedE
 from demorec.core.files import read_json_object
 from demorec.core.registry import is_allowed
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.episode.features import ActionKind
+from demorec.episode.features import IMAGE_PREFIX, ActionKind
 
 CONFIG_NAME, TRAIN_CONFIG_NAME = "config.json", "train_config.json"
 
@@ -46,6 +46,24 @@ def policy_config(checkpoint: Path) -> dict[str, Any]:
         raise ConfigError(
             f"{CONFIG_NAME} of the policy cannot be used ({describe_error(error)}): {checkpoint}"
         ) from error
+
+
+def policy_inputs(checkpoint: Path) -> dict[str, tuple[int, ...]]:
+    """Read the policy's inputs: name -> shape, three dimensions of an image. Raises ConfigError if that fails."""
+    plain = policy_config(checkpoint)
+    try:
+        inputs = {name: _shape(value["shape"]) for name, value in (plain.get("input_features") or {}).items()}
+        if any(len(shape) != 3 for name, shape in inputs.items() if name.startswith(IMAGE_PREFIX)):
+            raise ValueError("an image of other than three dimensions")
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise ConfigError(f"The inputs of the policy cannot be used ({describe_error(error)}): {checkpoint}") from error
+    return inputs
+
+
+def _shape(value: object) -> tuple[int, ...]:
+    if not isinstance(value, list) or not all(type(size) is int and size > 0 for size in value):
+        raise ValueError(f"a shape of {reprlib.repr(value)}")
+    return tuple(value)
 
 
 def policy_digest(checkpoint: Path) -> str:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import functools
 import json
-import reprlib
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
@@ -66,6 +65,7 @@ from demorec.learn.evaluate.policy import (
     find_checkpoint,
     policy_config,
     policy_digest,
+    policy_inputs,
     trained_action,
 )
 from demorec.learn.evaluate.statistics import Rate, factors_of
@@ -166,15 +166,8 @@ def settings_for(
     """
     checkpoint = find_checkpoint(policy)
     check_steps(checkpoint, allowed)
-    plain = policy_config(checkpoint)
-    try:
-        inputs = {name: _shape(value["shape"]) for name, value in (plain.get("input_features") or {}).items()}
-        images = {name.removeprefix(IMAGE_PREFIX): shape for name, shape in inputs.items()
-                    if name.startswith(IMAGE_PREFIX)}  # fmt: skip
-        if any(len(shape) != 3 for shape in images.values()):
-            raise ValueError("an image of other than three dimensions")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ConfigError(f"The inputs of the policy cannot be used ({describe_error(error)}): {checkpoint}") from error
+    plain, inputs = policy_config(checkpoint), policy_inputs(checkpoint)
+    images = {name.removeprefix(IMAGE_PREFIX): inputs[name] for name in inputs if name.startswith(IMAGE_PREFIX)}
     if images:
         (_, height, width), *_ = images.values()
         own = {camera_name(name): name for name in config.cameras}
@@ -200,12 +193,6 @@ def settings_for(
         state=_state_kind(inputs, ROBOTS.load(config.robot)),
         episode_length=episode_length,
     )
-
-
-def _shape(value: object) -> tuple[int, ...]:
-    if not isinstance(value, list) or not all(type(size) is int and size > 0 for size in value):
-        raise ValueError(f"a shape of {reprlib.repr(value)}")
-    return tuple(value)
 
 
 def _state_kind(inputs: Mapping[str, tuple[int, ...]], robot: RobotSpec) -> StateKind:

@@ -23,8 +23,8 @@ from demorec.loop.session import ActionNoise
 from demorec.mcap import open_simulated
 from demorec.sim.world import World
 from demorec.tasks.recovery import TAKE_OVER
-from demorec.tasks.script import Step
-from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.script import ExpertFailure, Step
+from demorec.tasks.skills import Expert
 from demorec.tasks.success import goal_pose
 
 TAKE_OVER_EVENT, HAND_BACK_EVENT, _MESSAGE = "take_over", "hand_back", "the expert takes over: "
@@ -127,7 +127,7 @@ class Turns:
         self._trouble = "", ""
         try:
             yield from self._env.episode.task.resume(expert)
-        except GaveUp as error:
+        except ExpertFailure as error:
             self._trouble = error.phase, error.reason
             yield expert.step()  # which carries the events that say why
             return

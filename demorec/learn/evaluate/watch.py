@@ -18,8 +18,8 @@ from demorec.gym_env import Situation
 from demorec.learn.evaluate import TakeOver
 from demorec.loop import PreparedEpisode, Session
 from demorec.sim.world import World
-from demorec.tasks.script import Behaviour, Step
-from demorec.tasks.skills import Expert, GaveUp
+from demorec.tasks.script import Behaviour, ExpertFailure, Step
+from demorec.tasks.skills import Expert
 
 _AHEAD_SECONDS = 1.0
 """How far ahead on the expert's way a policy may be from one frame to the next."""
@@ -88,7 +88,7 @@ def _steps(world: World, episode: PreparedEpisode, *, is_start: bool) -> Iterato
     expert = Expert(world, correcting_behaviour(episode, noise=False))
     try:
         yield from episode.task.script(expert) if is_start else episode.task.resume(expert)
-    except GaveUp:
+    except ExpertFailure:
         return
 
 
