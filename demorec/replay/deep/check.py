@@ -23,8 +23,6 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording, open_simulated
-from demorec.render import Renderer
-from demorec.render.painter import Painter
 from demorec.replay.deep.contents import Contents, RemakeDifference, coded_topics, content_differences
 from demorec.replay.deep.images import image_differences
 from demorec.replay.demonstration import ReplayOptions, open_demonstration
@@ -58,11 +56,10 @@ class DeepReport:
 
     @property
     def level(self) -> Literal["pass", "warn", "fail"]:
-        """Failed where something differs that versions and CPU do not explain; other encodings are warnings."""
-        differs = any(not difference.is_coding for difference in self.differences)
-        if (self.error or differs) and not self.versions:
-            return "fail"
-        return "warn" if self.versions or self.differences else "pass"
+        """Failed if it cannot be made again or differs, and neither versions nor the CPU explain it."""
+        if self.versions:
+            return "warn"
+        return "fail" if self.error or self.differences else "pass"
 
 
 _simulators = SimulatorCache()
@@ -91,8 +88,8 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             report = replace(report, versions=_unlike_here(info, allowed))
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
-            differences = tuple(_differences(recording, again, simulators))
-            if not report.is_derived and any(not d.is_coding and d.field != "image" for d in differences):
+            differences = tuple(_differences(recording, again))
+            if not report.is_derived and any(d.field != "image" for d in differences):
                 report = replace(report, replay=_replayed(recording, simulators, allowed))
             return replace(report, differences=differences)
     except DemorecError as error:
@@ -174,7 +171,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     info = with_simulation(recording.info, config_digest=digest(recording.info.simulated.config))
     RENDERERS.check_name(str(info.simulated.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
-    painter = _recorded_painter(info, renderer)
+    painter = None if renderer is None else view_painter(renderer, recorded_view(info), info.simulated.config)
     with EpisodeWriter(path, info, video=config_as(info.simulated.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
         if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
@@ -189,26 +186,14 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
         writer.finish(outcome)
 
 
-def _recorded_painter(info: EpisodeInfo, renderer: Renderer | None) -> Painter | None:
-    """Draws what the recording shows, from where its cameras really were; None without cameras."""
-    if renderer is None:
-        return None
-    return view_painter(renderer, recorded_view(info), info.simulated.config)
-
-
-def _differences(recording: Recording, again: Path, simulators: SimulatorCache) -> Iterator[RemakeDifference]:
+def _differences(recording: Recording, again: Path) -> Iterator[RemakeDifference]:
     """Ordered by the first frame, what belongs to no frame first."""
     found, made = Contents.of(recording.path), Contents.of(again)
     with open_simulated(again) as remade:
         if recording.is_recovered:
             made.cut_off(found)
         differences, images = content_differences(found, made, remade.info, recording.info.fps)
-        if images:
-            _, renderer = simulators.acquire(remade.info)
-            painter = _recorded_painter(remade.info, renderer)
-            assert painter is not None, "images were drawn"
-            cameras = coded_topics(remade.info)
-            differences += image_differences(found, made, remade, painter, cameras, images)
+        differences += image_differences(found, made, remade, coded_topics(remade.info), images)
     yield from sorted(differences, key=lambda difference: difference.frames[:1])
 
 

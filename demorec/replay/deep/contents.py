@@ -1,7 +1,7 @@
 """Two recordings of one episode compared byte by byte, and what differs taken apart into named fields.
 
 Recordings hold no clock, host or path, so that the same episode made again on the same type of machine has the same
-bytes in every message. Coded images that differ are left to `images`, which looks at what they show.
+bytes in every message. Encoded images that differ are left to `images`, which decodes them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,6 @@ class RemakeDifference:
         recorded, again: What is recorded and what comes out, at the first of these frames, in words; `again` is ""
             where `recorded` says it all.
         largest: Largest absolute difference over these frames; None of what is no number.
-        is_coding: Whether an image is coded otherwise, but shows the same within the coder's own error.
     """
 
     stream: str
@@ -56,7 +55,6 @@ class RemakeDifference:
     recorded: str
     again: str
     largest: float | None = None
-    is_coding: bool = False
 
     def __str__(self) -> str:
         where = f"{self.stream} {self.field}"
