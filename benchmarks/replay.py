@@ -24,7 +24,8 @@ from demorec.mcap import EpisodeWriter, Recording
 from demorec.render.painter import WarmRenderer
 from demorec.replay.demonstration import ReplayOptions, open_file
 from demorec.replay.drive import replay_all
-from demorec.replay.rerender import RerenderOptions, rerender
+from demorec.replay.options import RerenderOptions
+from demorec.replay.rerender import rerender
 
 
 def generate(path: Path, config: GenerateConfig, index: int, simulators: SimulatorCache) -> None:

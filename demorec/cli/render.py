@@ -3,27 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
 from demorec.cli.shared.progress import ProgressBar
-from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, check_option, check_seed
+from demorec.core.errors import ConfigError, check_option
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.registry import modules_of
 from demorec.core.targets import Target
+from demorec.replay.options import RerenderOptions
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 if TYPE_CHECKING:
     from demorec.render.painter import WarmRenderer
-    from demorec.replay.rerender import RerenderOptions, RerenderReport
+    from demorec.replay.rerender import RerenderReport
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,32 +43,8 @@ class Render:
     """Recordings, runs, or folders of recordings."""
     out: Target
     """Folder for the new recordings, or the name of one (.mcap)."""
-    cameras: tuple[str, ...] = ()
-    """Names from the recording or `demorec list cameras`, or my_package.my_module:MY_CAMERA (auto: as recorded)."""
-    width: int | None = None
-    """Image width in pixels (auto: as recorded)."""
-    height: int | None = None
-    """Image height in pixels (auto: as recorded)."""
-    renderer: str | None = None
-    """A name from `demorec list renderers` (auto: as recorded)."""
-    antialias: bool = True
-    """Smooth edges if the recording has them (raster only)."""
-    depth: bool = False
-    """Add depth images if the recording has none."""
-    segmentation: bool = False
-    """Add segmentation images if the recording has none."""
-    looks: int | None = None
-    """Seed of random light, colours and textures (auto: the recorded looks)."""
-    codec: Literal["h264", "av1", "jpeg"] | None = None
-    """Codec of the new images (auto: as recorded)."""
-    gop: int | None = None
-    """Frames from one keyframe to the next (auto: as recorded)."""
-    crf: int | None = None
-    """Constant rate factor, lower is better (auto: as recorded)."""
-    preset: str | None = None
-    """Encoder preset (auto: as recorded)."""
-    jpeg_quality: int | None = None
-    """Quality for --codec jpeg, 1 to 100, higher is better (auto: as recorded)."""
+    options: Annotated[RerenderOptions, arg(name="images")] = field(default_factory=RerenderOptions)
+    """Changes of the new images."""
     workers: int | None = None
     """Processes (auto: one per core)."""
     allow: Allow = ()
@@ -80,7 +56,8 @@ class Render:
         """Render and report."""
         if not self.paths:
             raise ConfigError("No path is given: name a recording or a run, e.g. demorec render recordings --out new.")
-        options = self._options()
+        self.options.validate()
+        allowed = (*allowed_modules(self.allow), *modules_of(self.options.cameras))
         jobs = _jobs(self.paths, self.out)
 
         check_option("workers", self.workers, 1, 1024)
@@ -88,7 +65,7 @@ class Render:
         reports: list[RerenderReport] = []
         try:
             with ProgressBar("rendering", total=len(jobs), at_once=workers) as bar:
-                for report in in_turn(partial(_draw, options, self.overwrite), jobs, workers):
+                for report in in_turn(partial(_draw, self.options, allowed, self.overwrite), jobs, workers):
                     bar.advance()
                     reports.append(report)
                     for camera, frame in report.differing.items():
@@ -106,34 +83,6 @@ class Render:
         if compared:
             say(f"{compared - differing} of {compared} unchanged cameras reproduce the recorded images bit-exactly.")
         return 1 if differing else 0
-
-    def _options(self) -> RerenderOptions:
-        from demorec.core.tables import RENDERERS
-        from demorec.replay.rerender import RerenderOptions
-
-        if self.renderer is not None:
-            RENDERERS.check_name(self.renderer)
-        check_seed("looks", self.looks)
-        check_option("width", self.width, 16, 8192, "pixels")
-        check_option("height", self.height, 16, 8192, "pixels")
-        changes = {
-            name: getattr(self, name)
-            for name in ("codec", "gop", "crf", "preset", "jpeg_quality")
-            if getattr(self, name) is not None
-        }
-        replace(VideoConfig(), **changes).validate()
-        return RerenderOptions(
-            cameras=self.cameras or None,
-            width=self.width,
-            height=self.height,
-            renderer=self.renderer,
-            antialias=None if self.antialias else False,
-            depth=self.depth or None,
-            segmentation=self.segmentation or None,
-            looks=self.looks,
-            video=changes,
-            allowed=(*allowed_modules(self.allow), *modules_of(self.cameras)),
-        )
 
 
 def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
@@ -153,10 +102,10 @@ def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
     return jobs
 
 
-def _draw(options: RerenderOptions, overwrite: bool, job: tuple[Path, Path]) -> RerenderReport:
+def _draw(options: RerenderOptions, allowed: Sequence[str], overwrite: bool, job: tuple[Path, Path]) -> RerenderReport:
     from demorec.replay.rerender import rerender
 
-    return rerender(*job, options, overwrite=overwrite, renderers=_renderers())
+    return rerender(*job, options, allowed=allowed, overwrite=overwrite, renderers=_renderers())
 
 
 @cache

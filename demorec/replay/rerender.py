@@ -6,7 +6,7 @@ looks the images come out again as they were before coding, so the coded packets
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -30,36 +30,10 @@ from demorec.mcap import EpisodeWriter, Recording, open_simulated
 from demorec.mcap.frames import frames_of
 from demorec.render import Renderer, RenderSetup
 from demorec.render.painter import Painter, WarmRenderer
+from demorec.replay.options import RerenderOptions
 from demorec.robots.assets import allow_models
 from demorec.sim.recorded_states import RecordedStates
 from demorec.tasks.vary import vary_looks
-
-
-@dataclass(frozen=True, kw_only=True)
-class RerenderOptions:
-    """What the new images shall be; None keeps what was recorded.
-
-    Attributes:
-        cameras: Names: of the recording, of the cameras' table, or "module:CAMERA" of one's own.
-        width, height: Pixels.
-        renderer: Row of the renderers' table.
-        antialias: Whether edges are smoothed.
-        depth, segmentation: Whether these are recorded too.
-        looks: Seed of random light, colours and textures; None keeps the recorded looks.
-        video: Fields of `VideoConfig` that change.
-        allowed: The user's own modules that may be imported for what recordings name.
-    """
-
-    cameras: tuple[str, ...] | None = None
-    width: int | None = None
-    height: int | None = None
-    renderer: str | None = None
-    antialias: bool | None = None
-    depth: bool | None = None
-    segmentation: bool | None = None
-    looks: int | None = None
-    video: Mapping[str, Any] = field(default_factory=dict)
-    allowed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,7 +79,7 @@ def recorded_view(info: EpisodeInfo) -> SceneView:
     return SceneView(scene=info.simulated.scene, true_cameras=cameras, true_from_recorded=errors)
 
 
-def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
+def new_view(info: EpisodeInfo, options: RerenderOptions, allowed: Sequence[str] = ()) -> SceneView:
     """The view that the options ask for.
 
     Raises:
@@ -126,7 +100,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions) -> SceneView:
             w, h = options.width or recorded[name].width, options.height or recorded[name].height
             believed, actual = (replace(c, width=w, height=h) for c in (recorded[name], true[name]))
         elif name in CAMERAS.rows or split_name(name) is not None:
-            preset = CAMERAS.load(name, options.allowed)
+            preset = CAMERAS.load(name, allowed)
             believed = actual = preset.camera(camera_name(name), info.simulated.robot, width=width, height=height)
         else:
             known = tuple(dict.fromkeys((*recorded, *CAMERAS.rows)))
@@ -194,15 +168,10 @@ def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any])
 
 
 def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any]:
-    """The recording's config with what the options change about the images."""
+    """The recording's config with the changed options of its images."""
     config = dict(info.simulated.config)
-    same_names = ("renderer", "antialias", "depth", "segmentation", "width", "height")
-    changes = {name: getattr(options, name) for name in same_names} | {
-        "video": {**config.get("video", {}), **options.video} if options.video else None,
-        "cameras": None if options.cameras is None else list(options.cameras),
-    }
-    config |= {name: value for name, value in changes.items() if value is not None}
-    return config
+    video = {"video": {**config.get("video", {}), **options.video}} if options.video else {}
+    return config | options.config | video
 
 
 def _video_options(info: EpisodeInfo, config: Mapping[str, Any]) -> VideoConfig:
@@ -219,6 +188,7 @@ def rerender(
     out: Path,
     options: RerenderOptions,
     *,
+    allowed: Sequence[str] = (),
     overwrite: bool = False,
     renderers: WarmRenderer | None = None,
 ) -> RerenderReport:
@@ -228,6 +198,7 @@ def rerender(
         source: The recording.
         out: The file to be made.
         options: What is to change.
+        allowed: The user's own modules that may be imported for what the recording or the options name.
         overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
         renderers: Gives the renderer, warm from one recording to the next; None makes and frees one.
 
@@ -239,12 +210,12 @@ def rerender(
     """
     if out.resolve() == source.resolve():
         raise ConfigError(f"The new recording would replace its own source, choose another --out: {out}")
-    allow_models(options.allowed)
+    allow_models(allowed)
     with open_simulated(source) as recording:
         info, trajectory = recording.info, recording.trajectory()
         if trajectory.num_frames == 0:
             raise RecordingError(f"The recording has no frames: {source}")
-        view, config = new_view(info, options), drawing_config(info, options)
+        view, config = new_view(info, options, allowed), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = _video_options(info, config)
         new_info = _drawn_info(recording, view, config)

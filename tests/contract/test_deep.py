@@ -27,7 +27,8 @@ from demorec.mcap.metadata import EPISODE, OUTCOME
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.replay.deep.check import DeepReport, deep_check, deep_checks
 from demorec.replay.deep.contents import Contents, content_differences
-from demorec.replay.rerender import RerenderOptions, rerender
+from demorec.replay.options import RerenderOptions
+from demorec.replay.rerender import rerender
 from demorec.runs.run_file import load_run_file
 
 FPS = 10

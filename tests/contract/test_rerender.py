@@ -13,7 +13,8 @@ from support.commands import exit_code
 from demorec.mcap import Recording
 from demorec.render.painter import WarmRenderer
 from demorec.replay.deep.check import deep_check
-from demorec.replay.rerender import RerenderOptions, rerender
+from demorec.replay.options import RerenderOptions
+from demorec.replay.rerender import rerender
 
 pytestmark = pytest.mark.slow
 
