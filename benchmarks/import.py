@@ -142,7 +142,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
         f"observation.images.{name}": {"dtype": "video", "shape": (HEIGHT, WIDTH, 3), "names": list(AXES)}
         for name in rows.cameras
     }
-    for name in rows.features:
+    for name in rows.table.features:
         names = [element for line in lines.sources(name) for element in line.stream.names]
         features[name] = {"dtype": "float32", "shape": (len(names),), "names": names}
     dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
@@ -159,12 +159,12 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
         if coded:
             with av.open(io.BytesIO(b"".join(coded)), mode="r", format="h264") as file:
                 kept[name] += [frame.to_ndarray(format="rgb24").astype(np.uint8) for frame in file.decode(video=0)]
-    for row in range(len(rows.times_ns)):
+    for row in range(rows.table.num_frames):
         frame: dict[str, object] = {
-            f"observation.images.{name}": kept[name][int(camera.taken[camera.positions[row]])]
+            f"observation.images.{name}": kept[name][int(camera.taken[rows.table.images[name][row]])]
             for name, camera in rows.cameras.items()
         }
-        frame |= {name: feature.values[row].astype(np.float32) for name, feature in rows.features.items()}
+        frame |= {name: vectors[row].astype(np.float32) for name, vectors in rows.table.features.items()}
         dataset.add_frame({**frame, "task": "measure"})
     dataset.save_episode()
     dataset.finalize()

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.output import aligned, counted, say, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
@@ -20,6 +20,9 @@ from demorec.core.targets import OptionalTarget
 from demorec.robots.motors import Motors
 from demorec.runs.find import find, name_of
 from demorec.sources.formats import FORMATS, SourceFormat
+
+if TYPE_CHECKING:
+    from demorec.sources.import_file import BagReport
 
 MAX_WORKERS = 1000
 _BAGS = "Bags; each is an episode, or several, as the mapping says."
@@ -137,7 +140,6 @@ class Import:
         return _list_skipped(result.skipped, result.num_episodes + len(result.skipped), "episode")
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
-        from demorec.sources.import_file import report_lines
         from demorec.sources.import_run import import_bags
 
         with ProgressBar("importing", unit="bag") as bar:
@@ -148,13 +150,13 @@ class Import:
                 video=self.video,
                 workers=self.workers,
                 skip_bad=self.skip_bad,
-                tell=lambda report: say(*report_lines(report), ""),
+                tell=lambda report: say(*_report_lines(report), ""),
                 progress=bar.set,
             )
         if result.num_new < len(result.reports):
             tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
         episodes = [episode for report in result.reports for episode in report.episodes]
-        made = [episode for episode in episodes if episode.episode_index is not None]
+        made = [episode for report in result.reports for episode in report.made]
         dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
         odd = [finding.kind for report in result.reports for finding in report.odd]
         notes = sum(len(report.findings) for report in result.reports) - len(odd)
@@ -166,6 +168,16 @@ class Import:
             above = f"No findings; {counted(notes, 'note')} above."
             say(above if notes else "Nothing odd was found.")
         return _list_skipped(result.skipped, len(result.reports) + len(result.skipped), "bag")
+
+
+def _report_lines(report: BagReport) -> list[str]:
+    """Describe a bag: a table of its streams, its findings, its episodes."""
+    lines = aligned([tuple(report.streams[0]), *(tuple(stream.values()) for stream in report.streams)])
+    for finding in report.findings:
+        place = f"{finding.stream}: " if finding.stream else ""
+        lines.append(f"{finding.kind}: {place}{finding.text}")
+    lines += [line for episode in report.episodes for line in episode.lines()]
+    return [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)", *(f"  {line}" for line in lines)]
 
 
 def _list_skipped(skipped: Mapping[Any, str], total: int, word: str) -> int:

@@ -199,8 +199,8 @@ def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
     """What is odd in the rows of a bag's episodes, each thing once."""
     fps = lines.mapping.clock.fps
-    for rows in (rows for rows in episodes if rows.follows and len(rows.times_ns) > 1):
-        steps = np.diff(rows.times_ns)
+    for rows in (rows for rows in episodes if rows.follows and len(rows.table.time_ns) > 1):
+        steps = np.diff(rows.table.time_ns)
         rate = NS / float(steps[steps <= LOST * np.median(steps)].mean())
         if abs(rate - fps) > RATE * fps:
             text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
@@ -217,7 +217,7 @@ def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[F
     for line in (line for line in lines.lines.values() if line.stream.names and line.is_regular):
         num_used = num_messages = 0
         for rows in episodes:
-            shown = line.chosen(rows.times_ns).index
+            shown = line.chosen(rows.table.time_ns).index
             num_used += len(np.unique(shown))
             num_messages += int(shown[-1] - shown[0]) + 1
         if num_messages - num_used > RATE * num_messages:
@@ -234,7 +234,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
     line, clock = lines.lines[name], lines.mapping.clock
     num_repeated = num_free = num_skipped = num_images = 0
     for rows in episodes:
-        shown = line.chosen(rows.times_ns).index
+        shown = line.chosen(rows.table.time_ns).index
         steps = np.diff(shown)
         repeated = shown[1:][steps == 0]
         num_repeated += len(repeated)
@@ -244,7 +244,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
         num_free += max(0, int(np.sum(waits <= LOST * line.period_ns)) - 1)
         num_skipped += int(np.maximum(steps - 1, 0).sum())
         num_images += int(shown[-1] - shown[0]) + 1
-    num_rows = sum(len(rows.times_ns) for rows in episodes)
+    num_rows = sum(len(rows.table.time_ns) for rows in episodes)
     rate = NS / max(line.period_ns, 1)
     repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows show the image before"
     skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"

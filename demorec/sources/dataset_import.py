@@ -28,7 +28,8 @@ from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.robots.motors import Motors
 from demorec.runs.external import ExternalFolder, episode_path, open_external_run, planned_episode
 from demorec.runs.find import expect
-from demorec.sources.frames_writer import FramesImport, Image, importing_versions, write_frames
+from demorec.sources.description import importing_versions
+from demorec.sources.episode_writer import FramesImport, Image, add_episode
 
 _MAX_EXACT = 2**53
 """Largest whole number up to which float64 holds every one."""
@@ -200,22 +201,10 @@ def _write(
     info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
     if folder.has(info):
         return False
-    columns = recording.table()
-    rows = range(recording.num_frames)
-    frames = ({name: values[row] for name, values in columns.features.items()} for row in rows)
+    leads = {camera.name: recording.lead(camera.name) if camera.kept else 0 for camera in info.cameras}
+    table = recording.table_with(leads)
     images = {camera.name: _images(recording, camera) for camera in info.cameras}
-    leads = {camera.name: int(columns.images[camera.name][0]) for camera in info.cameras if camera.kept}
-    write_frames(
-        folder,
-        info,
-        frames,
-        images,
-        outcome=recording.outcome,
-        video=video,
-        leads=leads,
-        subtasks=subtasks,
-        times_ns=recording.measured_ns,
-    )
+    add_episode(folder, info, table, images, outcome=recording.outcome, video=video, subtasks=subtasks)
     return True
 
 
@@ -240,4 +229,4 @@ def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:
         return recording.distances(camera.name)
     if camera.kept:
         return (packet.data for packet in recording.packets(camera.name))
-    return islice(recording.images(camera.name), int(recording.table().images[camera.name][0]), None)
+    return islice(recording.images(camera.name), recording.lead(camera.name), None)

@@ -1,189 +1,130 @@
-"""A bag's episodes on their way into their recordings, while the bag is read a second time for the images.
-
-Images that are encoded already stay as they are, byte for byte; pixels are encoded once. A frame is written as soon as
-its images are, so that of a bag of any size only what is under way is in memory."""
+"""Record imported episodes, each whole or not at all."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.config import VideoConfig
-from demorec.core.files import Closing
-from demorec.episode.episode import Outcome, Sample, SampledFrame
-from demorec.episode.info import DEPTH_UNITS
+from demorec.episode.episode import Outcome, Sample, SampledFrame, Table
+from demorec.episode.info import EpisodeInfo
 from demorec.mcap import SampledWriter
-from demorec.mcap.cdr import Values
-from demorec.runs.external import episode_path, external_line
-from demorec.runs.run_file import Attempt
-from demorec.sources.bag import Bag
-from demorec.sources.bag_files import BagError
-from demorec.sources.clock import Int
-from demorec.sources.decoding import BagDecoder
-from demorec.sources.fields import FieldError, image_bytes
-from demorec.sources.image_messages import decode_image
-from demorec.sources.import_file import BagReport
-from demorec.sources.planning import PlannedBag, PlannedEpisode
-from demorec.sources.rows import CameraRows
+from demorec.runs.external import ExternalFolder, episode_path
+
+Image = bytes | NDArray[Any]
+"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `SampledWriter.image` takes them."""
 
 
-def write_bag(planned: PlannedBag, folder: Path, video: VideoConfig) -> tuple[BagReport, list[Attempt]]:
-    """Write a bag's episodes into a run, each while the bag's images pass once more.
-
-    Returns:
-        The bag's report, and the episodes' lines of run.json.
-
-    Raises:
-        BagError: The bag has changed, or an image cannot be decoded.
-        RecordingError: They cannot be written.
-    """
-    bag, waiting = planned.bag, sorted(planned.episodes, key=lambda episode: int(episode.rows.times_ns[0]))
-    begins: dict[tuple[str, int], list[PlannedEpisode]] = {}
-    for episode in waiting:
-        for plan in episode.rows.cameras.values():
-            begins.setdefault((plan.topic, int(plan.taken.min())), []).append(episode)
-        if not episode.rows.cameras:
-            with ImportedEpisodeWriter(folder, episode, video) as writer:
-                writer.finish()
-    begun: set[int] = set()
-    under_way: list[ImportedEpisodeWriter] = []
-    with ExitStack() as stack:
-        for topic, number, values in _images(bag, waiting) if begins else ():
-            for episode in begins.get((topic, number), ()):
-                if episode.info.episode_index not in begun:  # by an image of another camera
-                    begun.add(episode.info.episode_index)
-                    under_way.append(stack.enter_context(ImportedEpisodeWriter(folder, episode, video)))
-            for writer in under_way:
-                try:
-                    writer.add(topic, number, values)
-                except FieldError as error:
-                    raise _unusable(bag, topic, error) from error
-                if writer.is_complete:
-                    writer.finish()
-            under_way = [writer for writer in under_way if not writer.is_complete]
-        for writer in under_way:
-            writer.finish()
-    paths = [episode_path(folder, episode.info.episode_index) for episode in planned.episodes]
-    return planned.report, [external_line(path) for path in paths]
-
-
-def _images(bag: Bag, episodes: Sequence[PlannedEpisode]) -> Iterator[tuple[str, int, Values]]:
-    """(topic, number, values) of the images that any episode takes."""
-    taken: dict[str, list[Int]] = {}
-    for episode in episodes:
-        for plan in episode.rows.cameras.values():
-            taken.setdefault(plan.topic, []).append(plan.taken)
-    wanted = {topic: np.bincount(np.concatenate(numbers)) > 0 for topic, numbers in taken.items()}
-    decoder, counts = BagDecoder(), dict.fromkeys(wanted, 0)
-    for message in bag.messages([], wanted.keys()):
-        topic = message.channel.topic
-        number, counts[topic] = counts[topic], counts[topic] + 1
-        if number < len(wanted[topic]) and wanted[topic][number]:
-            try:
-                values = decoder.values(message)
-            except ValueError as error:
-                raise _unusable(bag, topic, error) from error
-            yield topic, number, values
-
-
-def _unusable(bag: Bag, topic: str, error: ValueError) -> BagError:
-    return BagError(f"An image of {topic} cannot be used, since {error}: {bag.path}")
-
-
-class _CameraImages:
-    """A camera's images: which are still to come, and what has come but waits for earlier ones.
+@dataclass(frozen=True, kw_only=True)
+class FramesImport:
+    """Result of an import of episodes whose frames are evenly spaced, as in datasets.
 
     Attributes:
-        plan: Of the camera.
-        num_missing: How many of the taken ones are still to come.
-        waiting: Of the taken ones -> the image.
-        num_written: How many are written.
+        num_episodes, num_frames: In the run.
+        num_new: Episodes that were written now; the others were there.
+        cameras: Camera -> what became of its images, in words.
+        left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
+        skipped: Episode that cannot be read -> why.
     """
 
-    def __init__(self, plan: CameraRows) -> None:
-        self.plan = plan
-        self.num_missing = len(plan.taken)
-        self.waiting: dict[int, Any] = {}
-        self.num_written = 0
-        self._first = int(plan.taken.min()) if len(plan.taken) else 0
-        self._places = np.full(int(plan.taken.max(initial=self._first - 1)) - self._first + 1, -1)
-        self._places[plan.taken - self._first] = np.arange(len(plan.taken))
+    num_episodes: int
+    num_frames: int
+    num_new: int
+    cameras: Mapping[str, str]
+    left_out: Mapping[str, str]
+    skipped: Mapping[str, str] = field(default_factory=dict)
 
-    def place(self, number: int) -> int:
-        """Which of the taken ones a message of the topic is, -1 for none."""
-        number -= self._first
-        return int(self._places[number]) if 0 <= number < len(self._places) else -1
+    def left_out_lines(self) -> Iterator[str]:
+        """Describe what the run does not have."""
+        yield from (f"{name} is left out: {reason}." for name, reason in self.left_out.items() if reason)
+        if unnamed := [name for name, reason in self.left_out.items() if not reason]:
+            yield f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}."
 
 
-class ImportedEpisodeWriter(Closing):
-    """Writes one episode; a context manager, which leaves nothing behind unless `finish` was called.
+def add_episode(
+    folder: ExternalFolder,
+    info: EpisodeInfo,
+    table: Table,
+    images: Mapping[str, Iterator[Image]],
+    *,
+    outcome: Outcome,
+    video: VideoConfig,
+    subtasks: Mapping[int, str],
+) -> None:
+    """Record an episode whose cameras have an image in each frame; see `write_episode`.
+
+    Raises:
+        ConfigError: The run holds episodes of another kind.
+        RecordingError: A number is not finite, or the disk is full.
+    """
+    folder.check_fits(info)
+    folder.begin(info)
+    stream = _frame_by_frame(images, table)
+    folder.add(write_episode(folder.path, info, table, stream, outcome=outcome, video=video, subtasks=subtasks))
+
+
+def _frame_by_frame(images: Mapping[str, Iterator[Image]], table: Table) -> Iterator[tuple[str, Image]]:
+    """Yield (camera, image); images before the first frame come first."""
+    for camera, stream in images.items():
+        yield from ((camera, image) for image in islice(stream, int(table.images[camera][0])))
+    for _ in range(table.num_frames):
+        for camera, stream in images.items():
+            yield camera, next(stream)
+
+
+def write_episode(
+    folder: Path,
+    info: EpisodeInfo,
+    table: Table,
+    images: Iterable[tuple[str, Image]],
+    *,
+    outcome: Outcome,
+    video: VideoConfig,
+    subtasks: Mapping[int, str],
+) -> Path:
+    """Record an episode of a run and return its file.
 
     Args:
-        folder: Of the run.
-        episode: The episode.
+        folder: The run.
+        info: Description of the episode.
+        table: Its numbers, and which image each frame shows.
+        images: (camera, image), each camera's in order; a frame is written when its images are there.
+        outcome: How it ended; the number of frames is set here.
         video: How pixels are encoded.
+        subtasks: Frame -> subtask that begins there.
+
+    Raises:
+        RecordingError: A number is not finite, or the disk is full.
     """
+    with SampledWriter(episode_path(folder, info.episode_index), info, video=video, keeps_part=False) as writer:
+        num_images = dict.fromkeys(table.images, 0)
+        frames = _frames(table, subtasks)
+        frame = next(frames, None)
+        for camera, image in images:
+            writer.image(camera, int(table.image_stamps[camera][num_images[camera]]), image)
+            num_images[camera] += 1
+            while frame is not None and all(number < num_images[name] for name, number in frame.images.items()):
+                writer.write(frame)
+                frame = next(frames, None)
+        while frame is not None:
+            writer.write(frame)
+            frame = next(frames, None)
+        return writer.finish(replace(outcome, num_frames=table.num_frames))
 
-    def __init__(self, folder: Path, episode: PlannedEpisode, video: VideoConfig) -> None:
-        self._rows, self._subtasks, self._next_row = episode.rows, episode.subtasks, 0
-        self._cameras = {name: _CameraImages(plan) for name, plan in episode.rows.cameras.items()}
-        path = episode_path(folder, episode.info.episode_index)
-        self._writer = SampledWriter(path, episode.info, video=video, keeps_part=False)
 
-    def close(self) -> None:
-        """Leave nothing behind unless it is finished."""
-        self._writer.close()
-
-    @property
-    def is_complete(self) -> bool:
-        """Whether nothing more is needed of the bag."""
-        return not any(images.num_missing for images in self._cameras.values())
-
-    def add(self, topic: str, number: int, values: Values) -> None:
-        """Take a message of a camera's topic, if the episode wants it.
-
-        Raises:
-            FieldError: Its image cannot be decoded.
-            RecordingError: It cannot be written.
-        """
-        for name, images in self._cameras.items():
-            if images.plan.topic == topic and (place := images.place(number)) >= 0:
-                images.num_missing -= 1
-                self._take(name, images, place, values)
-        self._write_rows()
-
-    def _take(self, name: str, images: _CameraImages, place: int, values: Values) -> None:
-        is_coded = images.plan.kept and images.plan.kept not in DEPTH_UNITS
-        data: Any = image_bytes(values) if is_coded else decode_image(values)
-        images.waiting[place] = data
-        while images.num_written in images.waiting:
-            image = images.waiting.pop(images.num_written)
-            self._writer.image(name, int(images.plan.stamps_ns[images.num_written]), image)
-            images.num_written += 1
-
-    def _write_rows(self) -> None:
-        while self._next_row < len(self._rows.times_ns) and all(
-            int(images.plan.positions[self._next_row]) < images.num_written for images in self._cameras.values()
-        ):
-            row = self._next_row
-            time_ns = int(self._rows.times_ns[row])
-            samples = {
-                name: Sample(stamp_ns=time_ns - int(feature.ages_ns[row]), vector=feature.values[row])
-                for name, feature in self._rows.features.items()
-            }
-            shown = {name: int(images.plan.positions[row]) for name, images in self._cameras.items()}
-            subtask = self._subtasks.get(row, "")
-            self._writer.write(SampledFrame(time_ns=time_ns, samples=samples, images=shown, subtask=subtask))
-            self._next_row += 1
-
-    def finish(self) -> None:
-        """Write what is left and give the recording its name; BagError when images have not come."""
-        self._write_rows()
-        if self._next_row < len(self._rows.times_ns):
-            missing = [images.plan.topic for images in self._cameras.values() if images.num_missing]
-            raise BagError(f"The bag has changed while it was read: images of {missing[0]} are missing.")
-        self._writer.finish(Outcome(success=self._rows.window.success, num_frames=self._next_row))
+def _frames(table: Table, subtasks: Mapping[int, str]) -> Iterator[SampledFrame]:
+    for row, time_ns in enumerate(table.time_ns.tolist()):
+        yield SampledFrame(
+            time_ns=time_ns,
+            samples={
+                name: Sample(stamp_ns=int(table.stamps[name][row]), vector=vectors[row])
+                for name, vectors in table.features.items()
+            },
+            images={camera: int(numbers[row]) for camera, numbers in table.images.items()},
+            subtask=subtasks.get(row, ""),
+        )

@@ -24,7 +24,7 @@ from demorec.runs.find import IMPORT_WORDS, PathKind, find
 from demorec.sources.mapping import SourceKind, SourceMapping
 
 if TYPE_CHECKING:
-    from demorec.sources.frames_writer import FramesImport
+    from demorec.sources.episode_writer import FramesImport
 
 
 @dataclass(frozen=True, kw_only=True)

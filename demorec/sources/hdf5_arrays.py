@@ -12,15 +12,14 @@ from numpy.typing import NDArray
 
 from demorec.core.config import MAX_PIXELS
 from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
-from demorec.episode.episode import Vector
 from demorec.episode.info import Camera, Feature, Kept
 from demorec.mcap.cdr import Values
+from demorec.sources.description import imported_feature
+from demorec.sources.episode_writer import Image
 from demorec.sources.fields import FieldError, converted, names_of, picked
-from demorec.sources.frames_writer import Image, imported_feature
 from demorec.sources.image_messages import decode_image, image_head
 from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source, conversion_factor
 
-_BLOCK_ROWS = 1024
 _EXACT = 2**53
 """Up to which float64 holds every whole number."""
 
@@ -39,7 +38,7 @@ class _Column:
         kind = self.array.dtype
         return kind.kind == "f" and kind.itemsize <= 4 and conversion_factor(self.part.unit, self.part.to) is None
 
-    def block(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
+    def rows(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
         rows: NDArray[Any] = self.array.read(begin, end).reshape(end - begin, -1)
         rows = rows[:, list(self.part.elements)] if self.part.elements else rows
         if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
@@ -74,24 +73,23 @@ class StoredFeature:
         source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
         return imported_feature(self.name, self._dtype, names, units, called=called, source=source)
 
-    def vectors(self, count: int) -> Iterator[Vector]:
-        """(D,) of each of the first `count` frames.
+    def vectors(self, count: int) -> NDArray[np.floating[Any]]:
+        """Read (T, D) of the first `count` frames.
 
         Raises:
             FieldError: A number is not finite, or not to be held.
             Hdf5Error: They cannot be read.
         """
-        for begin in range(0, count, _BLOCK_ROWS):
-            first, last = begin + self.shift, min(begin + _BLOCK_ROWS, count) + self.shift
-            parts = [column.block(first, last) for column in self.columns]
-            for column, part in zip(self.columns, parts, strict=True):
-                if len(wrong := np.argwhere(~np.isfinite(part))):
-                    row, element = wrong[0].tolist()
-                    raise FieldError(
-                        f"{column.array.place} is {part[row, element]} in row {first + row} ({column.names[element]}), "
-                        "numbers must be finite"
-                    )
-            yield from np.concatenate(parts, axis=1).astype(self._dtype)
+        parts = [column.rows(self.shift, self.shift + count) for column in self.columns]
+        for column, part in zip(self.columns, parts, strict=True):
+            if len(wrong := np.argwhere(~np.isfinite(part))):
+                row, element = wrong[0].tolist()
+                raise FieldError(
+                    f"{column.array.place} is {part[row, element]} in row {self.shift + row} "
+                    f"({column.names[element]}), numbers must be finite"
+                )
+        vectors: NDArray[np.floating[Any]] = np.concatenate(parts, axis=1).astype(self._dtype, copy=False)
+        return vectors
 
 
 def _names(part: Source, array: StoredArray) -> tuple[str, ...]:

@@ -23,13 +23,15 @@ from demorec.core.errors import ConfigError
 from demorec.core.files import sha256_of
 from demorec.core.registry import nearest_match
 from demorec.datasets.hdf5.foreign import ForeignFile, Hdf5Error, Scalar, StoredArray
-from demorec.episode.episode import Outcome, Vector
+from demorec.episode.episode import Outcome, Table
 from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
+from demorec.mcap.streams import frame_times
 from demorec.runs.external import differences, open_external_run, planned_episode
 from demorec.runs.find import expect
+from demorec.sources.description import imported_info, urdf_text
+from demorec.sources.episode_writer import FramesImport, add_episode
 from demorec.sources.fields import FieldError
-from demorec.sources.frames_writer import FramesImport, imported_info, urdf_text, write_frames
 from demorec.sources.hdf5_arrays import StoredCamera, StoredFeature, is_camera
 from demorec.sources.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.sources.mapping_file import read_mapping
@@ -89,7 +91,15 @@ def import_hdf5(
             with ForeignFile(path) as file, _named(path):
                 episode = _Stored(file, place, mapping)
                 images = {camera.name: camera.images() for camera in episode.cameras}
-                write_frames(folder, info, episode.frames(), images, outcome=outcome, video=video or VideoConfig())
+                add_episode(
+                    folder,
+                    info,
+                    episode.table(info.fps),
+                    images,
+                    outcome=outcome,
+                    video=video or VideoConfig(),
+                    subtasks={},
+                )
     return FramesImport(
         num_episodes=len(plans),
         num_frames=sum(outcome.num_frames for _, _, _, outcome in plans),
@@ -147,17 +157,24 @@ class _Stored:
             for name, images in cameras.items()
         ]
 
-    def frames(self) -> Iterator[dict[str, Vector]]:
-        """Feature -> (D,) of each frame."""
-        columns = [feature.vectors(self.num_frames) for feature in self.features]
-        for vectors in zip(*columns, strict=True):
-            yield {feature.name: vector for feature, vector in zip(self.features, vectors, strict=True)}
+    def table(self, fps: int) -> Table:
+        """Read the numbers of every frame."""
+        times = frame_times(self.num_frames, fps)
+        features = {feature.name: feature.vectors(self.num_frames) for feature in self.features}
+        cameras = [camera.name for camera in self.cameras]
+        return Table(
+            time_ns=times,
+            features=features,
+            stamps=dict.fromkeys(features, times),
+            images=dict.fromkeys(cameras, np.arange(self.num_frames)),
+            image_stamps=dict.fromkeys(cameras, times),
+        )
 
     def described(self, urdf: str | None, source: SourceFile, episode_index: int) -> EpisodeInfo:
         """What the recording shall say of it; every number is looked at."""
         file, place, mapping = self._file, self._place, self._mapping
-        for _ in self.frames():
-            pass
+        for feature in self.features:
+            feature.vectors(self.num_frames)
         if attribute := mapping.robot.urdf_attribute:
             urdf = str(found_attribute(file, place, attribute) or "")
         try:

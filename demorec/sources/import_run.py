@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Future, wait
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, Future
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -24,8 +24,8 @@ from demorec.episode.info import EpisodeInfo
 from demorec.runs.external import ExternalFolder, differences, open_external_run
 from demorec.runs.run_file import RUN_NAME, Attempt
 from demorec.sources.bag import Bag, Files, bags_in, open_bag
-from demorec.sources.episode_writer import write_bag
-from demorec.sources.frames_writer import urdf_text
+from demorec.sources.bag_images import write_bag
+from demorec.sources.description import urdf_text
 from demorec.sources.import_file import BagReport, ImportFile, SkippedBag, load_import_file, save_import_file
 from demorec.sources.mapping_file import read_mapping
 from demorec.sources.planning import PlannedBag, plan_bag
@@ -85,10 +85,22 @@ def import_bags(
                     folder,
                     lambda bag: submit(plan_bag, bag, mapping, urdf, video),
                     lambda planned: submit(write_bag, planned, folder.path, video),
-                    ahead=1 if workers == 1 else 2 * workers,
+                    ahead=workers,
                     tell=tell,
                 )
     return batch
+
+
+def _in_order[Item, Result](
+    begin: Callable[[Item], Future[Result]], items: Iterable[Item], ahead: int
+) -> Iterator[tuple[Item, Future[Result]]]:
+    """Yield each item and what is begun with it, in order; up to `ahead` are under way, which bounds the memory."""
+    waiting: deque[tuple[Item, Future[Result]]] = deque()
+    for item in items:
+        waiting.append((item, begin(item)))
+        while waiting and (len(waiting) >= ahead or waiting[0][1].done()):
+            yield waiting.popleft()
+    yield from waiting
 
 
 def _at_once[R](function: Callable[..., R], *args: Any) -> Future[R]:
@@ -126,6 +138,7 @@ class ImportBatch:
         self.num_new = self._num_done = 0
         self._next_index = known.num_episodes
         self._kind: EpisodeInfo | None = None
+        self._failure: Exception | None = None
         self._progress(0, len(paths))
 
     def look(self, digest: Callable[[Bag], Future[Files]]) -> list[Bag]:
@@ -164,42 +177,31 @@ class ImportBatch:
             folder: Of the run.
             read: Begins to read and judge a bag.
             write: Begins to write its episodes.
-            ahead: How many bags are under way at a time: bounds the memory.
+            ahead: Number of bags that are read, and that are written, at a time.
             tell: Called with the report of each bag that is in the run now.
         """
         self._kind = folder.kind()
         folder.planned = [path.name for path in self._left]
-        waiting, failure = deque(bags), None
-        reading: deque[tuple[Bag, Future[PlannedBag]]] = deque()
-        writing: deque[tuple[Path, Future[_Written]]] = deque()
-        while waiting or reading or writing:
-            while waiting and len(reading) + len(writing) < ahead:
-                bag = waiting.popleft()
-                reading.append((bag, read(bag)))
-            if writing and writing[0][1].done():
-                path, written = writing.popleft()
-                report, lines = written.result()
-                self._take(folder, path, report, lines)
-                tell(report)
-            elif reading and reading[0][1].done():
-                try:
-                    planned = self._accept(folder, *reading.popleft())
-                except Exception as error:
-                    failure = error
-                    waiting.clear()
-                    reading.clear()
-                    continue
-                if planned is not None:
-                    writing.append((planned.bag.path, write(planned)))
-            else:
-                first: list[Future[Any]] = [future for _, future in list(writing)[:1]]
-                first += [future for _, future in list(reading)[:1]]
-                wait(first, return_when=FIRST_COMPLETED)
+        planned = self._accepted(folder, _in_order(read, bags, ahead))
+        for bag, written in _in_order(write, planned, ahead):
+            report, lines = written.result()
+            self._take(folder, bag.bag.path, report, lines)
+            tell(report)
         folder.planned = [path.name for path in self._left]
-        if failure is not None:
-            raise failure
+        if self._failure is not None:
+            raise self._failure
         if self._known.bags:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
+
+    def _accepted(self, folder: ExternalFolder, bags: Iterator[tuple[Bag, Future[PlannedBag]]]) -> Iterator[PlannedBag]:
+        """Yield what is to be written of each bag, up to the first one that ends the import."""
+        try:
+            for bag, read in bags:
+                planned = self._accept(folder, bag, read)
+                if planned is not None:
+                    yield planned
+        except Exception as error:
+            self._failure = error
 
     def _take(self, folder: ExternalFolder, path: Path, report: BagReport, lines: Sequence[Attempt]) -> None:
         """Take a bag whose episodes are written into the run; run.json, which says that it is done, comes last."""

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
@@ -23,12 +24,12 @@ from demorec.sources.bag import Bag, Files
 from demorec.sources.bag_files import BagError
 from demorec.sources.bag_findings import all_findings, row_findings
 from demorec.sources.clock import NS
+from demorec.sources.description import imported_feature, imported_info
 from demorec.sources.fields import FieldError
 from demorec.sources.findings import Finding
-from demorec.sources.frames_writer import imported_feature, imported_info
-from demorec.sources.import_file import BagReport, EpisodeReport, stream_reports
+from demorec.sources.import_file import BagReport, EpisodeReport, stream_figures
 from demorec.sources.mapping import Episodes, SourceMapping
-from demorec.sources.rows import CameraRows, EpisodeRows, FeatureRows, NoRowsError, Timelines, Window
+from demorec.sources.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
 from demorec.sources.streams import Text, read_streams
 from demorec.sources.words import task_in_name
 
@@ -110,12 +111,13 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
                 raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {bag.path}")
     except BagError as error:
         raise BagError(f"{error}: {bag.path}") from error
+    rows_of = [episode.rows for episode in episodes]
     report = BagReport(
         name=bag.path.name,
         files=files,
         num_bytes=bag.num_bytes,
-        streams=tuple(stream_reports(lines, [episode.rows for episode in episodes])),
-        findings=(*findings, *row_findings(lines, [episode.rows for episode in episodes])),
+        streams=tuple(stream_figures(line, rows_of) for line in lines.lines.values()),
+        findings=(*findings, *row_findings(lines, rows_of)),
         episodes=tuple(reports),
     )
     return PlannedBag(bag=bag, report=report, episodes=tuple(episodes))
@@ -145,7 +147,7 @@ def _episode(
             instruction=_task_text(bag.name, lines, rows.window),
             urdf=urdf,
             fps=mapping.clock.fps,
-            features=(_feature(name, feature, lines) for name, feature in rows.features.items()),
+            features=(_feature(name, values.dtype, lines) for name, values in rows.table.features.items()),
             cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
             files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
         )
@@ -258,19 +260,19 @@ def _subtask_rows(lines: Timelines, rows: EpisodeRows) -> dict[int, str]:
     markers = ends if is_marker else set()
     found: dict[int, str] = {}
     for text in sorted(lines.streams.texts.get(topic, ()), key=lambda text: text.time_ns):
-        if not rows.window.begin_ns <= text.time_ns <= rows.times_ns[-1]:
+        if not rows.window.begin_ns <= text.time_ns <= rows.table.time_ns[-1]:
             continue
         if not isinstance(text.value, str):
             raise BagError(f"The subtask of {topic} is no text")
         if text.value in markers:
             continue
         if said := " ".join(text.value.split()):
-            found[int(np.searchsorted(rows.times_ns, text.time_ns))] = said
+            found[int(np.searchsorted(rows.table.time_ns, text.time_ns))] = said
     before = ["", *found.values()]
     return {row: said for (row, said), last in zip(found.items(), before, strict=False) if said != last}
 
 
-def _feature(name: str, feature: FeatureRows, lines: Timelines) -> Feature:
+def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
     rules = [
         f"{source.next} of the next frame"
         if source.next
@@ -280,10 +282,10 @@ def _feature(name: str, feature: FeatureRows, lines: Timelines) -> Feature:
     streams = [line.stream for line in lines.sources(name)]
     names = tuple(element for stream in streams for element in stream.names)
     units = (stream.unit for stream in streams for _ in stream.names)
-    return imported_feature(name, feature.values.dtype, names, units, called=names, source="; ".join(rules))
+    return imported_feature(name, dtype, names, units, called=names, source="; ".join(rules))
 
 
-def _camera(name: str, plan: CameraRows, lines: Timelines) -> Camera:
+def _camera(name: str, plan: TakenImages, lines: Timelines) -> Camera:
     info = lines.streams.infos.get(name, {})
     matrix, distortion = _numbers(info, "k", "K"), _numbers(info, "d", "D")
     width, height = plan.head.width, plan.head.height
@@ -314,9 +316,8 @@ def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
             yield f"camera {name}: {problem}"
     if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
         yield f"a subtask is no single line of at most {MAX_SUBTASK} characters"
-    times, features = episode.rows.times_ns, episode.rows.features.values()
-    cameras = episode.rows.cameras.values()
-    for stamps in (times, *(times - one.ages_ns for one in features), *(one.stamps_ns for one in cameras)):
+    table = episode.rows.table
+    for stamps in (table.time_ns, *table.stamps.values(), *table.image_stamps.values()):
         if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
             yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
             return
@@ -325,16 +326,18 @@ def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
 def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str) -> EpisodeReport:
     """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
     rows = None if episode is None else episode.rows
-    begin_ns, end_ns = (int(rows.times_ns[0]), int(rows.times_ns[-1])) if rows else (window.begin_ns, window.end_ns)
-    trimmed_ns = rows.trimmed_ns if rows else (0, 0)
+    begin_ns, end_ns = window.begin_ns, window.end_ns
+    if rows:
+        begin_ns, end_ns = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
     return EpisodeReport(
         episode_index=None if episode is None else episode.info.episode_index,
         begin_s=(begin_ns - zero_ns) / NS,
         end_s=(end_ns - zero_ns) / NS,
-        num_frames=len(rows.times_ns) if rows else 0,
+        num_frames=rows.table.num_frames if rows else 0,
         success=window.success,
-        trimmed_s=(trimmed_ns[0] / NS, trimmed_ns[1] / NS),
-        pictures={name: plan.description for name, plan in rows.cameras.items()} if rows else {},
+        pictures=(
+            {name: plan.described(rows.table.images[name]) for name, plan in rows.cameras.items()} if rows else {}
+        ),
         reason=reason,
         discarded=window.discarded,
         follows=rows.follows if rows else "",

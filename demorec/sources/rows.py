@@ -8,6 +8,7 @@ from typing import cast
 
 import numpy as np
 
+from demorec.episode.episode import Table
 from demorec.episode.info import DEPTH_UNITS, Kept
 from demorec.sources.bag_files import BagError
 from demorec.sources.clock import MISSING, NS, ChosenSamples, Int, Numbers, Timeline, followed, grid, timeline
@@ -39,50 +40,31 @@ class Window:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class FeatureRows:
-    """A feature of an episode.
+class TakenImages:
+    """Images that an episode takes of a camera.
 
     Attributes:
-        values: (R, D), float32 where all its sources are, otherwise float64.
-        ages_ns: (R,) of the oldest of its sources, signed as in `ChosenSamples`.
-    """
-
-    values: Numbers
-    ages_ns: Int
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class CameraRows:
-    """The images that an episode takes of a camera.
-
-    Attributes:
-        topic: Of them.
-        head: Of the first.
-        kept: The codec whose packets stay as they are, or the encoding of distances; "" for pixels, which are encoded
-            once.
-        taken: (P,) which of the topic's messages are taken, in the order of their times.
-        stamps_ns: (P,) their times.
-        positions: (R,) which of the taken ones each row shows.
+        topic: Topic of the messages.
+        head: Head of the first image.
+        kept: Codec whose packets stay as they are, or encoding of distances; "" for pixels, which are encoded once.
+        taken: (P,) number of each image's message in its topic, in the order of their times.
     """
 
     topic: str
     head: ImageHead
     kept: Kept
     taken: Int
-    stamps_ns: Int
-    positions: Int
 
-    @property
-    def description(self) -> str:
-        """What becomes of them, for people."""
-        shown = len(np.unique(self.positions))
+    def described(self, shown: Int) -> str:
+        """Describe in words what becomes of the images, of which the rows show those of (R,) these numbers."""
+        num_shown = len(np.unique(shown))
         what = f"{len(self.taken)} images {self.head.width}x{self.head.height}, "
         kind = self.head.encoding if self.head.format == "raw" else self.head.format
         what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
-        repeated = len(self.positions) - shown
+        repeated = len(shown) - num_shown
         rows = "row shows" if repeated == 1 else "rows show"
         what += f", {repeated} {rows} the image of the row before" if repeated else ""
-        return what + (f", {len(self.taken) - shown} shown by no row" if len(self.taken) > shown else "")
+        return what + (f", {len(self.taken) - num_shown} shown by no row" if len(self.taken) > num_shown else "")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -91,18 +73,14 @@ class EpisodeRows:
 
     Attributes:
         window: Where it is in the bag.
-        times_ns: (R,) of the rows, by the mapping's clock.
-        features: Name -> feature.
+        table: Its rows, by the mapping's clock; a feature is as old as the oldest of its sources.
         cameras: Name -> its images.
-        trimmed_ns: How much of the window's beginning and end no row covers.
-        follows: Of whose messages each has a row ("camera front"); "" for a grid.
+        follows: Stream whose messages have a row each ("camera front"); "" for a grid.
     """
 
     window: Window
-    times_ns: Int
-    features: Mapping[str, FeatureRows]
-    cameras: Mapping[str, CameraRows]
-    trimmed_ns: tuple[int, int]
+    table: Table
+    cameras: Mapping[str, TakenImages]
     follows: str
 
 
@@ -145,17 +123,27 @@ class Timelines:
         has_next = any(source.next for sources in mapped.values() for source in sources)
         count = len(times) - has_next
         features = {name: self._feature(name, chosen, times, count) for name in mapped}
+        shown = {name: chosen[name].index[:count] for name in self.mapping.cameras}
+        places = {name: _taken(self.lines[name], indices) for name, indices in shown.items()}
         return EpisodeRows(
             window=window,
-            times_ns=times[:count],
-            features=features,
-            cameras={name: _camera(self.lines[name], chosen[name].index[:count]) for name in self.mapping.cameras},
-            trimmed_ns=(int(times[0]) - window.begin_ns, max(0, window.end_ns - end)),
+            table=Table(
+                time_ns=times[:count],
+                features={name: values for name, (values, _) in features.items()},
+                stamps={name: stamps for name, (_, stamps) in features.items()},
+                images={name: np.searchsorted(places[name], indices) for name, indices in shown.items()},
+                image_stamps={name: self.lines[name].times_ns[taken] for name, taken in places.items()},
+            ),
+            cameras={name: _camera(self.lines[name], taken) for name, taken in places.items()},
             follows=follows,
         )
 
-    def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> FeatureRows:
-        """The first `count` rows of a feature; a source that is a feature's next row is taken one row later."""
+    def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> tuple[Numbers, Int]:
+        """Return the first `count` rows (R, D) of a feature and their stamps.
+
+        They are float32 where all sources are, otherwise float64. A source that is a feature's next row is taken one
+        row later.
+        """
         values, ages = [], []
         for index, source in enumerate(self.mapping.features[name]):
             later = 1 if source.next else 0
@@ -166,7 +154,7 @@ class Timelines:
                 values.append(self.lines[key].sampled(chosen[key])[part])
                 # The age of a next row counts from the row that has it, and so is below 0.
                 ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
-        return FeatureRows(values=np.concatenate(values, axis=1), ages_ns=np.max(np.stack(ages), axis=0))
+        return np.concatenate(values, axis=1), times[:count] - np.max(np.stack(ages), axis=0)
 
     def _extent(self, window: Window) -> tuple[int, int]:
         """From where on and until when all streams have something, within a window."""
@@ -282,22 +270,20 @@ def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
     return f"{line.label} has images of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
 
 
-def _camera(line: Timeline, shown: Int) -> CameraRows:
-    """Of a camera that shows these images (R,) of its timeline: of video all are taken from the keyframe before on."""
-    stream, taken = line.stream, np.unique(shown)
-    head = stream.heads[int(line.order[shown[0]])]
-    if head.format in VIDEO_FORMATS:
-        first = int(taken[0])
-        while not stream.heads[int(line.order[first])].is_keyframe:
-            first -= 1
-        head = stream.heads[int(line.order[first])]
-        taken = np.arange(first, int(taken[-1]) + 1)
+def _taken(line: Timeline, shown: Int) -> Int:
+    """Return which images of its timeline a camera needs to show these (R,): of video, from the keyframe before on."""
+    taken = np.unique(shown)
+    if line.stream.heads[int(line.order[shown[0]])].format not in VIDEO_FORMATS:
+        return taken
+    first = int(taken[0])
+    while not line.stream.heads[int(line.order[first])].is_keyframe:
+        first -= 1
+    return np.arange(first, int(taken[-1]) + 1)
+
+
+def _camera(line: Timeline, taken: Int) -> TakenImages:
+    """Describe the images of its timeline that an episode takes of a camera."""
+    head = line.stream.heads[int(line.order[taken[0]])]
     kept = head.encoding if head.encoding in DEPTH_UNITS else head.format if head.format in KEPT_FORMATS else ""
-    return CameraRows(
-        topic=stream.topic,
-        head=head,
-        kept=cast(Kept, kept),
-        taken=np.asarray(stream.places)[line.order[taken]],
-        stamps_ns=line.times_ns[taken],
-        positions=np.searchsorted(taken, shown),
-    )
+    numbers = np.asarray(line.stream.places)[line.order[taken]]
+    return TakenImages(topic=line.stream.topic, head=head, kept=cast(Kept, kept), taken=numbers)

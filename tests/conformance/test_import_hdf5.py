@@ -28,7 +28,7 @@ from support.hdf5 import (
 from demorec.datasets.hdf5.foreign import Hdf5Error
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources.frames_writer import FramesImport
+from demorec.sources.episode_writer import FramesImport
 from demorec.sources.hdf5_import import import_hdf5
 from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 

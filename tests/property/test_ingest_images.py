@@ -75,7 +75,7 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
 
 def _numbers(rows: EpisodeRows, camera: str) -> NDArray[np.int64]:
     """(R,) which image each row shows."""
-    return rows.cameras[camera].taken[rows.cameras[camera].positions]
+    return rows.cameras[camera].taken[rows.table.images[camera]]
 
 
 def _kinds(lines: Timelines, rows: EpisodeRows) -> set[str]:
@@ -96,7 +96,7 @@ def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, se
     times = _moments(rate, phase, jitter, seed, rounding)
     lines, rows = _rows({"front": times}, Clock(fps=round(rate), max_age_s=1.0))
     assert _numbers(rows, "front").tolist() == list(range(COUNT))
-    assert rows.times_ns.tolist() == times
+    assert rows.table.time_ns.tolist() == times
     if jitter < 0.1 and abs(rate / round(rate) - 1) < 0.03:
         assert _kinds(lines, rows) == set()
 
@@ -106,21 +106,16 @@ def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, se
 def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     times = _moments(Fraction(rate), phase, jitter, seed, rounding)
     lines, rows = _rows({"front": times}, Clock(fps=rate, rows="grid", max_age_s=1.0))
-    steps = np.diff(rows.times_ns)
+    steps = np.diff(rows.table.time_ns)
     assert set(steps.tolist()) <= {NS // rate, -(-NS // rate)}
-    expected = [bisect_right(times, time) - 1 for time in rows.times_ns.tolist()]
+    expected = [bisect_right(times, time) - 1 for time in rows.table.time_ns.tolist()]
     numbers = _numbers(rows, "front").tolist()
     assert numbers == expected
     assert set(numbers) == set(range(COUNT))
     assert "repeats" not in _kinds(lines, rows)
     # No later than need be: where nothing jitters, images are as good as new, but for a row after the last one.
     if not jitter:
-        assert (
-            sorted((rows.times_ns - rows.cameras["front"].stamps_ns[rows.cameras["front"].positions]).tolist())[
-                COUNT - 2
-            ]
-            <= 3_000
-        )
+        assert sorted(rows.table.image_age_ns("front").tolist())[COUNT - 2] <= 3_000
 
 
 @settings(max_examples=80, **PATIENT)
@@ -134,7 +129,7 @@ def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float,
     lines, rows = _rows(cameras, Clock(fps=rate, max_age_s=1.0))
     for name, times in cameras.items():
         numbers = _numbers(rows, name)
-        assert numbers.tolist() == [bisect_right(times, time) - 1 for time in rows.times_ns.tolist()]
+        assert numbers.tolist() == [bisect_right(times, time) - 1 for time in rows.table.time_ns.tolist()]
         # Not lost: all between the first and the last; of these only what one camera had before the other began.
         assert set(numbers.tolist()) == set(range(numbers[0], numbers[-1] + 1))
         assert numbers[0] <= 1

@@ -168,7 +168,10 @@ class DatasetRecording:
 
     @cached_property
     def _table(self) -> Table:
-        leads = {name: self._lead(name) for name in self.dataset.keys}
+        return self.table_with({name: self.lead(name) for name in self.dataset.keys})
+
+    def table_with(self, leads: Mapping[str, int]) -> Table:
+        """Read the features of every frame, with this number of images of each camera before the first frame."""
         begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
         times = frame_times(begin + self.num_frames, fps)
         if self.measured_ns is not None:  # behind the images that come before the first frame
@@ -202,8 +205,8 @@ class DatasetRecording:
         """No names, as of `has_segmentation`."""
         return {}
 
-    def _lead(self, camera: str) -> int:
-        """How many images of a camera come before the first frame: what that is decoded from."""
+    def lead(self, camera: str) -> int:
+        """Count the images of a camera before the first frame, from which that is decoded."""
         video = None if camera in self.depth_cameras else self._video(camera)
         return 0 if video is None else video.lead
 
@@ -219,7 +222,7 @@ class DatasetRecording:
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
-        lead, times = self._lead(camera), self.table().image_stamps[camera]
+        lead, times = self.lead(camera), self.table().image_stamps[camera]
         if (video := self._video(camera)) is not None:
             for frame, data, is_key in video.packets():
                 number = min(frame + lead, len(times) - 1)
@@ -236,7 +239,7 @@ class DatasetRecording:
     def images(self, camera: str) -> Iterator[Rgb]:
         """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
         if (video := self._video(camera)) is not None:
-            return video.images(-self._lead(camera))
+            return video.images(-self.lead(camera))
         return self.dataset.stored_images[self.dataset.keys[camera]].read(self.place)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
