@@ -21,7 +21,7 @@ from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
 from demorec.mcap.channels import camera_topic, description_topic, video_topic
 from demorec.mcap.container import Container, damage_as_recording_error
-from demorec.mcap.episode_layout import EpisodeLayout, episode_layout
+from demorec.mcap.episode_layout import EpisodeLayout
 from demorec.mcap.images import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.lossless import decode_distances
 from demorec.mcap.metadata import CameraStreams
@@ -63,7 +63,7 @@ class EpisodeFile(Closing):
     def _read_metadata(self, found: Mapping[str, str]) -> None:
         """Read what is known without reading the numbers."""
         self.info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(found)
-        self._layout = episode_layout(self.info)
+        self._layout = EpisodeLayout(self.info)
         self._read_end()
         if self.num_frames and len(self._cameras) != len(self.info.cameras):
             raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")

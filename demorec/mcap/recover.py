@@ -19,7 +19,7 @@ from demorec.core.files import MCAP_MAGIC, make_folder, open_regular
 from demorec.episode.info import Origin
 from demorec.mcap import messages, metadata
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.episode_layout import episode_layout
+from demorec.mcap.episode_layout import EpisodeLayout
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
@@ -174,7 +174,7 @@ def _survey(source: Path) -> _Survey:
     if metadata.EPISODE in found:
         episode, outcome = found[metadata.EPISODE], found.get(metadata.OUTCOME)
         info, cameras, _ = metadata.read_episode_metadata(episode)
-        num_frames, keeps = episode_layout(info).whole_frames(counts, cameras)
+        num_frames, keeps = EpisodeLayout(info).whole_frames(counts, cameras)
         reason = reason or "the end is missing"
         if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
             outcome = None

@@ -23,7 +23,7 @@ from demorec.mcap.cdr import encode
 from demorec.mcap.channels import SUBTASK
 from demorec.mcap.images import CameraWriter
 from demorec.mcap.lossless import DEPTH_TYPES
-from demorec.mcap.sampled_layout import SampledLayout
+from demorec.mcap.sampled_streams import sampled_streams
 from demorec.mcap.transforms import FrameTree, joint_places, joint_positions
 from demorec.mcap.writer import BatchWriter, PendingFrame, check_description
 from demorec.robots.urdf import Urdf
@@ -46,13 +46,15 @@ class SampledWriter(BatchWriter):
         begins: bool = True,
         keeps_part: bool = True,
     ) -> None:
-        if begins:
-            check_description(info)
-        video = video or VideoConfig()
-        cameras = {camera.name: CameraWriter(camera, video, info.fps) for camera in info.cameras}
-        super().__init__(path, info, cameras, overwrite=overwrite, keeps_part=keeps_part)
+        self._begins = begins
+        super().__init__(path, info, video=video, overwrite=overwrite, keeps_part=keeps_part)
         if begins:
             self._describe(info)
+
+    def _prepare(self, info: EpisodeInfo) -> None:
+        if self._begins:
+            check_description(info)
+        self._cameras = {camera.name: CameraWriter(camera, self._video, info.fps) for camera in info.cameras}
 
     def begin(self, info: EpisodeInfo) -> None:
         """Describe the episode, of which only the cameras were known; before its first image and frame.
@@ -66,7 +68,7 @@ class SampledWriter(BatchWriter):
 
     def _describe(self, info: EpisodeInfo) -> None:
         self._info, self._check = info, SampledFrameCheck(info)
-        *features, frames = SampledLayout(info).streams
+        *features, frames = sampled_streams(info)
         self._places = joint_places(info.features)
         self._tree = FrameTree(Urdf.parse(info.urdf), [*self._places], info.cameras) if info.urdf else None
         self._streams = (*features, *(self._tree.streams(self._state) if self._tree else ()), frames)

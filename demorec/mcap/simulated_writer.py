@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.episode import CameraImages, Event, Frame, JointSample, frame_time_ns
@@ -18,7 +16,7 @@ from demorec.mcap.cdr import encode
 from demorec.mcap.channels import DELIBERATE_MISS, EVENTS, PHASE, PHASE_EVENT, Message
 from demorec.mcap.images import CameraWriter
 from demorec.mcap.metadata import CameraStreams
-from demorec.mcap.simulated_layout import FrameValues, SimulatedLayout
+from demorec.mcap.simulated_streams import FrameValues, simulated_streams
 from demorec.mcap.transforms import FrameTree
 from demorec.mcap.writer import BatchWriter, PendingFrame, check_description
 from demorec.robots.assets import asset_path
@@ -31,16 +29,7 @@ class EpisodeWriter(BatchWriter):
     Depth and segmentation are recorded of the cameras that have them in the first frame.
     """
 
-    def __init__(
-        self,
-        path: Path,
-        info: EpisodeInfo,
-        *,
-        video: VideoConfig | None = None,
-        overwrite: bool = False,
-        keeps_part: bool = True,
-    ) -> None:
-        self._video = video or VideoConfig()
+    def _prepare(self, info: EpisodeInfo) -> None:
         self._phase: str | None = None
         self._is_miss: bool | None = None
         check_description(info)
@@ -55,8 +44,7 @@ class EpisodeWriter(BatchWriter):
             )
         self._tree = FrameTree(urdf, robot.joint_names, info.cameras, scene)
         self._objects = [body.name for body in scene.movable]
-        self._streams = (*SimulatedLayout(info).streams, *self._tree.streams(self._state))
-        super().__init__(path, info, {}, overwrite=overwrite, keeps_part=keeps_part)
+        self._streams = (*simulated_streams(info), *self._tree.streams(self._state))
 
     def write(self, frame: Frame) -> None:
         """Add the next frame with its images.

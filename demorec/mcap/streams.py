@@ -1,6 +1,6 @@
 """Streams with one message at each frame, and how their messages become columns.
 
-The layouts of episodes (`demorec.mcap.simulated_layout`, `demorec.mcap.sampled_layout`) list them; writer, reader,
+`demorec.mcap.simulated_streams` and `demorec.mcap.sampled_streams` list them; writer, reader,
 recovery and checks go through these lists.
 """
 

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.core.files import Closing
 from demorec.episode.episode import Outcome, SampledFrame
@@ -31,7 +32,7 @@ from demorec.mcap.images import CameraWriter
 from demorec.mcap.lossless import segment_names, to_labels
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recover import can_be_made_again
-from demorec.mcap.simulated_layout import FrameValues
+from demorec.mcap.simulated_streams import FrameValues
 from demorec.mcap.streams import FrameStream
 from demorec.mcap.transforms import FrameTree, camera_frame
 
@@ -76,13 +77,25 @@ class BatchWriter(Closing, ABC):
     _streams: Sequence[FrameStream]
 
     def __init__(
-        self, path: Path, info: EpisodeInfo, cameras: dict[str, CameraWriter], *, overwrite: bool, keeps_part: bool
+        self,
+        path: Path,
+        info: EpisodeInfo,
+        *,
+        video: VideoConfig | None = None,
+        overwrite: bool = False,
+        keeps_part: bool = True,
     ) -> None:
         self.num_frames = 0
-        self._info, self._cameras, self._keeps_part = info, cameras, keeps_part
+        self._info, self._video, self._keeps_part = info, video or VideoConfig(), keeps_part
+        self._cameras: dict[str, CameraWriter] = {}
         self._pending: list[PendingFrame] = []
         self._is_described = False
+        self._prepare(info)
         self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=info.origin))
+
+    @abstractmethod
+    def _prepare(self, info: EpisodeInfo) -> None:
+        """Prepare for an episode before a file is opened. Raises ConfigError if the description is impossible."""
 
     @abstractmethod
     def flush(self) -> None:
