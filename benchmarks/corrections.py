@@ -32,7 +32,8 @@ from learning import ACTION, ENVIRONMENT, STATE, SWITCHED_OFF, Data, Variant, co
 from demorec.core.config import GenerateConfig
 from demorec.episode.episode import interventions
 from demorec.learn.evaluate import TakeOver
-from demorec.learn.evaluate.rollouts import Evaluation, evaluate, load_evaluation, settings_for
+from demorec.learn.evaluate.evaluation import Evaluation, load_evaluation
+from demorec.learn.evaluate.rollouts import evaluate, settings_for
 from demorec.learn.evaluate.statistics import Rate
 from demorec.mcap import Recording
 

@@ -18,7 +18,7 @@ from demorec.core.targets import OptionalTarget
 from demorec.learn.evaluate import TakeOver
 
 if TYPE_CHECKING:
-    from demorec.learn.evaluate.rollouts import Evaluation
+    from demorec.learn.evaluate.evaluation import Evaluation
     from demorec.learn.evaluate.statistics import RateComparison
 
 
@@ -149,7 +149,7 @@ class Evaluate(RolloutFlags):
         return 0
 
     def _compare(self, first: Path, second: Path) -> int:
-        from demorec.learn.evaluate.rollouts import load_evaluation
+        from demorec.learn.evaluate.evaluation import load_evaluation
         from demorec.learn.evaluate.statistics import compare
 
         a, b = load_evaluation(first), load_evaluation(second)

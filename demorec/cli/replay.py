@@ -35,7 +35,8 @@ class Replay:
     Recordings must replay bit-exactly (on the same type of machine); labels, phases and images are for
     demorec check --deep. Datasets hold float32 actions without the
     exploration noise that was executed; for them success and deviations are reported. Exit code 0: as recorded
-    (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded.
+    (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded. What
+    the same command has written to --out before stays.
 
     With --robot a simulated arm does what a real one did, by the actions of its dataset or imported recordings alone,
     on an empty table, and how far it is from the measured states is reported of each joint. Exit code 1: farther than

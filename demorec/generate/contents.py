@@ -8,12 +8,13 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error, without_path
-from demorec.core.files import free_name, sha256_of, sync_path
+from demorec.core.files import free_name, open_locked, sha256_of, sync_path
 from demorec.core.own_versions import differences
 from demorec.core.plain import to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
@@ -35,7 +36,8 @@ PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
 
 _NAME = r"episode_\d{6,}(\.attempt_\d+)?\.mcap"
 _RECORDING = re.compile(_NAME)
-_PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}\.part")  # of a worker: host, process, number
+_SCRATCH = re.compile(r".+-\d+-\d+")  # of a worker: host, process, number
+_PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}(\.part)?")
 _RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # since it was damaged or of another run
 _REPORT = re.compile(r"error_episode_\d+\.txt")
 _CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by somebody, so that --overwrite does not delete it
@@ -58,6 +60,24 @@ def set_aside(folder: Path) -> list[str]:
         (_number(_CARD, others), "edited dataset card", ""),
     ]
     return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
+
+
+def clear_scratch(folder: Path, run: RunFile) -> None:
+    """Remove what lost workers have left of attempts that have been made since.
+
+    Whatever else is in unfinished/, or is being written, stays.
+    """
+    made = {recording_name(line.episode_index, line.attempt, success=False) for line in run.known}
+    for scratch in (folder / UNFINISHED).glob("*"):
+        if not _SCRATCH.fullmatch(scratch.name) or scratch.is_symlink() or not scratch.is_dir():
+            continue
+        for path in scratch.iterdir():
+            if path.name.removesuffix(".part") in made:
+                with suppress(OSError):  # it is being written, or is no file
+                    os.close(open_locked(path))
+                    path.unlink()
+        with suppress(OSError):  # it holds something else
+            scratch.rmdir()
 
 
 def _number(kind: re.Pattern[str], names: list[str]) -> int:

@@ -32,7 +32,7 @@ from demorec.core.replacing import (
     replaced_parts,
     settle_parts,
 )
-from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, recordings_of, survey
+from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, clear_scratch, recordings_of, survey
 from demorec.generate.executor import peak_memory
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.runs.run_file import (
@@ -168,6 +168,7 @@ def open_run(
         with replaced_parts(path, PARTS) if replaces else nullcontext():
             folder = _begin_or_continue(path, asked, progress=progress, inspect=inspect)
         yield folder
+        clear_scratch(path, folder.run)
 
 
 def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: Inspector) -> bool:

@@ -19,11 +19,10 @@ from typing import Any
 
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
-from demorec.core.files import sync_path
 from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
-from demorec.runs.recorded import inspect_recording
+from demorec.runs.recorded import inspect_recording, place_recording
 from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
@@ -67,8 +66,7 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
             file = f"{EPISODES if attempt.success else FAILED}/" + recording_name(
                 plan.episode_index, plan.attempt, success=attempt.success
             )
-            path.replace(folder / file)
-            sync_path((folder / file).parent)
+            place_recording(path, folder / file)
     return replace(attempt, file=file, seconds=_with_rest(seconds, began))
 
 

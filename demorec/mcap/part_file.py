@@ -218,14 +218,19 @@ class PartFile:
                 take_name(self.part, self.path)
             sync_path(self.path.parent)
         except FileExistsError as error:
-            raise ConfigError(
-                f"Another file has appeared while this recording was made, and stays as it is ({self.path}); the "
-                f"recording is kept as {self.part}"
-            ) from error
+            raise name_taken(self.path, self.part) from error
         except OSError as error:
             raise self._unwritable(error) from error
         finally:
             self.close()
+
+
+def name_taken(path: Path, kept: Path) -> ConfigError:
+    """Return the error for a recording whose name somebody else's file has taken, where the recording stays."""
+    return ConfigError(
+        f"Another file has appeared while this recording was made, and stays as it is ({path}); the recording is kept "
+        f"as {kept}"
+    )
 
 
 def _lock_part(part: Path) -> int:

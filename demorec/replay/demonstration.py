@@ -81,6 +81,14 @@ class ReplayOptions:
             raise ConfigError("--state, --action and --gripper say how the data of a real arm are read: add --robot.")
 
     @property
+    def changes(self) -> str:
+        """How the commands differ from the recorded ones, for a replay's origin; "" for a plain replay."""
+        if self.states:
+            return " by its states"
+        changes = [("noise", self.noise), ("seed", self.noise and self.seed), ("delay", self.delay)]
+        return "".join(f", {name} {value}" for name, value in [*changes, ("export_hz", self.export_hz)] if value)
+
+    @property
     def is_plain(self) -> bool:
         """Whether the commands are sent as recorded."""
         return not (self.states or self.noise or self.delay or self.export_hz)

@@ -24,7 +24,7 @@ from demorec.mcap import EpisodeWriter
 from demorec.mcap.frames import pose_of
 from demorec.render.painter import Painter
 from demorec.replay.demonstration import JOINTS, OPENING, POSE_OF, Demonstration, ReplayOptions, seen_in
-from demorec.replay.rerender import config_as, recorded_view, view_behaviour, view_painter
+from demorec.replay.rerender import config_as, finished_outcome, recorded_view, view_behaviour, view_painter
 from demorec.robots.assets import allow_models
 from demorec.sim.world import World
 
@@ -303,16 +303,15 @@ def replay_all(
             if out is not None:
                 yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
                 continue
-            blind = replace(demonstration.info.simulated.scene, cameras=())
-            info = with_simulation(replace(demonstration.info, fps=demonstration.fps), scene=blind, config={})
-            world, _ = simulators.acquire(info)
-            yield replay(demonstration, world, options)[0], None
+            yield _replay_blind(demonstration, simulators, options), None
 
 
 def record_replay(
     demonstration: Demonstration, simulators: SimulatorCache, options: ReplayOptions, out: Path, *, overwrite: bool
 ) -> tuple[ReplayReport, tuple[Path, Path] | None]:
     """Replay and record it, with images of the recording's cameras, into a file of the same name in `out`.
+
+    A recording that the same call has made before stays as it is, unless it is to be replaced.
 
     Returns:
         As `replay_all` yields.
@@ -327,11 +326,23 @@ def record_replay(
     view = recorded_view(d.info)
     make_folder(out)
     behaviour = view_behaviour(d.info, view)
-    info = with_simulation(replace(d.info, fps=d.fps, origin=f"replay of {d.digest[:16]}"), behaviour=behaviour)
+    origin = f"replay of {d.digest[:16]}{options.changes}"
+    info = with_simulation(replace(d.info, fps=d.fps, origin=origin), behaviour=behaviour)
+    pair = None if d.source is None else (d.source, path)
+    if not overwrite and finished_outcome(path, info) is not None:
+        return _replay_blind(d, simulators, options), pair
     video = config_as(d.info.simulated.config.get("video", {}), VideoConfig)
     world, renderer = simulators.acquire(info)
     painter = view_painter(renderer, view, d.info.simulated.config) if renderer else None
     with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
         writer.finish(outcome)
-    return report, None if d.source is None else (d.source, path)
+    return report, pair
+
+
+def _replay_blind(d: Demonstration, simulators: SimulatorCache, options: ReplayOptions) -> ReplayReport:
+    """Replay it without images."""
+    blind = replace(d.info.simulated.scene, cameras=())
+    info = with_simulation(replace(d.info, fps=d.fps), scene=blind, config={})
+    world, _ = simulators.acquire(info)
+    return replay(d, world, options)[0]

@@ -219,7 +219,7 @@ def rerender(
         RENDERERS.check_name(str(config.get("renderer", "raster")))
         video = _video_options(info, config)
         new_info = _drawn_info(recording, view, config)
-        was_there = not overwrite and _is_drawn(out, new_info, _outcome(recording))
+        was_there = not overwrite and finished_outcome(out, new_info) == _outcome(recording)
         if not was_there:
             states = RecordedStates(info.simulated.robot, view.scene, trajectory)
             make_folder(out.parent)
@@ -265,17 +265,19 @@ def _write_drawn(
     writer.finish(_outcome(recording))
 
 
-def _is_drawn(out: Path, info: EpisodeInfo, outcome: Outcome) -> bool:
-    """Whether a whole recording is there whose description is the one that would be written now.
+def finished_outcome(path: Path, info: EpisodeInfo) -> Outcome | None:
+    """Return the outcome of a whole recording whose description is the one that would be written now, if it is there.
 
-    The description holds the digest of the source, the cameras, the looks and every option of the drawing.
+    The description holds the digest of the source, and all that decides what is drawn or replayed.
     """
     try:
-        with open_simulated(out) as drawn:
-            is_same = to_json(drawn.info) == to_json(info) and drawn.outcome == outcome
-            return is_same and bool(drawn.digest())  # which reads it to its end, against its checksums
+        with open_simulated(path) as recording:
+            if to_json(recording.info) != to_json(info):
+                return None
+            recording.digest()  # reads it to its end, against its checksums
+            return recording.outcome
     except RecordingError:
-        return False
+        return None
 
 
 def _outcome(recording: Recording) -> Outcome:

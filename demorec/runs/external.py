@@ -15,7 +15,7 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
-from demorec.core.replacing import json_object
+from demorec.core.replacing import RECORDING, json_object
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
 from demorec.runs.recorded import recorded_line
@@ -85,6 +85,7 @@ class ExternalFolder:
 
     def _line(self, file: Path, known: Mapping[str, Attempt]) -> Attempt:
         """What run.json says of a recording, or what it says itself where that is not the same file."""
+        _refuse_foreign(file)
         line = known.get(f"{EPISODES}/{file.name}")
         if line is not None and line.num_bytes == file.stat().st_size:
             return line
@@ -102,10 +103,15 @@ class ExternalFolder:
         return max(numbers, default=-1) + 1
 
     def kind(self) -> EpisodeInfo | None:
-        """Description of the last episode, which new ones must be like; None of an empty run."""
+        """Description of the last episode, which new ones must be like; None of an empty run.
+
+        ConfigError where somebody has put another file in its place.
+        """
         if not self.episodes:
             return None
-        with Recording(self.path / self.episodes[-1].file) as recording:
+        last = self.path / self.episodes[-1].file
+        _refuse_foreign(last)
+        with Recording(last) as recording:
             return recording.info
 
     def check_fits(self, info: EpisodeInfo) -> None:
@@ -122,6 +128,7 @@ class ExternalFolder:
         path = episode_path(self.path, info.episode_index)
         if not path.exists():
             return False
+        _refuse_foreign(path)
         with Recording(path) as recording:
             if recording.info == info and recording.outcome is not None:
                 return True
@@ -182,7 +189,8 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
     """Open, continue or begin a run, locked until the context ends; arguments as of `ExternalFolder`.
 
     Raises:
-        ConfigError: The folder is in use, holds another kind of run or somebody's files, or cannot be written to.
+        ConfigError: The folder is in use, holds another kind of run or somebody's files, also by the name of a
+            recording, or cannot be written to.
         RecordingError: One of its recordings is damaged.
     """
     path = path.absolute()
@@ -209,6 +217,20 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
                     (path / EPISODES).rmdir()
                     (path / LOCK_NAME).unlink()
                     path.rmdir()
+
+
+def is_cut_off(path: Path) -> bool:
+    """Check whether the last import into a run was ended before it had taken in all that it was given."""
+    run = json_object(path / RUN_NAME)
+    sessions = run.get("sessions")
+    last = sessions[-1] if isinstance(sessions, list) and sessions else None
+    return bool(run.get("planned")) or (isinstance(last, dict) and last.get("ended") == "")
+
+
+def _refuse_foreign(path: Path) -> None:
+    """Raise ConfigError for something that has a recording's name, and is none."""
+    if not path.is_file() or not RECORDING.recognises(path):
+        raise ConfigError(f"This is not a recording and is in the way, move it elsewhere: {path}")
 
 
 def planned_episode(episode_index: int) -> str:

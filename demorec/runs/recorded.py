@@ -6,10 +6,12 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from demorec.core.atomic import take_name
 from demorec.core.errors import NotGeneratedError, RecordingError
-from demorec.core.files import sha256_of
+from demorec.core.files import sha256_of, sync_path
 from demorec.episode.info import NOT_SIMULATED, EpisodeInfo
 from demorec.mcap import open_recording
+from demorec.mcap.part_file import name_taken
 from demorec.runs.run_file import Attempt
 
 
@@ -59,3 +61,27 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
     if attempt.success is None:
         raise RecordingError(f"The recording was cut off by a crash: {path}")
     return attempt, info.simulated.config, info.versions
+
+
+def place_recording(made: Path, target: Path) -> None:
+    """Move a finished recording to its place in a run, where only a recording of the same episode is replaced.
+
+    Raises:
+        ConfigError: Another file has appeared there. It stays, and so does the recording.
+        OSError: The folder cannot be written to.
+    """
+    try:
+        take_name(made, target)
+    except FileExistsError as error:
+        if not _is_same_episode(made, target):
+            raise name_taken(target, made) from error
+        made.replace(target)
+    sync_path(target.parent)
+
+
+def _is_same_episode(first: Path, second: Path) -> bool:
+    try:
+        with open_recording(first) as one, open_recording(second) as other:
+            return one.info == other.info
+    except RecordingError:
+        return False

@@ -19,10 +19,9 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.plain import to_plain
 from demorec.core.processes import process_pool
-from demorec.core.replacing import json_object
 from demorec.episode.info import EpisodeInfo
-from demorec.runs.external import ExternalFolder, differences, open_external_run
-from demorec.runs.run_file import RUN_NAME, Attempt
+from demorec.runs.external import ExternalFolder, differences, is_cut_off, open_external_run
+from demorec.runs.run_file import Attempt
 from demorec.sources.bag import Bag, Files, bags_in, open_bag
 from demorec.sources.bag_images import write_bag
 from demorec.sources.description import urdf_text
@@ -77,8 +76,7 @@ def import_bags(
         submit: Callable[..., Future[Any]]
         submit = _at_once if workers == 1 else stack.enter_context(process_pool(workers)).submit
         new = batch.look(lambda bag: submit(Bag.sha256s, bag))
-        was_unfinished = bool(json_object(out / RUN_NAME).get("planned"))
-        if new or was_unfinished or (known.bags and batch.skipped_bags() != known.skipped):
+        if new or is_cut_off(out) or (known.bags and batch.skipped_bags() != known.skipped):
             with open_external_run(out, recovers=False) as folder:
                 batch.run(
                     new,

@@ -24,6 +24,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.core.atomic import atomic_write
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.files import LOCK_NAME
 from demorec.core.replacing import (
     IMAGE,
     RECORDING,
@@ -36,7 +37,7 @@ from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.generate import reproduce as reproducing
 from demorec.generate.options import RunResult
-from demorec.learn.evaluate.rollouts import Settings, _open
+from demorec.learn.evaluate.evaluation import Evaluation, Settings, open_evaluation
 from demorec.mcap import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 
@@ -313,11 +314,16 @@ def test_a_folder_of_somebody_else_is_not_taken_for_what_was_set_aside(tmp_path:
 # An evaluation.
 
 
+def opened(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
+    with open_evaluation(settings, out, overwrite=overwrite) as found:
+        return found
+
+
 @pytest.fixture
 def evaluation(tmp_path: Path, made: Path) -> Path:
     """One with a rollout in each folder."""
     out = tmp_path / "evaluation"
-    _open(SETTINGS, out, overwrite=False)
+    opened(SETTINGS, out, overwrite=False)
     for place in ("episodes", "failed"):
         shutil.copy(made / "alone.mcap", out / place / "episode_000000.mcap")
     return out
@@ -334,18 +340,18 @@ def test_an_evaluation_with_something_foreign_is_not_overwritten(evaluation: Pat
     (evaluation / foreign).write_text("mine")
     before = files_of(evaluation)
     with pytest.raises(ConfigError, match="not part of an evaluation") as error:
-        _open(SETTINGS, evaluation, overwrite=True)
+        opened(SETTINGS, evaluation, overwrite=True)
     assert foreign in str(error.value)
     with pytest.raises(ConfigError, match="Another evaluation") as error:
-        _open(replace(SETTINGS, episode_length=7), evaluation, overwrite=False)
+        opened(replace(SETTINGS, episode_length=7), evaluation, overwrite=False)
     assert "--overwrite" not in str(error.value)  # since it would be refused
     assert files_of(evaluation) == before
 
 
 def test_an_evaluation_is_overwritten_and_what_lies_beside_stays(evaluation: Path) -> None:
     (evaluation / "notes.txt").write_text("mine")
-    _open(SETTINGS, evaluation, overwrite=True)
-    assert files_of(evaluation).keys() == {EVALUATION_NAME, "notes.txt"}
+    opened(SETTINGS, evaluation, overwrite=True)
+    assert files_of(evaluation).keys() == {EVALUATION_NAME, LOCK_NAME, "notes.txt"}
 
 
 def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) -> None:
@@ -355,10 +361,10 @@ def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) ->
     plain["versions"]["torch"] = "1.0"
     (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))
     with pytest.raises(ConfigError, match=r"version of torch is 1\.0 there"):
-        _open(SETTINGS, evaluation, overwrite=False)
+        opened(SETTINGS, evaluation, overwrite=False)
     del plain["versions"]  # as of an older demorec
     (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))
-    assert not _open(SETTINGS, evaluation, overwrite=False).versions
+    assert not opened(SETTINGS, evaluation, overwrite=False).versions
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "", '{"settings": 1, "rollouts": []}'])
@@ -366,7 +372,7 @@ def test_what_only_has_the_name_of_an_evaluation_is_kept(evaluation: Path, conte
     (evaluation / EVALUATION_NAME).write_text(content)
     before = files_of(evaluation)
     with pytest.raises(ConfigError, match="not an evaluation"):
-        _open(SETTINGS, evaluation, overwrite=True)
+        opened(SETTINGS, evaluation, overwrite=True)
     assert files_of(evaluation) == before
 
 

@@ -5,82 +5,19 @@ The options are found by their types, so that those of a new command are tried a
 
 from __future__ import annotations
 
-import dataclasses
 import re
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hints
+from typing import Any, Literal, get_args, get_origin
 
 import pytest
 from support.commands import exit_code
-from tyro.conf import Positional
-
-from demorec.cli import COMMANDS, subcommands_of
-from demorec.core.tables import EXPORTERS
-from demorec.core.targets import OptionalTarget, Target
+from support.options import OPTIONS, TARGETS, Option, parts_of
 
 READ_PATHS = {"a", "b", "bags", "calibration", "compare", "config", "dataset", "datasets", "file", "mapping", "path",
               "paths", "policy", "scores", "sources", "urdf"}  # fmt: skip
 """Paths that are read; every other one names something new."""
 WITHOUT_REASON = re.compile("Could not (find valid parse for|parse) arguments")
 """What tyro says of several values."""
-_POSITIONAL = get_args(Positional[int])[1]
-
-
-class Option(NamedTuple):
-    """An option of a command: the words of the command, its name, and its type."""
-
-    command: tuple[str, ...]
-    name: str
-    type: Any
-    is_required: bool
-
-    @property
-    def is_positional(self) -> bool:
-        return _POSITIONAL in get_args(self.type)
-
-    def takes(self, *kinds: object) -> bool:
-        """Whether its values, or those of a pair or list, are of one of these types."""
-        return any(kind in kinds for kind in _parts(self.type))
-
-    @property
-    def is_pair(self) -> bool:
-        """Whether it takes two values."""
-        return any(get_origin(kind) is tuple and Ellipsis not in get_args(kind) for kind in _parts(self.type))
-
-
-def _parts(kind: Any) -> Iterator[Any]:
-    yield kind
-    if get_origin(kind) is not Literal:
-        for part in get_args(kind):
-            yield from _parts(part)
-
-
-def _fields(owner: type) -> Iterator[tuple[str, Any, bool]]:
-    hints = get_type_hints(owner, include_extras=True)
-    for field in dataclasses.fields(owner):
-        kinds = [
-            kind for kind in _parts(hints[field.name]) if isinstance(kind, type) and dataclasses.is_dataclass(kind)
-        ]
-        if kinds:
-            yield from _fields(kinds[0])
-        else:
-            is_required = field.default is dataclasses.MISSING and field.default_factory is dataclasses.MISSING
-            yield field.name, hints[field.name], is_required
-
-
-def _options() -> Iterator[Option]:
-    for name in COMMANDS.names():
-        command = COMMANDS.load(name)
-        below = subcommands_of(command)
-        found = [((name,), command)] if below is None else [((name, sub), below.load(sub)) for sub in below.names()]
-        for words, owner in found:
-            yield from (Option(words, *field) for field in _fields(owner))
-    for name in EXPORTERS.names():
-        yield from (Option(("export", name), *field) for field in _fields(EXPORTERS.load(name).options))
-
-
-OPTIONS = tuple(_options())
 
 
 def words_with(option: Option, value: list[str]) -> list[str]:
@@ -98,7 +35,7 @@ def _example(option: Option, *, is_named: bool) -> list[str]:
     """A value that the option takes; none if the words of the command are one already."""
     if option.name == "format":
         return [] if is_named else ["lerobot"]
-    literals = [get_args(kind)[0] for kind in _parts(option.type) if get_origin(kind) is Literal]
+    literals = [get_args(kind)[0] for kind in parts_of(option.type) if get_origin(kind) is Literal]
     return [*([] if option.is_positional else [f"--{option.name}"]), literals[0] if literals else "new.html"]
 
 
@@ -138,9 +75,6 @@ def test_texts_are_lines(option: Option, text: str, capsys: pytest.CaptureFixtur
     told = refusal(option, [text], capsys)
     assert "is not one line of text" in told or WITHOUT_REASON.search(told)
     assert repr(text)[1:-1].replace("\\n", "") in told.replace("\\\\", "\\").replace("\\n", "")
-
-
-TARGETS = [option for option in OPTIONS if {Target, OptionalTarget} & {option.type}]
 
 
 def test_every_path_is_read_or_a_target() -> None:

@@ -24,7 +24,8 @@ from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
 from demorec.gym_env import DemorecEnv, Situation
 from demorec.learn.evaluate import TakeOver, rollouts
-from demorec.learn.evaluate.rollouts import Evaluation, Settings, make_rollout
+from demorec.learn.evaluate.evaluation import Evaluation, Settings
+from demorec.learn.evaluate.rollouts import make_rollout
 from demorec.learn.evaluate.turns import Turns, read_takeover
 from demorec.learn.evaluate.watch import Watch
 from demorec.loop import ScriptAgent, Session, make_world, prepare

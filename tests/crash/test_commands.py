@@ -13,172 +13,27 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from rerun.chunk import RrdReader
-from support.check import simulate
-from support.crash import Running, run_command
-from support.export import content_of, export, files_of, make_run
-from support.hdf5 import write_robomimic
+from support.crash import Ended, Running, SmallDisk, on_small_disk, run_command
+from support.crash_rows import LONG, MAKERS, ROWS, SLOW, make_base
+from support.export import content_of, files_of
+from support.options import TARGETS
 
 from demorec.core.limited import VARIABLE
-from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+from demorec.core.tables import EXPORTERS
+from demorec.runs.find import IMPORT_WORDS
 
 KILLS = 8
 MINE = "years of work"
-SLOW = (pytest.mark.slow,)
-LONG = (pytest.mark.slow, pytest.mark.long)
 
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 
 
-@dataclass(frozen=True, kw_only=True)
-class Row:
-    """A command that writes.
-
-    Attributes:
-        call: Its words; SOURCES is a folder with a run, a dataset and recordings.
-        targets: What it makes in the current folder, each whole or absent: a path, or a pattern.
-        old: Words that make what the command replaces with `--overwrite`; "" for a command that has no such flag.
-        resumes: Whether an interrupted command leaves finished targets, among which it goes on.
-        surprise: A target that somebody else makes while the command runs.
-        keeps: Whether the result is kept under another name then.
-        flag: Lets the command replace what is there.
-        runs: When the tests run.
-    """
-
-    call: str
-    targets: tuple[str, ...]
-    old: str = ""
-    resumes: bool = False
-    surprise: str = ""
-    keeps: bool = True
-    flag: str = "--overwrite"
-    runs: tuple[pytest.MarkDecorator, ...] = ()
-
-    @property
-    def surprising(self) -> str:
-        return self.surprise or self.targets[0]
-
-
-ROWS = {
-    "score": Row(
-        call="dataset score SOURCES/dataset --out new.json",
-        targets=("new.json",),
-        old="dataset score SOURCES/other --out new.json",
-    ),
-    "split": Row(
-        call="dataset split SOURCES/dataset --shares train=0.7 val=0.3 --seed 1 --out new",
-        targets=("new/train", "new/val"),
-        old="dataset split SOURCES/dataset --shares train=0.3 val=0.7 --seed 0 --out new",
-        surprise="new/val",
-    ),
-    "view several": Row(
-        call="view SOURCES/run --episodes 0:2 --save new.rrd",
-        targets=("new-0000.rrd", "new-0001.rrd"),
-        old="view SOURCES/reversed --episodes 0:2 --save new.rrd",
-        surprise="new-0001.rrd",
-        runs=SLOW,
-    ),
-    "import": Row(
-        call="import lerobot SOURCES/dataset --out new",
-        targets=("new/episodes/*.mcap",),
-        surprise="new/episodes/episode_000001.mcap",
-        resumes=True,
-        keeps=False,
-        runs=SLOW,
-    ),
-    "import hdf5": Row(
-        call="import hdf5 SOURCES/demo.hdf5 --mapping SOURCES/hdf5.toml --out new",
-        targets=("new/episodes/*.mcap",),
-        surprise="new/episodes/episode_000001.mcap",
-        resumes=True,
-        keeps=False,
-        runs=LONG,
-    ),
-    "export lerobot": Row(
-        call="export lerobot SOURCES/run --no-verify --out new",
-        targets=("new",),
-        old="export lerobot SOURCES/run --episodes 1 --no-verify --out new",
-        runs=SLOW,
-    ),
-    "export hdf5": Row(
-        call="export hdf5 SOURCES/run --out new.hdf5",
-        targets=("new.hdf5",),
-        old="export hdf5 SOURCES/run --episodes 1 --out new.hdf5",
-        runs=SLOW,
-    ),
-    "recover": Row(
-        call="recover SOURCES/cut.mcap --out new.mcap",
-        targets=("new.mcap",),
-        old="recover SOURCES/other_cut.mcap --out new.mcap",
-        runs=SLOW,
-    ),
-    "append": Row(
-        call="export lerobot SOURCES/run --episodes 1: --no-verify --out new",
-        targets=("new",),
-        old="export lerobot SOURCES/run --episodes 0 --no-verify --out new",
-        flag="--append",
-        runs=LONG,
-    ),
-    "export lerobot with processes": Row(
-        call="export lerobot SOURCES/run --no-verify --workers 2 --out new",
-        targets=("new",),
-        old="export lerobot SOURCES/run --episodes 1 --no-verify --out new",
-        runs=LONG,
-    ),
-    "edit": Row(
-        call="dataset select SOURCES/dataset --episodes 0:2 --out new",
-        targets=("new",),
-        old="dataset select SOURCES/dataset --episodes 2 --out new",
-        runs=LONG,
-    ),
-    "merge": Row(
-        call="dataset merge SOURCES/dataset SOURCES/other --out new",
-        targets=("new",),
-        old="dataset select SOURCES/dataset --episodes 2 --out new",
-        runs=LONG,
-    ),
-    "report": Row(
-        call="report SOURCES/dataset --no-checks --out new.html",
-        targets=("new.html",),
-        old="report SOURCES/run --no-checks --out new.html",
-        runs=LONG,
-    ),
-    "view": Row(
-        call="view SOURCES/run --episodes 0 --save new.rrd",
-        targets=("new.rrd",),
-        old="view SOURCES/run --episodes 1 --save new.rrd",
-        runs=LONG,
-    ),
-    "replay": Row(
-        call="replay SOURCES/e.mcap --out new",
-        targets=("new/*.mcap",),
-        surprise="new/e.mcap",
-        resumes=True,
-        runs=LONG,
-    ),
-    "render": Row(
-        call="render SOURCES/e.mcap --cameras front --workers 1 --out new.mcap",
-        targets=("new.mcap",),
-        old="recover SOURCES/other_cut.mcap --out new.mcap",
-        resumes=True,
-        runs=LONG,
-    ),
-    "generate": Row(
-        call="generate --num-episodes 2 --cameras none --workers 1 --no-export --no-check --out new",
-        targets=("new/episodes/*.mcap",),
-        surprise="new/notes.txt",
-        resumes=True,
-        keeps=False,
-        runs=LONG,
-    ),
-}
-"""All commands that write, but for imports of bags, screenshots, and evaluate and correct, which need a policy."""
 NAMES = [pytest.param(name, marks=row.runs) for name, row in ROWS.items()]
 KILLED = [pytest.param(name, marks=LONG if row.runs and row.old else row.runs) for name, row in ROWS.items()]
 """Replacing is killed, too, which is more."""
@@ -187,24 +42,18 @@ REPLACING = [pytest.param(name, marks=row.runs or SLOW) for name, row in ROWS.it
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run, datasets and recordings, as small as they can be."""
     folder = tmp_path_factory.mktemp("sources").resolve()
-    make_run(folder / "run", (4, 5, 6), cameras=("front",))
-    make_run(folder / "reversed", (6, 4, 5), cameras=("front",))
-    export(folder / "run", folder / "dataset")
-    export(folder / "reversed", folder / "other")
-    simulate(folder / "e.mcap", fps=10, max_episode_seconds=0.5, cameras=("front",), width=32, height=32)
-    for name, source in (("cut", "run/episodes/episode_000000"), ("other_cut", "run/episodes/episode_000001")):
-        (folder / f"{name}.mcap").write_bytes((folder / f"{source}.mcap").read_bytes()[:-400])
-    hdf5 = write_robomimic(folder / "demo.hdf5")
-    (folder / "hdf5.toml").write_text("\n".join(suggested_hdf5_mapping(hdf5)))
+    make_base(folder)
     return folder
 
 
 @pytest.fixture
-def sources(made: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The sources, compared afterwards."""
+def sources(made: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+    """What the command reads, compared afterwards."""
     monkeypatch.setenv(VARIABLE, "off")  # else each command forks once more
+    for name in ROWS[request.node.callspec.params["name"]].needs:
+        if not (made / name).exists():
+            MAKERS[name](made)
     before = files_of(made)
     yield made
     assert files_of(made) == before
@@ -220,10 +69,10 @@ class Case:
         self._start = folder / f"start_{replaces}"
         self._start.mkdir()
         if replaces:
-            assert run_command(self._words(self.row.old), self._start).code == 0
+            assert self._run(self._words(self.row.old), self._start).code == 0
         self.start_anew()
         self.before, self.all_before = self.state(), self.everything()
-        ended = run_command(self.words, self.folder)
+        ended = self.run()
         assert ended.code == 0, ended.said
         self.num_changes = ended.num_changes
         self.after, self.all_after = self.state(), self.everything()
@@ -231,6 +80,13 @@ class Case:
 
     def _words(self, call: str) -> list[str]:
         return call.replace("SOURCES", str(self._sources)).split()
+
+    def _run(self, words: list[str], folder: Path, **arguments: Any) -> Ended:
+        return run_command(words, folder, program=self.row.program, **arguments)
+
+    def run(self, **arguments: Any) -> Ended:
+        """Run the command; arguments as of `Running`."""
+        return self._run(self.words, self.folder, **arguments)
 
     def start_anew(self) -> None:
         """Empty the folder, and put the old into it."""
@@ -261,7 +117,7 @@ class Case:
         """Run the same command again, unless its result is there: it gives the undisturbed one, and nothing else."""
         replaces_again = self._replaces and self.row.flag == "--overwrite"
         if self.state() != self.after or replaces_again or self.row.resumes:
-            ended = run_command(self.words, self.folder)
+            ended = self.run()
             assert ended.code == 0, (told, ended.said)
             assert self.everything() == self.all_after, told
         assert self.state() == self.after, told
@@ -286,7 +142,7 @@ def killed(case: Case) -> None:
     left_something = False
     for moment in case.moments(KILLS):
         case.start_anew()
-        ended = run_command(case.words, case.folder, at=moment, act=kill)
+        ended = case.run(at=moment, act=kill)
         assert ended.code == -signal.SIGKILL
         left_something |= any(case.folder.iterdir())
         case.check_whole(moment)
@@ -304,6 +160,22 @@ def test_killed_at_eight_moments_of_replacing(name: str, sources: Path, tmp_path
     killed(Case(name, sources, tmp_path, replaces=True))
 
 
+def check_full(case: Case, ended: Ended) -> None:
+    """Check what a command that fails on a full disk says and leaves, and that it gives its result where there is room.
+
+    It ends well where the disk has just enough room.
+    """
+    if ended.code == 0:
+        assert case.state() == case.after
+        return
+    assert ended.code == 1
+    assert len(ended.said) == 1
+    assert "unexpected" not in ended.said[0]
+    case.check_whole("full disk")
+    if not case.row.resumes:
+        assert case.everything() == case.all_before
+
+
 @pytest.mark.parametrize("name", NAMES)
 def test_a_full_disk(name: str, sources: Path, tmp_path: Path) -> None:
     """A limit on the size of a file fails the write that crosses it, as a full disk does."""
@@ -311,17 +183,38 @@ def test_a_full_disk(name: str, sources: Path, tmp_path: Path) -> None:
         case = Case(name, sources, tmp_path, replaces=replaces)
         case.start_anew()
         largest = max(len(content) for content in files_of(case.folder).values()) if replaces else 0
-        run_command(case.words, case.folder)
+        case.run()
         largest = max(largest, *(len(content) for content in files_of(case.folder).values()))
         case.start_anew()
-        ended = run_command(case.words, case.folder, max_bytes=largest // 3)
+        ended = case.run(max_bytes=largest // 3)
         assert ended.code == 1
-        assert len(ended.said) == 1
-        assert "unexpected" not in ended.said[0]
-        case.check_whole("full disk")
-        if not case.row.resumes:
-            assert case.everything() == case.all_before
+        check_full(case, ended)
         case.check_again("full disk")
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=row.runs or SLOW) for name, row in ROWS.items()])
+def test_a_full_file_system(name: str, sources: Path, tmp_path: Path) -> None:
+    """A real one, with room for nothing, for some and for most of what the command writes."""
+
+    def work(disk: SmallDisk) -> None:
+        for replaces in {False, bool(ROWS[name].old)}:
+            case = Case(name, sources, disk.folder, replaces=replaces)
+            page = os.statvfs(disk.folder).f_frsize
+            written = [len(content) for file, content in files_of(case.folder).items() if not file.endswith(".lock")]
+            num_pages = sum(-(-size // page) for size in written)
+            codes = set()
+            for room in {0, num_pages // 3, num_pages * 2 // 3, num_pages - 1}:
+                case.start_anew()
+                disk.resize(disk.num_used + room * page)
+                ended = case.run()
+                disk.resize()
+                check_full(case, ended)
+                case.check_again(room)
+                codes.add(ended.code)
+            assert 1 in codes
+
+    (tmp_path / "disk").mkdir()
+    on_small_disk(tmp_path / "disk", work)
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -339,7 +232,7 @@ def test_a_target_that_appears_meanwhile_stays(name: str, sources: Path, tmp_pat
                 mine.parent.mkdir(parents=True, exist_ok=True)
                 mine.write_text(MINE)
 
-        ended = run_command(case.words, case.folder, at=(case.num_changes + 1) // 2, act=write)
+        ended = case.run(at=(case.num_changes + 1) // 2, act=write)
         assert ended.code == 2
         assert len(ended.said) == 1
         assert mine.read_text() == MINE
@@ -360,10 +253,11 @@ def test_two_at_once(name: str, sources: Path, tmp_path: Path) -> None:
             os.write(reached[1], b"x")
             os.read(go_on[0], 1)
 
-    first = Running(case.words, case.folder, at=(case.num_changes + 1) // 2, act=wait)
+    half = (case.num_changes + 1) // 2
+    first = Running(case.words, case.folder, program=case.row.program, at=half, act=wait)
     os.close(reached[1])
     assert os.read(reached[0], 1) == b"x"  # nothing if it has ended
-    second = run_command(case.words, case.folder)
+    second = case.run()
     os.write(go_on[1], b"x")
     ended = [first.wait(), second]
     assert sorted(each.code for each in ended) == [0, 2]
@@ -383,7 +277,7 @@ def test_a_second_interrupt_during_the_clean_up(name: str, sources: Path, tmp_pa
 
     for moment in case.moments(5)[1:-1]:
         case.start_anew()
-        ended = run_command(case.words, case.folder, at=moment, act=interrupt)
+        ended = case.run(at=moment, act=interrupt)
         assert ended.code == 130, moment
         case.check_whole(moment)
         case.check_again(moment)
@@ -402,3 +296,16 @@ def test_closed_streams(name: str, sources: Path, tmp_path: Path) -> None:
         assert ended.returncode in (0, 1), line
         case.check_whole(line)
         case.check_again(line)
+
+
+def test_every_command_that_writes_has_a_row() -> None:
+    words = {option: " ".join(option.command) for option in TARGETS if option.command != ("export",)}
+    wanted = {(head, option.name) for option, head in words.items()}
+    wanted |= {(f"import {word}", "out") for word in IMPORT_WORDS.values()}
+    wanted |= {(f"export {word}", "out") for word in EXPORTERS.names()}
+    calls = [row.call for row in ROWS.values()]
+    without = {
+        (head, flag) for head, flag in wanted if not any(c.startswith(f"{head} ") and f"--{flag} " in c for c in calls)
+    }
+    assert not without
+    assert any(call.startswith("import SOURCES") for call in calls)

@@ -15,6 +15,7 @@ from typing import Any
 import psutil
 import pytest
 from support.generate import Remembers, expected_attempts, inspect, num_finished, run_fake
+from support.kills import generation, made_of, run_killed
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
@@ -187,6 +188,20 @@ def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) 
     assert len(one.run.successes) == NUM_REAL
     assert ray.run.digest == one.run.digest
     assert [a.sha256 for a in ray.run.attempts] == [a.sha256 for a in one.run.attempts]
+
+
+@pytest.mark.long
+def test_one_digest_for_any_workers_ray_and_twelve_kills(tmp_path: Path) -> None:
+    number = 24
+    ways = {"one": 1, "two": 2, "three": 3, "ray": 2}
+    for name, workers in ways.items():
+        more = ("--executor", "ray") if name == "ray" else ()
+        subprocess.run(generation(tmp_path / name, number, *more, workers=workers), check=True)
+    run_killed(tmp_path / "killed", number, num_kills=12)
+    assert len(made_of(tmp_path / "one")[1]) >= number
+    for name in (*ways, "killed"):
+        assert made_of(tmp_path / name) == made_of(tmp_path / "one"), name
+        assert not list((tmp_path / name / "unfinished").iterdir()), name
 
 
 @pytest.mark.long

@@ -15,12 +15,15 @@ import pytest
 from support import generate as generating
 from support.commands import exit_code
 from support.generate import Remembers, attempts_of, expected_attempts, run_fake
+from support.recording import write_episode
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError, MissingDependencyError, ResourceError
+from demorec.core.files import open_locked
 from demorec.generate import contents
 from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
+from demorec.runs.recorded import place_recording
 from demorec.runs.run_file import load_run_file
 
 
@@ -193,3 +196,43 @@ def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(
     assert "Traceback" not in told.err
     assert len((told.err or told.out).splitlines()) <= 8
     assert not (tmp_path / "copy").exists()
+
+
+def test_what_a_lost_worker_left_goes_when_its_episode_is_made(tmp_path: Path, reference: RunResult) -> None:
+    """Not what is being written, what is of an episode that was not made, or what somebody has put there."""
+    out = Path(shutil.copytree(reference.folder, tmp_path / "run"))
+    left = {
+        "node-1-0/episode_000002.attempt_0.mcap.part": False,
+        "node-2-0/episode_000003.attempt_0.mcap": False,
+        "node-3-0/episode_000900.attempt_0.mcap.part": True,
+        "node-4-0/notes.txt": True,
+        "node-5-0/episode_000004.attempt_0.mcap.part": True,
+    }
+    for name in left:
+        (out / "unfinished" / name).parent.mkdir()
+        (out / "unfinished" / name).write_bytes(b"half")
+    handle = open_locked(out / "unfinished/node-5-0/episode_000004.attempt_0.mcap.part")
+    run_fake(out)
+    os.close(handle)
+    stays = {name for name, is_kept in left.items() if is_kept}
+    assert {str(path.relative_to(out / "unfinished")) for path in out.glob("unfinished/*/*")} == stays
+    assert len(list(out.glob("unfinished/*"))) == len(stays)
+
+
+@pytest.mark.parametrize("there", ["a text", "another episode", "the same episode"])
+def test_a_recording_takes_the_name_of_no_other_file(tmp_path: Path, there: str) -> None:
+    """As a worker of generate-dataset or evaluate gives it."""
+    made, target = write_episode(tmp_path / "made.mcap", num_frames=3), tmp_path / "episode.mcap"
+    if there == "a text":
+        target.write_text("years of work")
+    else:
+        write_episode(target, num_frames=3, episode_index=int(there == "another episode"))
+    mine, new = target.read_bytes(), made.read_bytes()
+    if there == "the same episode":
+        place_recording(made, target)
+        assert target.read_bytes() == new
+        assert not made.exists()
+        return
+    with pytest.raises(ConfigError, match=f"stays as it is .*{target.name}.* is kept as .*{made.name}"):
+        place_recording(made, target)
+    assert (target.read_bytes(), made.read_bytes()) == (mine, new)

@@ -5,15 +5,18 @@ from __future__ import annotations
 import os
 import resource
 import signal
+import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import pytest
+
 from demorec.cli import main
 
-TIMEOUT_S = 60
+TIMEOUT_S = 240
 """After this a child counts as hung, and is killed."""
 _UNEXPECTED = 99
 """Exit code of a child whose command raised something."""
@@ -36,6 +39,7 @@ class Running:
     Args:
         words: The command line without the program's name.
         folder: Current folder of the command; changes of files below it are counted.
+        program: Takes the command line, and ends by SystemExit.
         at: Number of a change, from 1; 0 for none.
         act: Called in the child before that change with 0, before the next one with 1, and so on.
         max_bytes: Size that no file may exceed, as on a full disk; 0 for any.
@@ -46,6 +50,7 @@ class Running:
         words: Sequence[str],
         folder: Path,
         *,
+        program: Callable[[list[str]], object] = main,
         at: int = 0,
         act: Callable[[int], object] = lambda number: None,
         max_bytes: int = 0,
@@ -61,9 +66,11 @@ class Running:
                 os.dup2(said, 2)
                 sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
                 if max_bytes:
+                    # Python would leave bytecode that is cut off.
+                    sys.dont_write_bytecode, os.environ["PYTHONDONTWRITEBYTECODE"] = True, "1"
                     resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
                 _count_changes(folder, at, act, counted)
-                main(list(words))
+                program(list(words))
             except SystemExit as ended:
                 sys.stderr.flush()
                 os._exit(int(ended.code or 0))
@@ -87,6 +94,69 @@ class Running:
 def run_command(words: Sequence[str], folder: Path, **arguments: object) -> Ended:
     """Run a command in a child to its end; arguments as of `Running`."""
     return Running(words, folder, **arguments).wait()  # type: ignore[arg-type]
+
+
+class SmallDisk:
+    """An empty file system of the kernel's own, in memory, whose size can be changed; seen by this process alone.
+
+    Args:
+        folder: Where it is mounted.
+
+    Raises:
+        OSError: The kernel gives no such file system to this user.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, user, group = folder, os.getuid(), os.getgid()
+        os.unshare(os.CLONE_NEWUSER | os.CLONE_NEWNS)
+        for name, text in (("setgroups", "deny"), ("uid_map", f"0 {user} 1"), ("gid_map", f"0 {group} 1")):
+            Path("/proc/self", name).write_text(text)
+        self._mount("size=1g")
+
+    def _mount(self, options: str) -> None:
+        command = ["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(self.folder)]
+        if subprocess.run(command, capture_output=True, check=False).returncode:
+            raise OSError(f"mount -o {options} is refused")
+
+    @property
+    def num_used(self) -> int:
+        """Bytes."""
+        status = os.statvfs(self.folder)
+        return (status.f_blocks - status.f_bfree) * status.f_frsize
+
+    def resize(self, num_bytes: int = 1 << 30) -> None:
+        """Let it hold so many bytes, at least one page of memory; a gigabyte unless said otherwise."""
+        self._mount(f"remount,size={num_bytes or 1}")  # 0 is no limit
+
+
+def on_small_disk(folder: Path, work: Callable[[SmallDisk], object]) -> None:
+    """Do something in a forked child, which alone sees a small disk; its failure is the test's.
+
+    Where the kernel has no such file system for this user, the test is skipped.
+    """
+    reading, writing = os.pipe()
+    pid = os.fork()
+    if pid == 0:
+        told = b""
+        try:
+            disk = SmallDisk(folder)
+        except OSError as error:
+            told = f"skip: the kernel gives no file system of its own to this user ({error})".encode()
+        else:
+            try:
+                work(disk)
+            except BaseException:
+                told = traceback.format_exc().encode()
+        os.write(writing, told[-60_000:])
+        os._exit(0)
+    os.close(writing)
+    with os.fdopen(reading, errors="replace") as file:
+        said = file.read()
+    os.waitpid(pid, 0)
+    if said.startswith("skip: "):
+        pytest.skip(said.removeprefix("skip: "))
+    if said:
+        pytest.fail(said, pytrace=False)
 
 
 def _count_changes(folder: Path, at: int, act: Callable[[int], object], counted: int) -> None:

@@ -10,36 +10,13 @@ The recordings are ordinary ones (view, check, replay and export work on them); 
 from __future__ import annotations
 
 import functools
-import json
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field, replace
-from importlib.metadata import PackageNotFoundError, version
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
-from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
-from demorec.core.errors import (
-    ConfigError,
-    DemorecError,
-    GenerationError,
-    MissingDependencyError,
-    describe_error,
-    resource_error,
-    write_error,
-)
-from demorec.core.files import make_folder, read_json_object, replace_text
-from demorec.core.own_versions import differences
-from demorec.core.plain import from_plain, to_plain
-from demorec.core.replacing import (
-    ReplaceableKind,
-    check_replaceable,
-    json_object,
-    obstacle,
-    replaced_parts,
-    settle_parts,
-)
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, describe_error
 from demorec.core.tables import ROBOTS, camera_name
 from demorec.episode.episode import Outcome
 from demorec.episode.features import (
@@ -54,11 +31,17 @@ from demorec.episode.features import (
 )
 from demorec.episode.info import sensor_feature
 from demorec.episode.simulated import with_simulation
-from demorec.generate.contents import foreign_recordings
 from demorec.generate.executor import Raised
 from demorec.generate.local import LocalExecutor
 from demorec.gym_env import DemorecEnv
-from demorec.learn.evaluate import TakeOver
+from demorec.learn.evaluate.evaluation import (
+    Evaluation,
+    Settings,
+    load_evaluation,
+    open_evaluation,
+    save_evaluation,
+    with_rollouts,
+)
 from demorec.learn.evaluate.policy import (
     Policy,
     check_steps,
@@ -68,13 +51,12 @@ from demorec.learn.evaluate.policy import (
     policy_inputs,
     trained_action,
 )
-from demorec.learn.evaluate.statistics import Rate, factors_of
 from demorec.learn.evaluate.turns import Turns
 from demorec.learn.evaluate.watch import correcting_behaviour
-from demorec.loop import make_world, prepare
+from demorec.loop import make_world
 from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import RobotSpec
-from demorec.runs.find import EVALUATION_NAME
+from demorec.runs.recorded import place_recording
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.sim.sensors import SENSORS
 from demorec.sim.world import World
@@ -82,65 +64,6 @@ from demorec.sim.world import World
 _SENSORS = [sensor_feature(sensor.quantity) for sensor in SENSORS]
 
 MAKE_ROLLOUT = "demorec.learn.evaluate.rollouts:make_rollout"
-
-
-@dataclass(frozen=True, kw_only=True)
-class Settings:
-    """What decides the result of an evaluation.
-
-    Attributes:
-        policy: Folder of the policy; where it lies does not matter, `policy_digest` does.
-        policy_type: LeRobot's name of its kind ("act").
-        policy_digest: SHA-256 of its config and weights, 16 hex digits.
-        config: Task, split, root seed, cameras: which scenes, seen how.
-        action: What the policy's actions mean.
-        action_steps: Actions executed before it looks again; None: as trained.
-        privileged: Whether it sees observation.environment_state.
-        sensed: What else it sees of the features that datasets have only when named.
-        state: What its observation.state holds.
-        episode_length: Time limit; None: the environment's.
-        takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
-    """
-
-    policy: str
-    policy_type: str
-    policy_digest: str
-    config: GenerateConfig
-    action: ActionKind
-    action_steps: int | None = None
-    privileged: bool = False
-    sensed: tuple[str, ...] = ()
-    state: StateKind = "joint"
-    episode_length: int | None = None
-    takeover: TakeOver | None = None
-
-
-@dataclass(frozen=True, kw_only=True)
-class Evaluation:
-    """An evaluation, finished or not.
-
-    Attributes:
-        settings: What decides the result.
-        rollouts: One line each, in the order of the episodes.
-        factors: For each of these, what was randomised in its scene.
-        versions: package -> version, of what decides scenes, rollouts and the policy's answers; none in evaluations of
-            older versions of demorec.
-    """
-
-    settings: Settings
-    rollouts: tuple[Attempt, ...] = ()
-    factors: tuple[Mapping[str, float], ...] = field(default=())
-    versions: Mapping[str, str] = field(default_factory=dict)
-
-    @property
-    def rate(self) -> Rate:
-        """Of strict successes."""
-        return Rate(successes=sum(bool(r.success) for r in self.rollouts), trials=len(self.rollouts))
-
-    @property
-    def successes(self) -> dict[int, bool]:
-        """Scene (episode index) -> success."""
-        return {r.episode_index: bool(r.success) for r in self.rollouts}
 
 
 def settings_for(
@@ -214,39 +137,32 @@ def evaluate(
     """Run the policy in episodes 0 .. num_episodes - 1; goes on where an evaluation in `out` stopped.
 
     Raises:
-        ConfigError: Another evaluation, or something else, is in the folder; or what is to be overwritten is not an
-            evaluation alone.
+        ConfigError: Another evaluation, or something else, is in the folder, or another command writes there; or what
+            is to be overwritten is not an evaluation alone.
         DemorecError: A rollout could not be carried out.
     """
-    evaluation = _open(settings, out, overwrite=overwrite)
-    done = evaluation.successes
-    due = [
-        EpisodePlan(config=settings.config, episode_index=index) for index in range(num_episodes) if index not in done
-    ]
+    with open_evaluation(settings, out, overwrite=overwrite) as evaluation:
+        return _with_missing(evaluation, out, num_episodes=num_episodes, workers=workers, progress=progress)
+
+
+def _with_missing(
+    evaluation: Evaluation, out: Path, *, num_episodes: int, workers: int, progress: Callable[[Evaluation], None]
+) -> Evaluation:
+    """Run the policy in the episodes that an evaluation lacks."""
+    config, done = evaluation.settings.config, evaluation.successes
+    due = [EpisodePlan(config=config, episode_index=index) for index in range(num_episodes) if index not in done]
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
         for report in chain.from_iterable(executor.carry_out(functools.partial(next, iter(due), None))):
             if isinstance(report, Raised):
                 if report.kind == MissingDependencyError.__name__:
                     raise DemorecError(report.message)
-                raise DemorecError(
-                    f"Episode {report.plan.episode_index}: {report.kind}: {report.message.rstrip('.')}; the same "
-                    "command goes on."
+                raise report.error(
+                    f"Episode {report.plan.episode_index}: {report.message.rstrip('.')}; the same command goes on."
                 )
-            evaluation = _with(evaluation, [*evaluation.rollouts, report.attempt])
-            _save(evaluation, out)
+            evaluation = with_rollouts(evaluation, [*evaluation.rollouts, report.attempt])
+            save_evaluation(evaluation, out)
             progress(evaluation)
-    return _with(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
-
-
-def load_evaluation(folder: Path) -> Evaluation:
-    """Read evaluation.json; ConfigError where there is none, DemorecError where it is damaged."""
-    path = folder / EVALUATION_NAME
-    try:
-        return from_plain(read_json_object(path), Evaluation)
-    except FileNotFoundError as error:
-        raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
-    except (OSError, ValueError) as error:
-        raise DemorecError(f"{EVALUATION_NAME} is damaged ({describe_error(error)}): {path}") from error
+    return with_rollouts(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
@@ -280,7 +196,7 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
         )
         num_bytes = recording.finish(outcome).stat().st_size
     file = f"{EPISODES if turns.success else FAILED}/{name}"
-    path.replace(folder / file)
+    place_recording(path, folder / file)
     return Attempt(
         episode_index=plan.episode_index,
         attempt=info.attempt,
@@ -310,87 +226,3 @@ def _stage(folder: Path) -> tuple[Settings, DemorecEnv, Policy, World | None]:
     )
     policy = Policy(find_checkpoint(Path(settings.policy)), action_steps=settings.action_steps)
     return settings, env, policy, None if settings.takeover is None else make_world(env.info)
-
-
-def _open(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
-    """The evaluation that is in the folder already, or a new one."""
-    ours = out / EVALUATION_NAME
-    if out.is_dir():
-        settle_parts(out, _PARTS)
-    if out.exists() and (not out.is_dir() or any(out.iterdir())) and not ours.is_file():
-        raise ConfigError(f"The folder holds something that is no evaluation, choose another --out: {out}")
-    if overwrite:
-        check_replaceable(out, EVALUATION, overwrite=True)
-    with replaced_parts(out, _PARTS) if overwrite and ours.is_file() else nullcontext():
-        return _begin_or_continue(settings, out)
-
-
-def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
-    """Bring the folder and its evaluation.json to what is known now."""
-    versions = _versions(settings.config)
-    evaluation = Evaluation(settings=settings, versions=versions)
-    if (out / EVALUATION_NAME).is_file():
-        evaluation = load_evaluation(out)
-        here_versions = versions if evaluation.versions else {}
-        there, here = _deciding(evaluation.settings), _deciding(settings)
-        if lines := differences(there, evaluation.versions, here, here_versions):
-            advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
-            raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
-        kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
-        evaluation = _with(replace(evaluation, settings=settings), kept)
-    for place in (EPISODES, FAILED):
-        make_folder(out / place)
-    _save(evaluation, out)
-    return evaluation
-
-
-_PARTS = (EVALUATION_NAME, EPISODES, FAILED)
-
-
-def _is_evaluation(folder: Path) -> bool:
-    found = json_object(folder / EVALUATION_NAME)
-    return isinstance(found.get("settings"), dict) and isinstance(found.get("rollouts"), list)
-
-
-EVALUATION = ReplaceableKind(
-    name="an evaluation",
-    is_folder=True,
-    recognises=_is_evaluation,
-    strangers=lambda folder: [name for place in (EPISODES, FAILED) for name in foreign_recordings(folder, place)],
-)
-"""What else is in its folder is never touched."""
-
-
-def _deciding(settings: Settings) -> dict[str, Any]:
-    return {key: value for key, value in to_plain(settings).items() if key != "policy"}
-
-
-def _versions(config: GenerateConfig) -> dict[str, str]:
-    """Of what decides the scenes, and of what the policy runs with."""
-    versions = deciding_versions(config)
-    for package in ("lerobot", "torch"):
-        with suppress(PackageNotFoundError):
-            versions[package] = version(package)
-    return versions
-
-
-def _with(evaluation: Evaluation, rollouts: list[Attempt]) -> Evaluation:
-    ordered = sorted(rollouts, key=lambda r: r.episode_index)
-    return replace(
-        evaluation,
-        rollouts=tuple(ordered),
-        factors=tuple(_factors(evaluation.settings.config, r.episode_index, r.attempt) for r in ordered),
-    )
-
-
-@functools.lru_cache(maxsize=100_000)
-def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[str, float]:
-    plan = EpisodePlan(config=config, episode_index=episode_index, attempt=attempt)
-    return factors_of(prepare(plan).info.simulated.scene)
-
-
-def _save(evaluation: Evaluation, folder: Path) -> None:
-    try:
-        replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))
-    except OSError as error:
-        raise resource_error(error) or write_error("The evaluation", error, folder, GenerationError) from error

@@ -1,0 +1,177 @@
+"""A program that records with `Recorder`: killed, out of disk, surprised, interrupted twice, two at once.
+
+It records episodes until there are three. Whatever happens, a finished episode stays as it is, one that was cut off is
+made whole when the program runs again, and nothing of anybody else's is written over.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from itertools import count
+from pathlib import Path
+
+import numpy as np
+import pytest
+from support.crash import Ended, Running, SmallDisk, on_small_disk, run_command
+from support.export import files_of
+
+from demorec import Recorder
+from demorec.core.errors import DemorecError
+from demorec.mcap import Recording
+
+NUM_EPISODES, NUM_FRAMES, FPS = 3, 30, 10
+MINE = "years of work"
+
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning"),
+]
+
+
+def record(words: list[str]) -> None:
+    """Record into the folder that the only word names, and end as a command does."""
+    stamps = count(0, 1_000_000_000 // FPS)
+    pixels = np.zeros((16, 16, 3), np.uint8)
+    try:
+        recorder = Recorder(
+            *words, robot=["a"], cameras={"top": (16, 16)}, fps=FPS, task="wave", clock=lambda: next(stamps),
+            when_full="wait",
+        )  # fmt: skip
+        with recorder:
+            while recorder.num_episodes < NUM_EPISODES:
+                with recorder.episode() as episode:
+                    for frame in range(NUM_FRAMES):
+                        episode.write([frame + 0.5], images={"top": pixels})
+                    episode.success = True
+    except DemorecError as error:
+        print(f"demorec record: {error}", file=sys.stderr)
+        sys.exit(error.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+    sys.exit(0)
+
+
+def run(folder: Path, **arguments: object) -> Ended:
+    return run_command(["run"], folder, program=record, **arguments)
+
+
+def finished(folder: Path) -> dict[str, bytes]:
+    """Name -> content of each recording."""
+    return {path.name: path.read_bytes() for path in sorted(folder.glob("run/episodes/*.mcap"))}
+
+
+def num_frames(path: Path) -> int:
+    """Number of frames of a recording, each of which has what it was given."""
+    with Recording(path) as recording:
+        values = recording.table().features["observation.state"][:, 0]
+        assert np.array_equal(values, np.arange(len(values)) + 0.5)
+        assert len(values) == NUM_FRAMES or recording.is_recovered
+        return len(values)
+
+
+@pytest.fixture
+def num_changes(tmp_path: Path) -> int:
+    """Changes of the file system by a program that is not disturbed."""
+    (tmp_path / "undisturbed").mkdir()
+    ended = run(tmp_path / "undisturbed")
+    assert ended.code == 0
+    assert len(finished(tmp_path / "undisturbed")) == NUM_EPISODES
+    return ended.num_changes
+
+
+def check_again(folder: Path, told: object) -> None:
+    """Run the program again: what was finished stays, what was cut off is kept, and nothing unfinished is left."""
+    before = finished(folder)
+    ended = run(folder)
+    assert ended.code == 0, (told, ended.said)
+    after = finished(folder)
+    assert len(after) == NUM_EPISODES, told
+    assert before.items() <= after.items(), told
+    for name in after:
+        assert num_frames(folder / "run/episodes" / name)
+    left = {name for name in files_of(folder) if name.endswith((".part", ".recovering"))}
+    assert not left, told
+
+
+def test_killed_at_eight_moments(tmp_path: Path, num_changes: int) -> None:
+    for moment in sorted({int(each) for each in np.linspace(1, num_changes, 8)}):
+        folder = tmp_path / f"at_{moment}"
+        folder.mkdir()
+        ended = run(folder, at=moment, act=lambda number: os.kill(os.getpid(), signal.SIGKILL))
+        assert ended.code == -signal.SIGKILL
+        check_again(folder, moment)
+
+
+def test_a_second_interrupt(tmp_path: Path, num_changes: int) -> None:
+    for moment in (num_changes // 3, num_changes // 2, num_changes * 2 // 3):
+        folder = tmp_path / f"at_{moment}"
+        folder.mkdir()
+        ended = run(folder, at=moment, act=lambda number: number < 2 and os.kill(os.getpid(), signal.SIGINT))
+        assert ended.code == 130
+        check_again(folder, moment)
+
+
+def test_a_full_file_system(tmp_path: Path, num_changes: int) -> None:
+    page = os.sysconf("SC_PAGE_SIZE")
+    size = sum(len(content) for content in files_of(tmp_path / "undisturbed").values())
+
+    def work(disk: SmallDisk) -> None:
+        for share in (0, 1, 2):
+            folder = disk.folder / str(share)
+            folder.mkdir()
+            disk.resize(disk.num_used + share * size // 3 // page * page)
+            ended = run(folder)
+            assert ended.code == 1
+            assert len(ended.said) == 1
+            assert "No space left on device" in ended.said[0]
+            disk.resize()
+            check_again(folder, share)
+
+    (tmp_path / "disk").mkdir()
+    on_small_disk(tmp_path / "disk", work)
+
+
+def test_a_file_that_appears_meanwhile_stays(tmp_path: Path, num_changes: int) -> None:
+    """It takes the name of the episode that is being recorded."""
+    folder = tmp_path / "appears"
+    folder.mkdir()
+
+    taken: list[str] = []
+
+    def write(number: int) -> None:
+        parts = list(folder.glob("run/episodes/*.part"))
+        if parts and not taken:
+            taken.append(parts[0].name)  # what this writes is a change, too
+            parts[0].with_suffix("").write_text(MINE)
+
+    ended = run(folder, at=num_changes // 2, act=write)
+    (part,) = folder.glob("run/episodes/*.part")
+    assert ended.code == 2
+    assert str(part) in ended.said[0]
+    assert part.with_suffix("").read_text() == MINE
+    assert len(finished(folder)) == int(part.name[8:14]) + 1
+    assert num_frames(part) == NUM_FRAMES
+
+
+def test_two_at_once(tmp_path: Path, num_changes: int) -> None:
+    folder = tmp_path / "two"
+    folder.mkdir()
+    reached, go_on = os.pipe(), os.pipe()
+
+    def wait(number: int) -> None:
+        if number == 0:
+            os.write(reached[1], b"x")
+            os.read(go_on[0], 1)
+
+    first = Running(["run"], folder, program=record, at=num_changes // 2, act=wait)
+    assert os.read(reached[0], 1) == b"x"
+    second = run(folder)
+    os.write(go_on[1], b"x")
+    assert (first.wait().code, second.code) == (0, 2)
+    assert "Another run is writing here" in second.said[0]
+    for name in finished(tmp_path / "undisturbed"):
+        assert num_frames(folder / "run/episodes" / name) == NUM_FRAMES
+    for descriptor in (*reached, *go_on):
+        os.close(descriptor)
