@@ -1,7 +1,7 @@
 """A program that records with `Recorder`: killed, out of disk, surprised, interrupted twice, two at once.
 
-It records episodes until there are three. Whatever happens, a finished episode stays as it is, one that was cut off is
-made whole when the program runs again, and nothing of anybody else's is written over.
+It records episodes until there are three. Finished episodes never change, one that was cut off is made whole when the
+program runs again, and no other file is overwritten.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ def finished(folder: Path) -> dict[str, bytes]:
 
 
 def num_frames(path: Path) -> int:
-    """Number of frames of a recording, each of which has what it was given."""
+    """Return the number of frames of a recording, after comparing them with the given ones."""
     with Recording(path) as recording:
         values = recording.table().features["observation.state"][:, 0]
         assert np.array_equal(values, np.arange(len(values)) + 0.5)
@@ -82,7 +82,7 @@ def num_changes(tmp_path: Path) -> int:
 
 
 def check_again(folder: Path, told: object) -> None:
-    """Run the program again: what was finished stays, what was cut off is kept, and nothing unfinished is left."""
+    """Run the program again: finished episodes stay, those cut off are kept, and nothing unfinished is left."""
     before = finished(folder)
     ended = run(folder)
     assert ended.code == 0, (told, ended.said)
@@ -143,7 +143,7 @@ def test_a_file_that_appears_meanwhile_stays(tmp_path: Path, num_changes: int) -
     def write(number: int) -> None:
         parts = list(folder.glob("run/episodes/*.part"))
         if parts and not taken:
-            taken.append(parts[0].name)  # what this writes is a change, too
+            taken.append(parts[0].name)  # before writing, which is a change as well
             parts[0].with_suffix("").write_text(MINE)
 
     ended = run(folder, at=num_changes // 2, act=write)

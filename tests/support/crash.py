@@ -19,7 +19,7 @@ from demorec.cli import main
 TIMEOUT_S = 240
 """After this a child counts as hung, and is killed."""
 _UNEXPECTED = 99
-"""Exit code of a child whose command raised something."""
+"""Exit code of a child whose command raised an exception."""
 _CHANGES = ("os.mkdir", "os.rmdir", "os.remove", "os.rename", "os.link", "os.truncate")
 _WRITING = os.O_WRONLY | os.O_RDWR
 
@@ -34,7 +34,7 @@ class Ended:
 
 
 class Running:
-    """A command in a forked child, which has loaded what this process has loaded.
+    """A command in a forked child, which shares the modules that this process has loaded.
 
     Args:
         words: The command line without the program's name.
@@ -97,13 +97,13 @@ def run_command(words: Sequence[str], folder: Path, **arguments: object) -> Ende
 
 
 class SmallDisk:
-    """An empty file system of the kernel's own, in memory, whose size can be changed; seen by this process alone.
+    """An empty file system in memory, of variable size, visible to this process alone.
 
     Args:
         folder: Where it is mounted.
 
     Raises:
-        OSError: The kernel gives no such file system to this user.
+        OSError: The kernel does not let this user mount it.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -125,14 +125,14 @@ class SmallDisk:
         return (status.f_blocks - status.f_bfree) * status.f_frsize
 
     def resize(self, num_bytes: int = 1 << 30) -> None:
-        """Let it hold so many bytes, at least one page of memory; a gigabyte unless said otherwise."""
-        self._mount(f"remount,size={num_bytes or 1}")  # 0 is no limit
+        """Change the size, in bytes (default: a gigabyte); the minimum is one page."""
+        self._mount(f"remount,size={num_bytes or 1}")  # 0 means unlimited
 
 
 def on_small_disk(folder: Path, work: Callable[[SmallDisk], object]) -> None:
-    """Do something in a forked child, which alone sees a small disk; its failure is the test's.
+    """Run `work` in a forked child with a small disk; its failure fails the test.
 
-    Where the kernel has no such file system for this user, the test is skipped.
+    The test is skipped where the kernel does not let this user mount one.
     """
     reading, writing = os.pipe()
     pid = os.fork()
@@ -141,7 +141,7 @@ def on_small_disk(folder: Path, work: Callable[[SmallDisk], object]) -> None:
         try:
             disk = SmallDisk(folder)
         except OSError as error:
-            told = f"skip: the kernel gives no file system of its own to this user ({error})".encode()
+            told = f"skip: the kernel does not let this user mount a private file system ({error})".encode()
         else:
             try:
                 work(disk)

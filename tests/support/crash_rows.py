@@ -1,4 +1,4 @@
-"""Every command that writes, a row each, for `tests/crash/test_commands.py`; and what they read."""
+"""A row for every command that writes, for `tests/crash/test_commands.py`, and the sources that they read."""
 
 from __future__ import annotations
 
@@ -24,15 +24,15 @@ class Row:
     """A command that writes.
 
     Attributes:
-        call: Its words; SOURCES is a folder with what it reads.
-        targets: What it makes in the current folder, each whole or absent: a path, or a pattern.
-        needs: What it reads, beside the run and the datasets.
-        old: Words that make what the command replaces with `--overwrite`; "" for a command that has no such flag.
-        resumes: Whether an interrupted command leaves finished targets, among which it goes on.
-        surprise: A target that somebody else makes while the command runs.
-        keeps: Whether the result is kept under another name then.
-        flag: Lets the command replace what is there.
-        program: Runs it.
+        call: Its words; SOURCES is the folder with the sources.
+        targets: Paths or patterns of its results in the current folder, each whole or absent.
+        needs: Sources other than the run and the datasets.
+        old: Command that makes the result to be replaced with `flag`; "" if there is no such flag.
+        resumes: Whether an interrupted command keeps finished targets and continues after them.
+        surprise: Target that another program makes while the command runs (default: the first).
+        keeps: Whether the result is then kept under another name.
+        flag: Flag that lets the command replace an existing result.
+        program: Function that runs it.
         runs: When the tests run.
     """
 
@@ -53,14 +53,14 @@ class Row:
 
 
 def _edit(words: str) -> Row:
-    """Editing into a dataset, or over another one."""
+    """An edit into a new dataset, or over another one."""
     return Row(
         call=f"dataset {words} --out new", targets=("new",), old="dataset select SOURCES/dataset --episodes 2 --out new"
     )
 
 
 def _run(words: str, *, needs: tuple[str, ...] = (), surprise: str = "new/episodes/episode_000001.mcap") -> Row:
-    """An import, which goes on with a run."""
+    """An import, which continues a run."""
     return Row(
         call=f"import {words} --out new",
         targets=("new/episodes/*.mcap",),
@@ -228,9 +228,9 @@ ROWS = {
     ),
     "correct": Row(
         call=f"correct {_POLICY}",
-        targets=("new/failed/*.mcap",),
+        targets=("new/episodes/*.mcap",),
         needs=(POLICY,),
-        surprise="new/failed/episode_000001.mcap",
+        surprise="new/episodes/episode_000001.mcap",
         resumes=True,
         program=with_stand_in_policy,
     ),

@@ -1,4 +1,4 @@
-"""generate-dataset as a program of its own, and killed at random moments."""
+"""generate-dataset in a separate process, killed at random moments."""
 
 from __future__ import annotations
 

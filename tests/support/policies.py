@@ -26,6 +26,6 @@ class Lazy:
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
-    """What a worker does, with this policy."""
+    """Make a rollout as a worker does, with this policy."""
     setattr(rollouts, "Policy", Lazy)  # noqa: B010
     return rollouts.make_rollout(plan, folder)

@@ -34,7 +34,7 @@ from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 
 _PARTS = (EVALUATION_NAME, EPISODES, FAILED)
-"""All that an evaluation writes; what else is in its folder is never touched."""
+"""Names that an evaluation writes; other files in its folder are never touched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,14 +42,14 @@ class Settings:
     """What decides the result of an evaluation.
 
     Attributes:
-        policy: Folder of the policy; where it lies does not matter, `policy_digest` does.
+        policy: Folder of the policy; only `policy_digest` decides the result, not the place.
         policy_type: LeRobot's name of its kind ("act").
         policy_digest: SHA-256 of its config and weights, 16 hex digits.
         config: Task, split, root seed, cameras: which scenes, seen how.
-        action: What the policy's actions mean.
+        action: Meaning of the policy's actions.
         action_steps: Actions executed before it looks again; None: as trained.
         privileged: Whether it sees observation.environment_state.
-        sensed: What else it sees of the features that datasets have only when named.
+        sensed: Other observed features, which datasets have only when named.
         state: What its observation.state holds.
         episode_length: Time limit; None: the environment's.
         takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
@@ -75,7 +75,7 @@ class Evaluation:
     Attributes:
         settings: What decides the result.
         rollouts: One line each, in the order of the episodes.
-        factors: For each of these, what was randomised in its scene.
+        factors: Randomised values of the scene of each rollout.
         versions: package -> version, of what decides scenes, rollouts and the policy's answers; none in evaluations of
             older versions of demorec.
     """
@@ -97,7 +97,7 @@ class Evaluation:
 
 
 def load_evaluation(folder: Path) -> Evaluation:
-    """Read evaluation.json; ConfigError where there is none, DemorecError where it is damaged."""
+    """Read evaluation.json. Raises ConfigError if it is missing, DemorecError if it is damaged."""
     path = folder / EVALUATION_NAME
     try:
         return from_plain(read_json_object(path), Evaluation)
@@ -109,9 +109,9 @@ def load_evaluation(folder: Path) -> Evaluation:
 
 @contextmanager
 def open_evaluation(settings: Settings, out: Path, *, overwrite: bool) -> Iterator[Evaluation]:
-    """Give the evaluation that is in the folder already, or a new one; the folder is locked until the context ends."""
+    """Yield the existing evaluation, or a new one; the folder is locked until the context ends."""
     if not check_unsettled_parts(out, _PARTS):
-        _check_place(out, overwrite=overwrite)  # a folder that is refused is left without a lock
+        _check_place(out, overwrite=overwrite)  # leaves no lock in a refused folder
     make_folder(out)
     with run_lock(out):
         settle_parts(out, _PARTS)
@@ -122,7 +122,7 @@ def open_evaluation(settings: Settings, out: Path, *, overwrite: bool) -> Iterat
 
 
 def _check_place(out: Path, *, overwrite: bool) -> None:
-    """Refuse a folder that holds something else than an evaluation."""
+    """Raise ConfigError for a folder that holds something other than an evaluation."""
     is_free = not out.exists() or (out.is_dir() and {path.name for path in out.iterdir()} <= {LOCK_NAME})
     if not is_free and not (out / EVALUATION_NAME).is_file():
         raise ConfigError(f"The folder holds something that is no evaluation, choose another --out: {out}")
@@ -131,7 +131,7 @@ def _check_place(out: Path, *, overwrite: bool) -> None:
 
 
 def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
-    """Bring the folder and its evaluation.json to what is known now."""
+    """Make the folder and update its evaluation.json."""
     versions = _versions(settings.config)
     evaluation = Evaluation(settings=settings, versions=versions)
     if (out / EVALUATION_NAME).is_file():
@@ -167,7 +167,7 @@ def _deciding(settings: Settings) -> dict[str, Any]:
 
 
 def _versions(config: GenerateConfig) -> dict[str, str]:
-    """Of what decides the scenes, and of what the policy runs with."""
+    """Return the versions of the packages that decide the scenes and run the policy."""
     versions = deciding_versions(config)
     for package in ("lerobot", "torch"):
         with suppress(PackageNotFoundError):
@@ -176,7 +176,7 @@ def _versions(config: GenerateConfig) -> dict[str, str]:
 
 
 def with_rollouts(evaluation: Evaluation, rollouts: list[Attempt]) -> Evaluation:
-    """Return the evaluation with these rollouts, in order, and what was randomised in their scenes."""
+    """Return the evaluation with these rollouts, in order, and the factors of their scenes."""
     ordered = sorted(rollouts, key=lambda r: r.episode_index)
     return replace(
         evaluation,
@@ -192,7 +192,7 @@ def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[s
 
 
 def save_evaluation(evaluation: Evaluation, folder: Path) -> None:
-    """Replace evaluation.json in one step; GenerationError or ConfigError when it cannot be written."""
+    """Replace evaluation.json in one step. Raises GenerationError or ConfigError if it cannot be written."""
     try:
         replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))
     except OSError as error:

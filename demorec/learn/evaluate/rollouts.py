@@ -16,7 +16,7 @@ from itertools import chain
 from pathlib import Path
 
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, describe_error
+from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError
 from demorec.core.tables import ROBOTS, camera_name
 from demorec.episode.episode import Outcome
 from demorec.episode.features import (
