@@ -81,6 +81,11 @@ def num_changes(tmp_path: Path) -> int:
     return ended.num_changes
 
 
+def interrupt_twice(number: int) -> None:
+    if number < 2:
+        os.kill(os.getpid(), signal.SIGINT)
+
+
 def check_again(folder: Path, told: object) -> None:
     """Run the program again: finished episodes stay, those cut off are kept, and nothing unfinished is left."""
     before = finished(folder)
@@ -108,7 +113,7 @@ def test_a_second_interrupt(tmp_path: Path, num_changes: int) -> None:
     for moment in (num_changes // 3, num_changes // 2, num_changes * 2 // 3):
         folder = tmp_path / f"at_{moment}"
         folder.mkdir()
-        ended = run(folder, at=moment, act=lambda number: number < 2 and os.kill(os.getpid(), signal.SIGINT))
+        ended = run(folder, at=moment, act=interrupt_twice)
         assert ended.code == 130
         check_again(folder, moment)
 
