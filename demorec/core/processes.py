@@ -31,7 +31,7 @@ _starting = threading.Lock()
 
 def available_cores() -> int:
     """Cores that this process may use: its affinity mask, and the quota of its control group where there is one."""
-    count = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else (os.cpu_count() or 1)
+    count = len(os.sched_getaffinity(0))
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         if quota != "max":

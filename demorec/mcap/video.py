@@ -333,9 +333,6 @@ def ordinary_scheduling() -> Iterator[None]:
     SVT-AV1 gives its threads, and the one that starts it, the highest real-time priority when root runs it (as in most
     containers): all that the process starts later inherits that, and whatever else runs on the machine stands still.
     """
-    if not hasattr(os, "sched_setscheduler"):  # not Linux
-        yield
-        return
     own = (os.sched_getscheduler(0), os.sched_getparam(0))
     before = dict(_scheduling())
     try:

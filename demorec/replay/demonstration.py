@@ -19,7 +19,7 @@ import numpy as np
 from demorec.core.config import MAX_PHYSICS_HZ, deciding_versions
 from demorec.core.errors import ConfigError, ExportError, OptionError, RecordingError, check_option, check_seed
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, Frame, Observation, SuccessCheck, gave_up
+from demorec.episode.episode import Action, Frame, Observation, Outcome, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind, action_names
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.roles import NO_NAMES, NamedRoles
@@ -107,13 +107,11 @@ class Demonstration:
         action_kind: What `actions` mean; None where `commands` tell.
         compared: Words for what is compared, as of `seen_in` -> (T, D) recorded before each command; of a dataset
             the opening and the joints of the arm alone.
-        recorded_success: Whether the episode succeeded when it was recorded; None if that is not known.
-        final_state_digest: Of the recording, or "".
+        outcome: How it ended when it was recorded; without a final state where that is not compared, None if unknown.
         tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
         source: The recording's file; None for an episode of a dataset.
         digest: Of its content.
         recorded: The recorded frames, without images, where every one of them is replayed.
-        recorded_checks: Conditions of the task as recorded.
         gave_up: Whether the recording shows why it failed whatever the conditions say (`gave_up`).
         is_measured: Whether the states are those of a real arm, which no simulated one has to the bit.
     """
@@ -122,18 +120,21 @@ class Demonstration:
     info: EpisodeInfo
     fps: int
     compared: Mapping[str, Array]
-    recorded_success: bool | None
+    outcome: Outcome | None
     commands: tuple[Action, ...] = ()
     actions: Array | None = None
     action_kind: ActionKind | None = None
-    final_state_digest: str = ""
     tolerance: float = 0.0
     source: Path | None = None
     digest: str = ""
     recorded: tuple[Frame, ...] = ()
-    recorded_checks: tuple[SuccessCheck, ...] = ()
     gave_up: bool = False
     is_measured: bool = False
+
+    @property
+    def success(self) -> bool | None:
+        """Whether it succeeded when it was recorded; None if unknown."""
+        return None if self.outcome is None else self.outcome.success
 
     @property
     def num_steps(self) -> int:
@@ -175,13 +176,11 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         fps=fps,
         commands=tuple(action_at(trajectory, int(row), "command") for row in sent),
         compared={name: np.array([values[name] for values in seen]) for name in compared},
-        recorded_success=None if outcome is None else outcome.success,
-        final_state_digest="" if outcome is None or stride > 1 else outcome.final_state_digest,
+        outcome=outcome if outcome is None or stride == 1 else replace(outcome, final_state_digest=""),
         # Placing a body normalises its quaternion once more.
         tolerance=1e-9 if options.states else 0.0,
         digest=recording.digest(),
         recorded=() if stride > 1 else tuple(frames_of(trajectory, recording.events(), recording.joint_samples())),
-        recorded_checks=() if outcome is None else outcome.checks,
         gave_up=outcome is not None and gave_up(outcome, [event for _, event in recording.events()], info),
     )
 
@@ -279,7 +278,7 @@ def dataset_demonstrations(
             actions=rows[ACTION].astype(np.float64),
             action_kind=kind,
             compared={JOINTS: state[:, :arm], OPENING: state[:, arm : arm + 1]},
-            recorded_success=bool(row["success"]),
+            outcome=Outcome(success=bool(row["success"]), num_frames=len(state)),
             tolerance=1e-6,
             digest=str(row["content_digest"]),
         )
@@ -335,7 +334,7 @@ def demonstration_of(
         actions=action,
         action_kind="joint",
         compared={JOINTS: state[:, :count], OPENING: state[:, count:]},
-        recorded_success=None,
+        outcome=None,
         is_measured=True,
         digest=hashlib.sha256(state.tobytes() + action.tobytes()).hexdigest(),
     )

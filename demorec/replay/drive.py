@@ -184,10 +184,10 @@ def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
 
 
 def _recorded_outcome(d: Demonstration, world: World) -> Outcome:
-    success = bool(d.recorded_success)
+    success = bool(d.success)
     return Outcome(
         success=success,
-        checks=d.recorded_checks,
+        checks=() if d.outcome is None else d.outcome.checks,
         failure_phase="" if success else "replay",
         failure_reason="" if success else "unknown",
         num_frames=d.num_steps,
@@ -204,10 +204,11 @@ def _report(
     if differs.any():
         step = int(differs.any(axis=0).argmax())
         first = step, list(off)[int(differs[:, step].argmax())]
-    elif is_judged and d.final_state_digest not in ("", outcome.final_state_digest):
-        first = d.num_steps, "the final state"
-    elif is_judged and d.final_state_digest and outcome.checks != d.recorded_checks:
-        first = d.num_steps, _other_condition(outcome.checks, d.recorded_checks)
+    elif is_judged and d.outcome is not None and d.outcome.final_state_digest:
+        if d.outcome.final_state_digest != outcome.final_state_digest:
+            first = d.num_steps, "the final state"
+        elif d.outcome.checks != outcome.checks:
+            first = d.num_steps, _other_condition(outcome.checks, d.outcome.checks)
     arm = np.abs(off[JOINTS][:, : len(d.info.simulated.robot.arm_joints)]).max(axis=1)
     distances = np.array([np.linalg.norm(off[f"{POSE_OF}{name}"][:, :3], axis=1) for name in d.objects])
     number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
@@ -229,11 +230,9 @@ def _report(
         object_error_step=step,
         object_error_name="" if distance == 0.0 else d.objects[number],
         compares_objects=bool(d.objects),
-        recorded_success=d.recorded_success,
+        recorded_success=d.success,
         success=success,
-        is_outcome_as_recorded=None in (success, d.recorded_success)
-        or success == d.recorded_success
-        or (d.gave_up and not d.recorded_success),
+        is_outcome_as_recorded=None in (success, d.success) or success == d.success or (d.gave_up and not d.success),
         failed_checks=failed,
         unreachable=unreachable,
         tracking=_tracking(d, off) if d.is_measured else {},

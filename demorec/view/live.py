@@ -108,8 +108,7 @@ def send(recording: Path, url: str, laid_out: set[str]) -> None:
 
 
 def _main() -> None:
-    if hasattr(os, "nice"):
-        os.nice(_NICENESS)
+    os.nice(_NICENESS)
     url, laid_out = sys.argv[1], set[str]()
     for line in sys.stdin:
         try:

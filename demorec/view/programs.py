@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 import socket
-import sys
 from pathlib import Path
 
 from demorec.core.errors import MissingDependencyError
@@ -16,10 +15,9 @@ def viewer_program() -> str:
     """The viewer that came with rerun-sdk, so that its version fits the recordings."""
     import rerun_cli
 
-    folder = Path(rerun_cli.__file__).parent
-    for name in ("Rerun.app/Contents/MacOS/Rerun", "rerun.exe", "rerun"):
-        if (folder / name).is_file():
-            return str(folder / name)
+    program = Path(rerun_cli.__file__).with_name("rerun")
+    if program.is_file():
+        return str(program)
     raise MissingDependencyError("Showing recordings", "rerun-sdk", "pip install 'rerun-sdk>=0.41,<0.42'")
 
 
@@ -41,7 +39,7 @@ def _ffmpeg_folder() -> Path:
     except RuntimeError as error:
         raise MissingDependencyError("Playing H.264", "ffmpeg", "pip install imageio-ffmpeg, or ffmpeg") from error
     folder = cache_folder("bin", program.name)
-    link = folder / ("ffmpeg.exe" if sys.platform == "win32" else "ffmpeg")
+    link = folder / "ffmpeg"
     if not link.is_file():
         fresh = folder / f"{link.name}.{os.getpid()}"
         try:
@@ -61,6 +59,4 @@ def free_port() -> int:
 
 def has_display() -> bool:
     """Whether a window can be opened."""
-    if not sys.platform.startswith("linux"):
-        return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
