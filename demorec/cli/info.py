@@ -324,8 +324,8 @@ def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
         for name, item in folder.info.features.items():
             if item.is_video:
                 codec = (item.info or {}).get("video.codec", "")
-                camera = f"{name.removeprefix(IMAGE_PREFIX)} {item.shape[1]}x{item.shape[0]} {codec}"
-                facts.append(("camera", camera))
+                width, height = item.image_size
+                facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
         if problems:
             return facts, problems
         if (counts := attempt_counts(folder)) is not None:

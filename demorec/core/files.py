@@ -38,11 +38,16 @@ _KINDS = {
 }
 
 
+_LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
+"""Beginning of the text that Git LFS leaves in place of a file that was not fetched."""
+
+
 def open_regular(path: Path) -> BufferedReader:
     """Open a regular file (or a link to one) for reading, without ever waiting.
 
     Raises:
-        OSError: There is none, it cannot be opened, or it is a folder, FIFO, socket or device; `strerror` says which.
+        OSError: There is none, it cannot be opened, it is a folder, FIFO, socket or device, or Git LFS has left a
+            pointer in its place; `strerror` says which.
     """
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "its name holds a zero byte", str(path))
@@ -50,6 +55,8 @@ def open_regular(path: Path) -> BufferedReader:
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
         _refuse_irregular(path, os.fstat(descriptor).st_mode)  # it may have been exchanged in between
+        if os.pread(descriptor, len(_LFS_POINTER), 0) == _LFS_POINTER:
+            raise OSError(errno.ENODATA, "it is a pointer of Git LFS: fetch the file itself by git lfs pull", str(path))
         return os.fdopen(descriptor, "rb")
     except BaseException:
         os.close(descriptor)

@@ -149,7 +149,7 @@ def _surveyed(dataset: LeRobotFolder, skipped: dict[int, str] | None) -> _Survey
                 feature = dataset.info.features[key]
                 if feature.is_video and not feature.is_depth:
                     video = dataset.video(key, place)
-                    survey.formats.setdefault(name, set()).add((video.file.codec, video.file.size))
+                    survey.formats.setdefault(name, set()).add((video.file.codec_name, video.file.size))
                     survey.reasons[name] = survey.reasons.get(name) or video.why_transcoded()
             survey.inexact |= {name for name in whole if (abs(numbers[name]) > _MAX_EXACT).any()}
     return survey

@@ -98,7 +98,7 @@ class Edit:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
     def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
-        from demorec.datasets.editing.beside import left_out
+        from demorec.datasets.editing.beside import MAX_NAMES, left_out, unknown_files
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)
@@ -108,6 +108,9 @@ class Edit:
         if self.dry_run and len(plan.sources) == 1 and numbers != list(range(len(lengths))):
             say(f"episodes {_listed(numbers)}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
+        if unknown := unknown_files(plan.sources[0].root) if len(plan.sources) == 1 else ():
+            more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
+            say(f"Copied, but not understood: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still hold.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,10 +131,12 @@ def _changes(plan: Plan) -> list[str]:
     from demorec.datasets.editing.plan import mistyped_features
 
     lines = []
-    for name in dict.fromkeys(name for source in plan.sources for name in mistyped_features(source)):
-        lines.append(
-            f"info.json says float32 of {name}, which the data files hold as float64: corrected in the result."
-        )
+    for source in plan.sources:
+        for name, dtype in mistyped_features(source).items():
+            claimed = source.info.features[name].dtype
+            lines.append(
+                f"info.json says {claimed} of {name}, which the data files hold as {dtype}: corrected in the result."
+            )
     if new := sum(bool(cut.task) for cut in plan.cuts):
         lines.append(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
     for cut in plan.cuts:
@@ -139,7 +144,7 @@ def _changes(plan: Plan) -> list[str]:
         if (cut.first, cut.last) != (0, length):
             head = counted(cut.first, "frame")
             lines.append(f"episode {cut.episode}: {head} cut at the beginning, {length - cut.last} at the end")
-    return lines
+    return list(dict.fromkeys(lines))
 
 
 def dataset_at(path: Path) -> Path:

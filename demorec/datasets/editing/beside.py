@@ -21,9 +21,9 @@ from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import EpisodeSlice, Plan
 from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
+from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.sidecar import (
     ATTEMPT_SCHEMA,
@@ -38,9 +38,12 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "epi
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
-ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
+_ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
 """Files that are copied from a single source."""
-_NAMED = 5
+_OF_OTHER_TOOLS = (".cache/", ".git/")
+"""Folders that belong to the download of a dataset."""
+MAX_NAMES = 5
+"""Files that are named of one kind."""
 
 
 def _moving_cameras(source: LeRobotFolder) -> tuple[str, ...] | None:
@@ -214,21 +217,49 @@ def left_out(plan: Plan) -> tuple[str, ...]:
             found.setdefault(reason, set()).add(name)
     phrases = []
     for reason, names in found.items():
-        more = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
-        phrases.append(f"{', '.join(sorted(names)[:_NAMED])}{more} ({reason})")
+        more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+        phrases.append(f"{', '.join(sorted(names)[:MAX_NAMES])}{more} ({reason})")
     return (*phrases, *_scenes(plan), *_descriptions(plan), *_attempts(plan), *_facts(plan))
 
 
+def copied_files(plan: Plan) -> tuple[str, ...]:
+    """List the files that go along as they are: those about a whole dataset, and those that demorec does not know."""
+    if len(plan.sources) > 1:
+        return ()
+    root = plan.sources[0].root
+    known = [name for name in _ABOUT_THE_WHOLE if (root / name).is_file()]
+    return (*known, *unknown_files(root))
+
+
+def unknown_files(root: Path) -> tuple[str, ...]:
+    """List the files of a dataset's folder, links aside, whose names do not say what they are."""
+    return tuple(name for name in _files_below(root) if not is_dataset_file(name) and not (root / name).is_symlink())
+
+
+def _files_below(root: Path) -> list[str]:
+    names = (path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file())
+    return [name for name in names if not name.startswith(_OF_OTHER_TOOLS)]
+
+
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
+    for path in tables_in(root, "data"):
+        for name in open_table(path).schema_arrow.names:
+            if name not in plan.sources[number].info.features:
+                yield name, f"{INFO_PATH} does not list this column of the data files"
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
-    for path in sorted(root.rglob("*")):
-        name = path.relative_to(root).as_posix()
-        if not path.is_file() or name.startswith(".cache/"):
+    places = plan.sources[number].places
+    used = {place.data for place in places} | {path for place in places for path, _ in place.videos.values()}
+    copied = copied_files(plan)
+    for name in _files_below(root):
+        path = root / name
+        if name in copied:
             continue
         if not is_dataset_file(name):
             yield name, "of a kind that demorec does not know: copy it if it still holds"
-        elif name in ABOUT_THE_WHOLE and len(plan.sources) > 1:
+        elif name.startswith(("data/", "videos/")) and path not in used:
+            yield name, "no episode of the dataset is in this file"
+        elif name in _ABOUT_THE_WHOLE and len(plan.sources) > 1:
             yield name, "each of the datasets may have its own"
         elif name.startswith("images/"):
             yield name, "no row has it"

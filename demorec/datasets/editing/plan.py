@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
@@ -16,27 +17,47 @@ from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     CODEBASE_VERSION,
     DATA_PATH,
+    NUMBER_TYPES,
     VIDEO_PATH,
     DatasetFeature,
     DatasetInfo,
+    FeatureType,
 )
 from demorec.episode.features import ACTION, STATE
 
+_NUMPY_NAMES = {"float": "float32", "double": "float64"}
+"""Arrow's names of types -> NumPy's."""
 
-def mistyped_features(source: LeRobotFolder) -> tuple[str, ...]:
-    """Find the features that info.json calls float32 and the data files hold as float64."""
-    tables = tables_in(source.root, "data")
-    if not tables:
-        return ()
-    schema = open_table(tables[0]).schema_arrow
-    return tuple(
-        name
-        for name, feature in source.info.features.items()
-        if feature.dtype == "float32"
-        and name not in AUTOMATIC_FEATURES
-        and name in schema.names
-        and "double" in str(schema.field(name).type)
-    )
+
+def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
+    """Find the features of numbers that the data files hold in another type than info.json says -> that type.
+
+    Where files differ, it is the type that holds the numbers of all of them.
+    """
+    numeric = {name: feature for name, feature in source.info.features.items() if feature.is_numeric}
+    stored: dict[str, set[str]] = {}
+    for path in tables_in(source.root, "data"):
+        schema = open_table(path).schema_arrow
+        for name in numeric:
+            if name in schema.names:
+                stored.setdefault(name, set()).add(str(_number_type(schema.field(name).type)))
+    found: dict[str, FeatureType] = {}
+    for name, kinds in stored.items():
+        if name in AUTOMATIC_FEATURES and name != "timestamp":
+            continue
+        dtypes = {_NUMPY_NAMES.get(kind, kind) for kind in kinds}
+        if dtypes <= set(NUMBER_TYPES) and dtypes != {numeric[name].dtype}:
+            found[name] = str(np.result_type(*dtypes))  # type: ignore[assignment]
+    return found
+
+
+def _number_type(column: pa.DataType) -> pa.DataType:
+    """Type of the numbers in a column of numbers, lists or arrays."""
+    if isinstance(column, pa.BaseExtensionType):
+        column = column.storage_type
+    while pa.types.is_list(column) or pa.types.is_fixed_size_list(column) or pa.types.is_large_list(column):
+        column = column.value_type
+    return column
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -104,9 +125,13 @@ class Plan:
     def whole(cls, source: LeRobotFolder) -> Plan:
         """All of a dataset as it is."""
         own = {name: feature for name, feature in source.info.features.items() if name not in AUTOMATIC_FEATURES}
-        own |= {name: replace(own[name], dtype="float64") for name in mistyped_features(source)}
+        types = mistyped_features(source)
+        own |= {name: replace(own[name], dtype=types[name]) for name in types if name in own}
+        automatic = dict(AUTOMATIC_FEATURES)
+        if "timestamp" in types:
+            automatic["timestamp"] = replace(automatic["timestamp"], dtype=types["timestamp"])
         spoken = {name: feature for name, feature in own.items() if feature.dtype == "language"}
-        features = {**{k: v for k, v in own.items() if k not in spoken}, **AUTOMATIC_FEATURES, **spoken}
+        features = {**{k: v for k, v in own.items() if k not in spoken}, **automatic, **spoken}
         info = replace(
             source.info, features=features, version=CODEBASE_VERSION, data_path=DATA_PATH, video_path=VIDEO_PATH,
             fps=int(source.info.fps), chunks_size=int(source.info.chunks_size), total_episodes=0, total_frames=0,

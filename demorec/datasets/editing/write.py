@@ -17,8 +17,9 @@ from PIL import Image
 
 from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
+from demorec.core.files import open_regular
 from demorec.core.replacing import check_replaceable
-from demorec.datasets.editing.beside import ABOUT_THE_WHOLE, Beside
+from demorec.datasets.editing.beside import Beside, copied_files
 from demorec.datasets.editing.episode_records import episode_statistics
 from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan
 from demorec.datasets.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
@@ -86,7 +87,6 @@ def write_plan(
         ExportError: A source is damaged.
         OSError: The dataset cannot be written.
     """
-    roots = [source.root for source in plan.sources]
     readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
     with (
         DatasetWriter(folder, plan.info, _fact_types(plan), kept_tasks(plan)) as writer,
@@ -101,10 +101,10 @@ def write_plan(
                 progress(done, len(plan.cuts))
         writer.finish()
         beside.finish()
-    for name in ABOUT_THE_WHOLE:
-        if len(roots) == 1 and (roots[0] / name).is_file():
-            (folder / name).parent.mkdir(exist_ok=True)
-            shutil.copyfile(roots[0] / name, folder / name)
+    for name in copied_files(plan):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with open_regular(plan.sources[0].root / name) as source, (folder / name).open("wb") as target:
+            shutil.copyfileobj(source, target)
     return sum(reader.num_decoded for reader in readers), around
 
 
@@ -181,20 +181,22 @@ class _Reader:
             language=language,
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
-            timestamps=self._measured_timestamps(rows, cut),
+            timestamps=self._timestamps(rows, cut),
         )
 
-    def _measured_timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[np.float32] | None:
-        """(T,) timestamps of a cut that were measured, which stay to the bit; None for those of the grid.
+    def _timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[Any] | None:
+        """(T,) timestamps of a cut, (T,); None for the multiples of 1/fps.
 
-        Of a cut that begins later the first one is subtracted in float64, and the result is rounded once.
+        Those of a cut that begins with its episode stay to the bit. Of a later one, whose timestamps were measured, the
+        first is subtracted in float64, and the result is rounded once.
         """
         stored = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
+        if not cut.first:
+            return stored
         seconds = stored.astype(np.float64)
-        first = seconds[0] if cut.first else 0.0
-        if are_on_grid(seconds, self._fps, first):
+        if are_on_grid(seconds, self._fps, seconds[0]):
             return None
-        return stored.astype(np.float32) if not cut.first else (seconds - first).astype(np.float32)
+        return (seconds - seconds[0]).astype(stored.dtype)
 
     def _kept(self, place: EpisodePlace, key: str) -> Statistics | None:
         """The statistics that the source keeps of an episode, weighted by its frames; None where it has none."""

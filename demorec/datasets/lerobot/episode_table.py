@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -28,6 +28,8 @@ TIME_TOLERANCE_S = 1e-4
 """Maximum distance of a row's timestamp from the grid, as in LeRobot."""
 _MAX_VALUE = 1 << 40
 """Above all rows, frames and seconds of any dataset."""
+_MAX_TASK_GAPS = 100_000
+"""Numbers up to the largest one that no task has, in tables of which tasks were removed."""
 _VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")
 """Columns that locate the images of an episode, for each camera."""
 
@@ -75,7 +77,8 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
 
     @cache  # many episodes share a file
     def file(template: str, key: str, chunk: int, number: int) -> Path:
-        return root / FilePosition(chunk=chunk, file=number).path(template, key)
+        path = root / FilePosition(chunk=chunk, file=number).path(template, key)
+        return path if path.exists() else _elsewhere(root, path, key) or path
 
     for path, row in rows:
         _check_row(row, path)
@@ -95,6 +98,14 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
             from_index=row["dataset_from_index"],
             videos=videos,
         )
+
+
+def _elsewhere(root: Path, path: Path, key: str) -> Path | None:
+    """Find the only file of this name, and of a camera in a folder of its name, where info.json names other folders."""
+    found = [other for other in root.rglob(path.name) if not key or key in other.relative_to(root).parts]
+    if len(found) > 1:
+        found = [other for other in found if other.parent.name == path.parent.name]
+    return found[0] if len(found) == 1 else None
 
 
 def _old_rows(root: Path, info: DatasetInfo) -> Iterator[tuple[Path, dict[str, Any]]]:
@@ -131,10 +142,7 @@ def read_tasks(root: Path) -> list[str]:
     path = root / TASKS_PATH
     if not path.exists() and (root / OLD_TASKS_PATH).exists():
         path = root / OLD_TASKS_PATH
-        lines = [(line.get("task_index"), str(line.get("task"))) for line in read_json_lines(path)]
-        if not all(isinstance(index, int) for index, _ in lines):
-            raise ExportError(f"The tasks' table has no task_index: {path}")
-        return [task for _, task in sorted(lines)]
+        return _by_number([(line.get("task_index"), line.get("task")) for line in read_json_lines(path)], path)
     table = read_table(path)
     # pandas names an index column without a name.
     column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
@@ -144,5 +152,15 @@ def read_tasks(root: Path) -> list[str]:
         or not pa.types.is_integer(table.schema.field("task_index").type)
     ):
         raise ExportError(f"The tasks' table has no task or no task_index: {path}")
-    rows = zip(table.column("task_index").to_pylist(), table.column(column).to_pylist(), strict=True)
-    return [str(task) for _, task in sorted(rows, key=lambda row: -1 if row[0] is None else row[0])]
+    numbers, texts = table.column("task_index").to_pylist(), table.column(column).to_pylist()
+    return _by_number(list(zip(numbers, texts, strict=True)), path)
+
+
+def _by_number(rows: Sequence[tuple[object, object]], path: Path) -> list[str]:
+    """Put tasks at their numbers, with "" for numbers that no task has."""
+    found: dict[int, str] = {}
+    for number, task in rows:
+        if not isinstance(number, int) or not 0 <= number < len(rows) + _MAX_TASK_GAPS:
+            raise ExportError(f"The tasks' table has {reprlib.repr(number)} as task_index: {path}")
+        found[number] = str(task)
+    return [found.get(number, "") for number in range(max(found, default=-1) + 1)]

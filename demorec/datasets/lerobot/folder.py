@@ -136,7 +136,16 @@ class LeRobotFolder:
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
-        return DataRows(self.info.features, self.num_rows, names)
+        return DataRows(self.info.features, self.num_rows, names, fps=self.info.fps, task_number=self._only_task_number)
+
+    def _only_task_number(self, place: EpisodePlace) -> int:
+        """Number of the only task of an episode whose rows do not name one."""
+        if len(place.tasks) != 1 or place.tasks[0] not in self.tasks:
+            raise ExportError(
+                f"The rows of episode {place.episode_index} have no task_index, and it has {len(place.tasks)} tasks in "
+                f"the table of episodes: {place.data}"
+            )
+        return self.tasks.index(place.tasks[0])
 
     @property
     def columns(self) -> list[str]:
@@ -144,9 +153,14 @@ class LeRobotFolder:
         return [name for name, feature in self.info.features.items() if not feature.is_video]
 
     def video(self, key: str, place: EpisodePlace) -> EpisodeVideo:
-        """Open the images of a video feature in an episode."""
+        """Open the images of a video feature in an episode. Raises ExportError if it has no file."""
         from demorec.datasets.lerobot.videos import EpisodeVideo
 
+        if not (path := place.videos[key][0]).exists():
+            raise ExportError(
+                f"Episode {place.episode_index} has no video of {key}. Restore the file, drop the episode, or leave "
+                f"the camera out (demorec dataset drop-features DATASET {key} --out NEW): {path}"
+            )
         return EpisodeVideo(self.open_video, key, self.info.features[key], place, int(self.info.fps))
 
     @cached_property

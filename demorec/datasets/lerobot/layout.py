@@ -57,11 +57,13 @@ _ARROW_TYPES = {
     "string": pa.string(),
     **{str(kind): kind for kind in (pa.int8(), pa.int16(), pa.int32(), pa.uint8(), pa.uint16(), pa.uint32())},
 }
+NUMBER_TYPES = tuple(name for name in _ARROW_TYPES if name != "string")
 _CODING = (
     "video.codec", "video.pix_fmt", "is_depth_map", "depth_unit", "video.depth_min", "video.depth_max", "video.shift",
     "video.use_log",
 )  # fmt: skip
 """What a reader of the dataset takes as true of all its videos."""
+_NUM_CHANNELS = (1, 3, 4)
 _MOST_DIMENSIONS = 5
 """Of arrays that HF datasets has types for."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
@@ -113,6 +115,13 @@ class DatasetFeature:
     def is_camera(self) -> bool:
         """Whether its frames are images, in mp4 files or in the data table."""
         return self.dtype in ("video", "image")
+
+    @property
+    def image_size(self) -> tuple[int, int]:
+        """(width, height) of a camera's images, also where the channels come first, as in v2."""
+        is_channels_first = self.shape[0] in _NUM_CHANNELS and self.shape[-1] not in _NUM_CHANNELS
+        height, width = self.shape[1:3] if is_channels_first else self.shape[:2]
+        return width, height
 
     @property
     def is_depth(self) -> bool:
@@ -196,6 +205,12 @@ class DatasetInfo:
     """What meta/info.json says.
 
     Templates of paths are those of v3.0: in an older dataset `file_index` is the number of the episode.
+
+    Attributes:
+        features: All features; those that every dataset has are added where the file does not list them.
+        other: Other entries of the file.
+        version: Format of the dataset.
+        unlisted: The features that were added.
     """
 
     fps: int
@@ -211,6 +226,7 @@ class DatasetInfo:
     video_path: str | None = VIDEO_PATH
     other: dict[str, Any] = field(default_factory=dict)
     version: str = CODEBASE_VERSION
+    unlisted: tuple[str, ...] = ()
 
     @property
     def is_old(self) -> bool:
@@ -254,10 +270,12 @@ class DatasetInfo:
                 )
             data.pop("splits", None)
             features = {name: DatasetFeature.from_json(entry) for name, entry in data.pop("features").items()}
+            unlisted = tuple(name for name in AUTOMATIC_FEATURES if name not in features)
+            features |= {name: AUTOMATIC_FEATURES[name] for name in unlisted}
             known = {name: data.pop(name) for name in list(data) if name in _INFO_FIELDS}
             if version in OLD_VERSIONS:
                 known |= {name: _as_new(known[name]) for name in ("data_path", "video_path") if known.get(name)}
-            info = cls(features=features, other=data, version=version, **known)
+            info = cls(features=features, other=data, version=version, unlisted=unlisted, **known)
             info._check()
         except OSError as error:
             raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error

@@ -56,8 +56,8 @@ class EncodedVideo:
     """The T images of one camera in one episode, and those around them without which they cannot be decoded.
 
     Attributes:
-        codec: "h264", "hevc" or "av1".
-        first: The first image as it was encoded, a keyframe.
+        codec: "h264", "hevc" or "av1", or another one by libav's name.
+        first: The first image as it was encoded, a keyframe; for another codec an mp4 file of it alone.
         samples: All images back to back, as an mp4 file stores them, or where they lie.
         sizes: (lead + T + tail,) int64, bytes of each in `samples`.
         is_keyframe: (lead + T + tail,) bool, which ones can be decoded by themselves.
@@ -140,6 +140,9 @@ class EncodedVideo:
         """What a decoder must know before the first image; ExportError if that is no keyframe that stands alone."""
         if not len(self.is_keyframe) or not self.is_keyframe[0]:
             raise ExportError(f"The {self.codec} video does not start with a keyframe.")
+        if self.codec not in _PARAMETER_SETS:
+            with av.open(io.BytesIO(self.first), format="mp4") as image:
+                return image.streams.video[0].codec_context.extradata or b""
         kinds = _PARAMETER_SETS[self.codec]
         found = b"".join(stored for kind, stored in _units(self.codec, self.first) if kind in kinds)
         if not found:
@@ -214,19 +217,25 @@ class Mp4Writer:
             self._waiting.unlink(missing_ok=True)
 
 
-def _first_image_file(video: EncodedVideo, fps: int) -> bytes:
-    """A file of the first image alone, as libav writes it."""
-    described, buffer = io.BytesIO(), io.BytesIO()
-    with (
-        av.open(io.BytesIO(video.first), format=_DEMUXERS[video.codec]) as source,
-        av.open(described, "w", format="mp4") as target,
-    ):
-        packet = av.Packet(video.first)
-        packet.stream = target.add_stream_from_template(source.streams.video[0], opaque=True)
+def one_image_file(image: bytes, stream: av.VideoStream) -> bytes:
+    """Write an mp4 file of one image that was encoded as a stream describes."""
+    described = io.BytesIO()
+    with av.open(described, "w", format="mp4") as target:
+        packet = av.Packet(image)
+        packet.stream = target.add_stream_from_template(stream, opaque=True)
         packet.pts = packet.dts = 0
         packet.is_keyframe = True
         target.mux_one(packet)
-    described.seek(0)
+    return described.getvalue()
+
+
+def _first_image_file(video: EncodedVideo, fps: int) -> bytes:
+    """Write a file of the first image alone, as libav does, with the time base of the whole video."""
+    buffer = io.BytesIO()
+    described = io.BytesIO(video.first)
+    if video.codec in _DEMUXERS:
+        with av.open(described, format=_DEMUXERS[video.codec]) as source:
+            described = io.BytesIO(one_image_file(video.first, source.streams.video[0]))
     # The bit rate would be that of the first image, and without `bitexact` the file would name the version of libav.
     options = {"write_btrt": "0", "fflags": "bitexact"}
     with (

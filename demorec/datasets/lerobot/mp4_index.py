@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+import av
 import numpy as np
 from numpy.typing import NDArray
 
@@ -72,22 +73,41 @@ whether they are keyframes; when they are shown, s."""
 
 
 def mp4_index(path: Path) -> Index:
-    """Of the first video track; ExportError for what is no mp4 file, is cut off, or is fragmented."""
+    """Read the index of the first video track. Raises ExportError for a file that is cut off or not mp4."""
     check_video(path)
     try:
         with open_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
-            moov = next((part for kind, *part in _boxes(file, 0, size) if kind == b"moov"), None)
-            if moov is None:
+            boxes: dict[bytes, list[int]] = {}
+            for kind, *part in _boxes(file, 0, size):
+                boxes.setdefault(kind, part)
+            if b"moov" not in boxes:
                 raise ValueError("it has no index")
-            begin, end = moov
+            if b"moof" in boxes:
+                return _fragmented_index(path)
+            begin, end = boxes[b"moov"]
             tracks = (_flat(file, *part) for kind, *part in _boxes(file, begin, end) if kind == b"trak")
             track = next((track for track in tracks if track.get(b"hdlr", b"")[8:12] == b"vide"), None)
             if track is None:
                 raise ValueError("it has no video track")
             return _index(track, size)
-    except (OSError, ValueError, KeyError, IndexError, struct.error) as error:
+    except (OSError, EOFError, ValueError, KeyError, IndexError, struct.error, av.FFmpegError) as error:
         raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
+
+
+def _fragmented_index(path: Path) -> Index:
+    """Read the index of a file in fragments (`moof`), each with tables of its own, from libav's packets."""
+    found: list[tuple[int, int, bool, int]] = []
+    with av.open(str(path), format="mp4") as container:
+        stream = container.streams.video[0]
+        for packet in container.demux(stream):
+            if packet.size:
+                if packet.pos is None or packet.pts is None:
+                    raise ValueError("an image has no place or time")
+                found.append((packet.pos, packet.size, packet.is_keyframe, packet.pts))
+        time_base = float(stream.time_base or 0)
+    offsets, sizes, are_keyframes, ticks = np.array(found, dtype=np.int64).reshape(-1, 4).T
+    return offsets, sizes, are_keyframes.astype(np.bool_), ticks * time_base
 
 
 def _index(track: Mapping[bytes, bytes], size: int) -> Index:

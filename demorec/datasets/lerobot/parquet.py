@@ -149,8 +149,17 @@ def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa
     """A column of scalars (T,) or fixed-size vectors (T, D); a column that is one already keeps every bit."""
     if isinstance(values, pa.Array):
         values = plain_column(values)
+        if pa.types.is_primitive(arrow_type) and not pa.types.is_primitive(values.type):
+            values = _only_elements(values)
         return values if values.type == arrow_type else values.cast(arrow_type)
     if pa.types.is_fixed_size_list(arrow_type):
         flat = pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type.value_type)
         return pa.FixedSizeListArray.from_arrays(flat, type=arrow_type)
     return pa.array(np.ascontiguousarray(values).reshape(-1), arrow_type)
+
+
+def _only_elements(lists: pa.Array) -> pa.Array:
+    """Numbers of a column of lists of one, which other writers make of scalars; other columns stay."""
+    is_list = pa.types.is_list(lists.type) or pa.types.is_fixed_size_list(lists.type)
+    numbers = lists.flatten() if is_list and not lists.null_count else lists
+    return numbers if len(numbers) == len(lists) else lists

@@ -207,8 +207,12 @@ class DatasetRecording:
 
     def lead(self, camera: str) -> int:
         """Count the images of a camera before the first frame, from which that is decoded."""
-        video = None if camera in self.depth_cameras else self._video(camera)
+        video = self._video(camera) if self._has_packets(camera) else None
         return 0 if video is None else video.lead
+
+    def _has_packets(self, camera: str) -> bool:
+        """Whether the packets of a camera are of a codec that recordings hold."""
+        return camera not in self.depth_cameras and self.dataset.camera(camera).kept != ""
 
     def _video(self, camera: str) -> EpisodeVideo | None:
         """The video of a camera; None where its images are in rows of tables."""
@@ -216,14 +220,15 @@ class DatasetRecording:
         return self.dataset.video(key, self.place) if self.dataset.info.features[key].is_video else None
 
     def video_settings(self, camera: str) -> VideoSettings:
-        """How the images of a camera are encoded; those in rows of tables are given as JPEG."""
+        """How the images of a camera are encoded; those in rows, or of a codec of no recording, are given as JPEG."""
         found = self.dataset.camera(camera)
         return settings_of_coded(found.kept or "jpeg", found.width, found.height, int(self.dataset.info.fps))
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
         lead, times = self.lead(camera), self.table().image_stamps[camera]
-        if (video := self._video(camera)) is not None:
+        video = self._video(camera)
+        if video is not None and self._has_packets(camera):
             for frame, data, is_key in video.packets():
                 number = min(frame + lead, len(times) - 1)
                 yield VideoPacket(frame_index=number, time_ns=int(times[number]), data=data, is_keyframe=is_key)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.files import TableReader, column_numbers, open_table, table_batches
 from demorec.datasets.lerobot.language import column_digests
-from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
 
 _NUMBERS = ("float32", "float64", "int64", "bool")
@@ -30,11 +30,14 @@ class DataRows:
     """Some columns of the data files, episode after episode, in any order; one batch of a file is in memory.
 
     Every row is proven to be the episode's own: by its `episode_index` and, where the file has one, `frame_index`.
+    Counters and timestamps that a file lacks follow from the place of the rows.
 
     Args:
-        features: Of the dataset.
+        features: Features of the dataset.
         num_rows: Data file -> number of rows that its episodes have.
         names: Columns to read.
+        fps: Frames per second.
+        task_number: Gives the number of an episode's task.
 
     Attributes:
         names: Columns to read.
@@ -43,16 +46,24 @@ class DataRows:
     """
 
     def __init__(
-        self, features: Mapping[str, DatasetFeature], num_rows: Mapping[Path, int], names: Sequence[str]
+        self,
+        features: Mapping[str, DatasetFeature],
+        num_rows: Mapping[Path, int],
+        names: Sequence[str],
+        *,
+        fps: float,
+        task_number: Callable[[EpisodePlace], int],
     ) -> None:
         if missing := [name for name in names if name not in features]:
             raise ExportError(f"The dataset has no {', '.join(missing)}, by {INFO_PATH}")
         self.names = list(names)
         self._features = {name: features[name] for name in names}
-        self._num_rows = num_rows
+        self._num_rows, self._fps, self._task_number = num_rows, fps, task_number
         kinds = {feature.dtype for feature in self._features.values()}
         max_rows = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
-        self._tables = TableReader(names, optional=_OWN, rows=max_rows)
+        self._automatic = [name for name in names if name in AUTOMATIC_FEATURES]
+        stored = [name for name in names if name not in AUTOMATIC_FEATURES]
+        self._tables = TableReader(stored, optional=[*self._automatic, *_OWN], rows=max_rows)
 
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """Yield the rows of an episode."""
@@ -65,12 +76,28 @@ class DataRows:
             )
         for batch in self._tables.read(place.data, place.first_row, place.length) if place.length else ():
             _check_own(batch, place, found)
+            yield self._completed(batch, place, found)
             found += len(batch)
-            yield batch
         if found < place.length:
             raise ExportError(
                 f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {place.data}"
             )
+
+    def _completed(self, batch: pa.RecordBatch, place: EpisodePlace, begin: int) -> pa.RecordBatch:
+        """Add the counters and timestamps that a file lacks, and make counters whole numbers.
+
+        The first row of the batch is the frame `begin`.
+        """
+        frames = np.arange(begin, begin + len(batch))
+        for name in self._automatic:
+            number = batch.schema.get_field_index(name)
+            if number < 0:
+                values = _implied(name, frames, place, self._fps, self._task_number)
+                batch = batch.append_column(name, pa.array(values))
+            elif name != "timestamp" and batch.column(number).type != pa.int64():
+                with _column_errors(name, place):
+                    batch = batch.set_column(number, name, batch.column(number).cast(pa.int64()))
+        return batch
 
     def read(self, place: EpisodePlace) -> pa.Table:
         """Read all rows of an episode. Raises ExportError also if it has none."""
@@ -107,6 +134,18 @@ class DataRows:
                 f"The column {name} has {values.shape[1:]} values, expected {feature.shape}: {place.data}"
             )
         return values
+
+
+def _implied(
+    name: str, frames: NDArray[np.int64], place: EpisodePlace, fps: float, task_number: Callable[[EpisodePlace], int]
+) -> NDArray[Any]:
+    """Values of a counter or timestamp in some frames of an episode."""
+    if name == "timestamp":
+        return (frames / fps).astype(np.float32)
+    if name == "task_index":
+        return np.full(len(frames), task_number(place))
+    first = {"frame_index": 0, "index": place.from_index, "episode_index": place.episode_index}[name]
+    return first + frames * (name != "episode_index")
 
 
 def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int) -> None:

@@ -26,7 +26,7 @@ from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.layout import DatasetFeature
-from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored, one_image_file
 from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
 
@@ -100,13 +100,14 @@ class VideoFile:
         self._head = b""
 
     @property
-    def codec(self) -> PacketCodec:
-        """The codec of its packets. Raises ExportError if no recording holds them."""
-        if self._codec not in PACKET_CODECS:
-            raise ExportError(
-                f"The video cannot be read (its codec is {self._codec}; h264, hevc and av1 are read): {self.path}"
-            )
-        return PACKET_CODECS[self._codec]
+    def codec(self) -> PacketCodec | Literal[""]:
+        """The codec of its packets as recordings name it; "" for one that they cannot hold."""
+        return PACKET_CODECS.get(self._codec, "")
+
+    @property
+    def codec_name(self) -> str:
+        """The codec as info.json names it."""
+        return _MP4_NAMES.get(self.codec, self.codec) or self._codec
 
     def samples(self, numbers: Iterable[int]) -> Iterator[bytes]:
         """Yield images as the file stores them."""
@@ -119,7 +120,12 @@ class VideoFile:
 
     @contextmanager
     def access_units(self) -> Iterator[Callable[[bytes], bytes]]:
-        """Give what converts a stored image to an access unit of a stream, with start codes or a temporal delimiter."""
+        """Give what converts a stored image to an access unit of a stream, with start codes or a temporal delimiter.
+
+        Raises ExportError for a codec that recordings cannot hold.
+        """
+        if not self.codec:
+            raise ExportError(f"Recordings hold h264, hevc and av1, this video is {self.codec_name}: {self.path}")
         if self.codec == "av1":
             yield lambda sample: _TEMPORAL_DELIMITER + sample.removeprefix(_TEMPORAL_DELIMITER)
             return
@@ -128,7 +134,10 @@ class VideoFile:
             yield lambda sample: b"".join(bytes(part) for part in bits.filter(av.Packet(sample)))
 
     def first_image(self, number: int) -> bytes:
-        """Read a first image as it was encoded: after the parameter sets, which of H.264 and HEVC are the file's."""
+        """Read a first image as `EncodedVideo.first`, after the parameter sets; those of H.264 and HEVC are the file's."""
+        if not self.codec:
+            with opened_video(self.path) as (_, stream):
+                return one_image_file(next(self.samples([number])), stream)
         if self.codec == "av1" or not self._head:
             with self.access_units() as convert:
                 self._head = convert(*self.samples([number]))
@@ -139,7 +148,7 @@ class VideoFile:
         return {
             "video.height": self.size[1],
             "video.width": self.size[0],
-            "video.codec": _MP4_NAMES.get(self.codec, self.codec),
+            "video.codec": self.codec_name,
             "video.pix_fmt": self.pixels,
             "video.fps": int(self._fps),
             "video.channels": 3,
@@ -235,7 +244,7 @@ class EpisodeVideo:
         shifts = part.places - np.arange(len(part.places))
         sizes = file.sizes[part.numbers]
         return EncodedVideo(
-            codec=_MP4_NAMES.get(file.codec, file.codec),
+            codec=file.codec_name,
             width=file.size[0],
             height=file.size[1],
             first=file.first_image(int(part.numbers[0])),
@@ -279,6 +288,8 @@ class EpisodeVideo:
         from demorec.mcap.video import is_keyframe  # loads all that reads recordings
 
         file, part = self.file, self._whole
+        if not file.codec:
+            return f"no recording holds {file.codec_name}"
         if (np.diff(file.frames) < 0).any():
             return "images are not shown in the order in which they were encoded"
         _, keyframe, _ = next(self.packets())

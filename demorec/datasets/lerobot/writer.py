@@ -76,7 +76,7 @@ class EpisodeData:
         language: What is said about it; written where the dataset has the columns for it and `columns` has none.
         facts: Column of the table of episodes -> value; written where the dataset has the column.
         row_tasks: Instruction of each row, where there is more than one; `task` is the first.
-        timestamps: (T,) seconds that were measured; None for multiples of 1/fps.
+        timestamps: (T,) float32 or float64 seconds; None for multiples of 1/fps.
     """
 
     task: str
@@ -87,7 +87,7 @@ class EpisodeData:
     language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
     facts: Mapping[str, Any] = field(default_factory=dict)
     row_tasks: Sequence[str] = ()
-    timestamps: NDArray[np.float32] | None = None
+    timestamps: NDArray[Any] | None = None
 
     @property
     def num_frames(self) -> int:
@@ -165,7 +165,7 @@ class DatasetWriter(Closing):
                 name: episode.columns[name] for name in self._schema.names if name not in {*AUTOMATIC_FEATURES, *spoken}
             },
             "timestamp": (
-                (np.arange(frames) / self._info.fps).astype(np.float32)
+                (np.arange(frames) / self._info.fps).astype(self._info.features["timestamp"].dtype)
                 if episode.timestamps is None
                 else episode.timestamps
             ),

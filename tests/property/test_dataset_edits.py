@@ -1,0 +1,168 @@
+"""No edit changes what was not asked for: every column, file and packet before and after, by PyArrow and libav."""
+
+from __future__ import annotations
+
+import json
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from support.commands import exit_code
+from support.drawn_datasets import ACTION, DRAWN, REFERENCE, STATE, DrawnDataset, like, write_drawn
+from support.stored_episodes import StoredEpisode, is_counted, same_values, seconds, stored_episodes, task_texts
+
+NEW_TASK = "sweep the table"
+Slice = tuple[int, int, int]
+"""Episode, first frame and frame behind the last one."""
+
+
+def words_of(operation: str, source: Path, out: Path, drawn: DrawnDataset) -> list[str]:
+    """The words of a command."""
+    count = len(drawn.lengths)
+    flags = {
+        "select": ["--episodes", "1"],
+        "drop": ["--episodes", "0"],
+        "trim": ["--head", "1", "--tail", "1"],
+        "trim end": ["--tail", "2"],
+        "split": ["--shares", "a=0.5", "b=0.5"],
+        "rename": [f"{ACTION}=act"],
+        "drop-features": [ACTION],
+        "set-task": ["--task", NEW_TASK, "--episodes", "0"],
+        "reorder": ["--order", ",".join(map(str, reversed(range(count))))],
+        "shuffle": ["--seed", "3"],
+    }[operation]
+    return ["dataset", operation.split()[0], str(source), *flags, "--out", str(out)]
+
+
+def slices_of(operation: str, drawn: DrawnDataset) -> list[Slice]:
+    """What each episode of the result is; of shuffle and split in the source's order."""
+    whole = [(number, 0, length) for number, length in enumerate(drawn.lengths)]
+    if operation == "select":
+        return whole[1:2]
+    if operation == "drop":
+        return whole[1:]
+    if operation == "reorder":
+        return whole[::-1]
+    if operation.startswith("trim"):
+        head, tail = (1, 1) if operation == "trim" else (0, 2)
+        return [(number, head, last - tail) for number, _, last in whole]
+    return whole
+
+
+OPERATIONS = (
+    "select", "drop", "trim", "trim end", "split", "rename", "drop-features", "set-task", "reorder", "shuffle",
+)  # fmt: skip
+
+
+def compare(before: StoredEpisode, after: StoredEpisode, part: Slice, operation: str, drawn: DrawnDataset) -> None:
+    """Assert that an episode of the result is a part of one before, but for what was asked for."""
+    number, first, last = part
+    expected = before.cut(first, last)
+    if operation == "rename":
+        for store in (expected.columns, expected.types):
+            store["act"] = store.pop(ACTION)
+    if operation == "drop-features":
+        del expected.columns[ACTION]
+    if operation == "set-task" and number == 0:
+        expected = StoredEpisode(**{**vars(expected), "tasks": [NEW_TASK] * (last - first)})
+    for name, values in expected.columns.items():
+        if name.startswith("extra") and isinstance(values[0], list):  # a list of one is the scalar that it holds
+            expected.columns[name] = [value for (value,) in values]
+        elif isinstance(values[0], bytes):  # images become structs, as LeRobot writes them
+            expected.columns[name] = [{"bytes": value, "path": None} for value in values]
+            expected.types[name] = after.types[name]
+    assert same_values(expected, after, but=(REFERENCE, "is_pad")) == []
+    times = seconds(after)
+    if "timestamp" in drawn.missing:
+        stored = (np.arange(last - first) / drawn.fps).astype(np.float32).astype(float)
+    else:
+        assert after.types["timestamp"] == before.types["timestamp"]
+        stored = seconds(expected) - (seconds(expected)[0] if first else 0.0)
+    if first and drawn.clock != "jitter":  # on the grid, whatever its start
+        np.testing.assert_allclose(times, np.arange(last - first) / drawn.fps, atol=1e-6)
+    else:
+        kind = np.float32 if after.types["timestamp"] == "float" else np.float64
+        assert times.tolist() == stored.astype(kind).tolist()
+
+
+def check_files(source: Path, out: Path, operation: str) -> None:
+    """Assert that features and unknown files are those of before."""
+    for name in ("meta/notes of ours.txt", "extra/deep/calibration.bin"):
+        assert (out / name).read_bytes() == (source / name).read_bytes()
+    old, new = (json.loads((root / "meta/info.json").read_text())["features"] for root in (source, out))
+    renamed = {"act": ACTION} if operation == "rename" else {}
+    for name, feature in new.items():
+        was = old.get(renamed.get(name, name))
+        if was is not None:
+            assert (feature["shape"], feature["names"]) == (was["shape"], was["names"])
+
+
+def check_references(source: Path, out: Path, before: StoredEpisode, after: StoredEpisode, part: Slice) -> None:
+    """Assert that numbers of tasks stand for the texts of before."""
+    _, first, last = part
+    old, new = task_texts(source), task_texts(out)
+    was = [old[number] for number in before.columns[REFERENCE][first:last]]
+    assert [new[number] for number in after.columns[REFERENCE]] == was
+
+
+def found_slice(after: StoredEpisode, before: list[StoredEpisode], parts: list[Slice]) -> Slice:
+    """The part that an episode of the result is, by the first number of its state."""
+    key = after.columns[STATE][0][0]
+    return next(part for part in parts if before[part[0]].columns[STATE][part[1]][0] == key)
+
+
+@pytest.mark.slow
+@settings(max_examples=15, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@given(drawn=DRAWN, operation=st.sampled_from(OPERATIONS))
+def test_no_edit_changes_what_was_not_asked_for(drawn: DrawnDataset, operation: str) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        source, out = write_drawn(Path(folder) / "set", drawn), Path(folder) / "new"
+        untouched = files_of(source)
+        before, parts = stored_episodes(source), slices_of(operation, drawn)
+        assert exit_code(*words_of(operation, source, out, drawn)) == 0
+        outs = [out / "a", out / "b"] if operation == "split" else [out]
+        results = [stored_episodes(result) for result in outs]
+        found = []
+        for result, episodes in zip(outs, results, strict=True):
+            assert is_counted(episodes)
+            check_files(source, result, operation)
+            for place, after in enumerate(episodes):
+                is_mixed = operation in ("split", "shuffle")
+                part = found_slice(after, before, parts) if is_mixed else parts[place]
+                compare(before[part[0]], after, part, operation, drawn)
+                if drawn.reference:
+                    check_references(source, result, before[part[0]], after, part)
+                found.append(part)
+        assert sorted(found) == sorted(parts)
+        assert files_of(source) == untouched
+
+
+@pytest.mark.slow
+@settings(max_examples=6, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@given(drawn=DRAWN)
+def test_a_merge_changes_nothing_of_its_sources(drawn: DrawnDataset) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        kinds = (drawn, like(drawn))
+        sources = [write_drawn(Path(folder) / str(seed), kind, seed) for seed, kind in enumerate(kinds)]
+        out = Path(folder) / "new"
+        assert exit_code("dataset", "merge", *sources, "--out", out) == 0
+        episodes = stored_episodes(out)
+        assert is_counted(episodes)
+        for kind, source in zip(kinds, sources, strict=True):
+            for number, before in enumerate(stored_episodes(source)):
+                part = (number, 0, kind.lengths[number])
+                compare(before, episodes[0], part, "merge", kind)
+                if drawn.reference:
+                    check_references(source, out, before, episodes.pop(0), part)
+                else:
+                    episodes.pop(0)
+        assert not episodes
+
+
+def files_of(root: Path) -> dict[str, Any]:
+    """Path -> content of all files."""
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}

@@ -1,0 +1,252 @@
+"""LeRobot datasets as other programs write them, drawn at random and written by PyArrow, libav and JSON alone."""
+
+from __future__ import annotations
+
+import functools
+import io
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import av
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+from av.video.stream import VideoStream
+from hypothesis import strategies as st
+from PIL import Image
+
+STATE, ACTION, TOP = "observation.state", "action", "observation.images.top"
+REFERENCE = "annotation.human.task"
+TASKS = ("open the drawer", "close the drawer", "valid", "push it")
+WIDTH, HEIGHT = 64, 64
+ENCODERS = {"h264": "libx264", "hevc": "libx265", "av1": "libsvtav1", "mpeg4": "mpeg4"}
+_OPTIONS = {
+    "libx264": {"bf": "2", "preset": "ultrafast"},
+    "libx265": {"preset": "ultrafast", "x265-params": "log-level=none:bframes=0:pools=1:frame-threads=1"},
+    "libsvtav1": {"preset": "12", "svtav1-params": "lp=1"},
+    "mpeg4": {"qscale": "4"},
+}
+
+
+@dataclass(frozen=True, kw_only=True)
+class DrawnDataset:
+    """What varies between datasets.
+
+    Attributes:
+        version: "v2.1" or "v3.0".
+        lengths: Frames of each episode.
+        names: Form of the names of elements: "", "list", "nested", "motors" or "axes".
+        stored: NumPy's type of the state and action in the data files.
+        claimed: Their type in info.json.
+        is_variable: Whether vectors are lists of any length in the data files.
+        clock: "grid", "jitter" or "late".
+        time_type: NumPy's type of timestamps.
+        camera: A codec, "image" (structs in rows), "binary" (plain bytes in rows) or "" for none.
+        gop: Frames from one keyframe to the next.
+        is_fragmented: Whether videos are in fragments.
+        reference: NumPy's type of a column of numbers of tasks; "" for none.
+        missing: Counters that the data files and info.json lack.
+        num_files: Data files of a dataset of v3.0.
+        extra: Scalar columns of these types; "bool[]" is a list of one.
+        has_unlisted: Whether the data files have a column that info.json does not list.
+    """
+
+    version: str
+    lengths: tuple[int, ...]
+    names: str
+    stored: str
+    claimed: str
+    is_variable: bool
+    clock: str
+    time_type: str
+    camera: str
+    gop: int
+    is_fragmented: bool
+    reference: str
+    missing: tuple[str, ...]
+    num_files: int
+    extra: tuple[str, ...]
+    has_unlisted: bool
+    fps: int = 10
+
+    @property
+    def total(self) -> int:
+        """Frames of all episodes."""
+        return sum(self.lengths)
+
+
+DRAWN = st.builds(
+    DrawnDataset,
+    version=st.sampled_from(["v2.1", "v3.0"]),
+    lengths=st.lists(st.integers(4, 8), min_size=2, max_size=4).map(tuple),
+    names=st.sampled_from(["", "list", "nested", "motors", "axes"]),
+    stored=st.sampled_from(["float32", "float64"]),
+    claimed=st.sampled_from(["float32", "float64"]),
+    is_variable=st.booleans(),
+    clock=st.sampled_from(["grid", "jitter", "late"]),
+    time_type=st.sampled_from(["float32", "float64"]),
+    camera=st.sampled_from(["", "image", "binary", *ENCODERS]),
+    gop=st.sampled_from([1, 3, 100]),
+    is_fragmented=st.booleans(),
+    reference=st.sampled_from(["", "int64", "int32"]),
+    missing=st.sampled_from([(), ("frame_index",), ("index", "task_index"), ("timestamp",)]),
+    num_files=st.integers(1, 3),
+    extra=st.lists(st.sampled_from(["int32", "uint8", "bool", "bool[]", "string", "float64"]), max_size=3).map(tuple),
+    has_unlisted=st.booleans(),
+)
+
+
+def write_drawn(root: Path, drawn: DrawnDataset, seed: int = 0) -> Path:
+    """Write the dataset; the first number of a row's state is unique among all of a seed."""
+    random = np.random.default_rng(seed)
+    columns, features = _columns(drawn, random, seed)
+    for name in drawn.missing:
+        del columns[name], features[name]
+    parts, first = [], 0
+    for length in drawn.lengths:
+        parts.append(pa.table(columns).slice(first, length))
+        first += length
+    info = {
+        "codebase_version": drawn.version, "robot_type": "arm", "fps": drawn.fps, "features": features,
+        "total_episodes": len(drawn.lengths), "total_frames": drawn.total, "total_tasks": len(TASKS),
+        "chunks_size": 1000, "splits": {"train": f"0:{len(drawn.lengths)}"},
+    }  # fmt: skip
+    (root / "meta").mkdir(parents=True)
+    (_write_old if drawn.version == "v2.1" else _write_new)(root, drawn, info, parts)
+    (root / "meta/info.json").write_text(json.dumps(info))
+    (root / "meta/notes of ours.txt").write_bytes(bytes([seed, 1, 2]))
+    (root / "extra/deep").mkdir(parents=True)
+    (root / "extra/deep/calibration.bin").write_bytes(random.bytes(20))
+    return root
+
+
+def _columns(drawn: DrawnDataset, random: np.random.Generator, seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Columns of all rows, and the features of info.json."""
+    total, episodes = drawn.total, np.repeat(np.arange(len(drawn.lengths)), drawn.lengths)
+    frames = np.concatenate([np.arange(length) for length in drawn.lengths])
+    state, action = (random.normal(size=(total, 3)) for _ in range(2))
+    state[:, 0] = np.arange(total) + 1000 * seed
+    times = frames / drawn.fps
+    if drawn.clock != "grid":
+        times += random.uniform(0, 0.03, total) if drawn.clock == "jitter" else 1.7
+    names: Any = {"": None, "list": list("abc"), "nested": [list("abc")]}.get(drawn.names, {drawn.names: list("abc")})
+    vector = {"dtype": drawn.claimed, "shape": [3], "names": names}
+    scalar = {"shape": [1], "names": None}
+    numbers: dict[str, Any] = {
+        "timestamp": times.astype(drawn.time_type), "frame_index": frames, "episode_index": episodes,
+        "index": np.arange(total), "task_index": episodes % 2,
+    }  # fmt: skip
+    features: dict[str, Any] = {STATE: vector, ACTION: vector}
+    columns = {STATE: _vectors(state, drawn), ACTION: _vectors(action, drawn)}
+    if drawn.reference:
+        numbers[REFERENCE] = random.integers(0, len(TASKS), total).astype(drawn.reference)
+    for place, kind in enumerate(drawn.extra):
+        plain = kind.removesuffix("[]")
+        values = random.integers(0, 2, total).astype("U1" if plain == "string" else plain)
+        column = pa.array(values.tolist(), getattr(pa, plain if plain != "bool" else "bool_")())
+        columns[f"extra_{place}"] = pa.array([[value] for value in values.tolist()]) if kind != plain else column
+        features[f"extra_{place}"] = {"dtype": plain, **scalar}
+    for name, values in numbers.items():
+        columns[name] = pa.array(values)
+        features[name] = {"dtype": "float32" if name == "timestamp" else str(values.dtype), **scalar}
+    if drawn.has_unlisted:
+        columns["is_pad"] = pa.array(np.zeros(total, bool))
+    if drawn.camera in ("image", "binary"):
+        columns[TOP] = _stored_images(total, drawn.camera, seed)
+    if drawn.camera:
+        dtype = "image" if drawn.camera in ("image", "binary") else "video"
+        features[TOP] = {"dtype": dtype, "shape": [HEIGHT, WIDTH, 3], "names": ["height", "width", "channels"]}
+    return columns, features
+
+
+def _vectors(values: np.ndarray[Any, Any], drawn: DrawnDataset) -> pa.Array:
+    kind = pa.from_numpy_dtype(np.dtype(drawn.stored))
+    return pa.array(values.astype(drawn.stored).tolist(), pa.list_(kind) if drawn.is_variable else pa.list_(kind, 3))
+
+
+def _stored_images(total: int, kind: str, seed: int) -> pa.Array:
+    images = []
+    for row in range(total):
+        file = io.BytesIO()
+        Image.new("RGB", (WIDTH, HEIGHT), (row, seed, 0)).save(file, "PNG")
+        images.append(file.getvalue())
+    if kind == "binary":
+        return pa.array(images, pa.binary())
+    struct = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+    return pa.array([{"bytes": image, "path": None} for image in images], struct)
+
+
+def _write_old(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: list[pa.Table]) -> None:
+    info["data_path"] = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
+    info["video_path"] = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+    (root / "data/chunk-000").mkdir(parents=True)
+    episodes = []
+    for number, part in enumerate(parts):
+        pq.write_table(part, root / f"data/chunk-000/episode_{number:06d}.parquet")
+        if drawn.camera in ENCODERS:
+            path = root / f"videos/chunk-000/{TOP}/episode_{number:06d}.mp4"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(encoded(drawn.camera, len(part), drawn.gop, drawn.is_fragmented))
+        episodes.append({"episode_index": number, "tasks": [TASKS[number % 2]], "length": len(part)})
+    lines = "".join(json.dumps(row) + "\n" for row in episodes)
+    (root / "meta/episodes.jsonl").write_text(lines)
+    tasks = [{"task_index": number, "task": task} for number, task in enumerate(TASKS)]
+    (root / "meta/tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in tasks))
+
+
+def _write_new(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: list[pa.Table]) -> None:
+    info["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
+    info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
+    for folder in ("data/chunk-000", "meta/episodes/chunk-000", f"videos/{TOP}/chunk-000"):
+        (root / folder).mkdir(parents=True)
+    files = [min(number, drawn.num_files - 1) for number in range(len(parts))]
+    for file in set(files):
+        table = pa.concat_tables(part for part, place in zip(parts, files, strict=True) if place == file)
+        pq.write_table(table, root / f"data/chunk-000/file-{file:03d}.parquet")
+    begins = np.cumsum([0, *drawn.lengths])
+    table = {
+        "episode_index": range(len(parts)), "length": drawn.lengths, "data/chunk_index": [0] * len(parts),
+        "tasks": [[TASKS[number % 2]] for number in range(len(parts))], "data/file_index": files,
+        "dataset_from_index": begins[:-1], "dataset_to_index": begins[1:],
+    }  # fmt: skip
+    if drawn.camera in ENCODERS:
+        path = root / f"videos/{TOP}/chunk-000/file-000.mp4"
+        path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.is_fragmented))
+        table |= {f"videos/{TOP}/{name}": [0] * len(parts) for name in ("chunk_index", "file_index")}
+        table |= {
+            f"videos/{TOP}/{name}_timestamp": [number / drawn.fps for number in numbers]
+            for name, numbers in (("from", begins[:-1]), ("to", begins[1:]))
+        }
+    pq.write_table(pa.table(table), root / "meta/episodes/chunk-000/file-000.parquet")
+    pq.write_table(pa.table({"task": TASKS, "task_index": range(len(TASKS))}), root / "meta/tasks.parquet")
+
+
+@functools.cache
+def encoded(codec: str, length: int, gop: int, is_fragmented: bool) -> bytes:
+    """An mp4 file of some frames at 10 Hz, a square that moves over a table."""
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.uint8)
+    table = np.stack([2 * rows, 2 * columns, rows + columns], axis=-1)
+    file = io.BytesIO()
+    # Of a file in fragments no list of edits says that the first image is shown at 0, should others come before it.
+    in_order = {"bf": "0"} if is_fragmented else {}
+    options = {"movflags": "frag_keyframe+empty_moov+default_base_moof"} if is_fragmented else {}
+    with av.open(file, "w", format="mp4", options=options) as out:
+        name = ENCODERS[codec]
+        stream = out.add_stream(name, rate=10, options={"g": str(gop), **_OPTIONS[name], **in_order})
+        assert isinstance(stream, VideoStream)
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        for number in range(length):
+            image = table.copy()
+            image[number : number + 20, 5:25] = (200, 90, 7 * number)
+            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
+            frame.pts = number
+            out.mux(stream.encode(frame))
+        out.mux(stream.encode(None))
+    return file.getvalue()
+
+
+def like(drawn: DrawnDataset) -> DrawnDataset:
+    """A dataset that fits the other one in a merge, with other episodes."""
+    return replace(drawn, lengths=drawn.lengths[::-1], clock="grid", num_files=1)
