@@ -64,3 +64,13 @@ def test_a_text_file_is_no_mcap(command: str, tmp_path: Path, capsys: pytest.Cap
     printed = capsys.readouterr()
     assert "not an MCAP file" in printed.out + printed.err
     assert "demorec made" not in printed.out + printed.err
+
+
+def test_the_only_file_of_a_bag_is_read_under_another_name(
+    notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = bags.write_rosbag2(notes, tmp_path / "x")
+    (file,) = (file for file in path.iterdir() if file.name != "metadata.yaml")
+    file.rename(path / f"monday{file.suffix}")
+    assert exit_code("info", path, "--json") == 0
+    assert json.loads(capsys.readouterr().out)["messages"] == len(notes)

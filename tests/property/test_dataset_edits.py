@@ -63,8 +63,8 @@ def compare(before: StoredEpisode, after: StoredEpisode, part: Slice, operation:
     number, first, last = part
     expected = before.cut(first, last)
     if operation == "rename":
-        for store in (expected.columns, expected.types):
-            store["act"] = store.pop(ACTION)
+        expected.columns["act"] = expected.columns.pop(ACTION)
+        expected.types["act"] = expected.types.pop(ACTION)
     if operation == "drop-features":
         del expected.columns[ACTION]
     if operation == "set-task" and number == 0:

@@ -1,4 +1,4 @@
-"""Episodes of a LeRobot dataset as PyArrow and libav find them in its files, for comparison before and after an edit."""
+"""Episodes of a LeRobot dataset as PyArrow and libav find them in its files, to compare before and after an edit."""
 
 from __future__ import annotations
 
@@ -111,7 +111,8 @@ def _packets(root: Path, info: dict[str, Any], row: dict[str, Any], camera: str)
     with av.open(str(root / path)) as container:
         for packet in container.demux(video=0):
             if packet.size:
-                assert packet.pts is not None and packet.time_base is not None
+                assert packet.pts is not None
+                assert packet.time_base is not None
                 shown[round(packet.pts * packet.time_base * info["fps"])] = bytes(packet)
     return [shown[frame] for frame in range(first, first + row["length"])]
 

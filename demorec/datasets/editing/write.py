@@ -190,13 +190,14 @@ class _Reader:
         Those of a cut that begins with its episode stay to the bit. Of a later one, whose timestamps were measured, the
         first is subtracted in float64, and the result is rounded once.
         """
-        stored = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
+        stored: NDArray[Any] = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
         if not cut.first:
             return stored
         seconds = stored.astype(np.float64)
         if are_on_grid(seconds, self._fps, seconds[0]):
             return None
-        return (seconds - seconds[0]).astype(stored.dtype)
+        measured: NDArray[Any] = (seconds - seconds[0]).astype(stored.dtype)
+        return measured
 
     def _kept(self, place: EpisodePlace, key: str) -> Statistics | None:
         """The statistics that the source keeps of an episode, weighted by its frames; None where it has none."""

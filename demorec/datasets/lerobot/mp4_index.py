@@ -107,7 +107,7 @@ def _fragmented_index(path: Path) -> Index:
                 found.append((packet.pos, packet.size, packet.is_keyframe, packet.pts))
         time_base = float(stream.time_base or 0)
     offsets, sizes, are_keyframes, ticks = np.array(found, dtype=np.int64).reshape(-1, 4).T
-    return offsets, sizes, are_keyframes.astype(np.bool_), ticks * time_base
+    return offsets, sizes, are_keyframes.astype(np.bool_), (ticks * time_base).astype(np.float64)
 
 
 def _index(track: Mapping[bytes, bytes], size: int) -> Index:

@@ -134,7 +134,7 @@ class VideoFile:
             yield lambda sample: b"".join(bytes(part) for part in bits.filter(av.Packet(sample)))
 
     def first_image(self, number: int) -> bytes:
-        """Read a first image as `EncodedVideo.first`, after the parameter sets; those of H.264 and HEVC are the file's."""
+        """Read a first image as `EncodedVideo.first`; the parameter sets of H.264 and HEVC are the file's."""
         if not self.codec:
             with opened_video(self.path) as (_, stream):
                 return one_image_file(next(self.samples([number])), stream)
