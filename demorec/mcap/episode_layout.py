@@ -28,11 +28,11 @@ if TYPE_CHECKING:
 class EpisodeLayout:
     """Layout of one episode's file.
 
-    In a simulated episode all messages and images are at the times of the frames. In any other one images are at
-    times of their own, and `/frames` lists the samples and images of each frame.
+    In a simulated episode all messages and images are at the times of the frames. In any other one the cameras decide
+    the times of images, and `/frames` lists the samples and images of each frame.
 
     Attributes:
-        frame_topic: Topic whose messages are counted as frames.
+        frame_topic: Topic with one message per frame.
         event_topics: Topics of events.
     """
 
@@ -47,7 +47,7 @@ class EpisodeLayout:
         return tuple(simulated_streams(self._info) if self._is_simulated else sampled_streams(self._info))
 
     def due_ns(self, num_frames: int) -> NDArray[np.int64] | None:
-        """(T,) times at which all images are due; None for times of their own."""
+        """(T,) times at which all images are due; None if the cameras decide."""
         return frame_times(num_frames, self._info.fps) if self._is_simulated else None
 
     def read(
@@ -90,7 +90,7 @@ class EpisodeLayout:
     def whole_frames(
         self, counts: Counter[str], cameras: Mapping[str, CameraStreams]
     ) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
-        """Find what a crash left whole: the frames that all streams have, images included.
+        """Find the frames that are whole after a crash: those that all streams have, images included.
 
         Images of an episode that was not simulated are in front of their frames.
 

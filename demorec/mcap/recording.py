@@ -43,7 +43,7 @@ class Recording(EpisodeFile):
 
     Attributes:
         path: Of the file.
-        info: What was known before the first frame.
+        info: Description of the episode.
         outcome: How the episode ended; None when a crash cut it off.
         num_frames: Length.
         is_recovered: Whether a crash cut it off.
@@ -62,7 +62,7 @@ class Recording(EpisodeFile):
         return simulated_table(numbers, self.info) if isinstance(numbers, Trajectory) else numbers
 
     def trajectory(self) -> Trajectory:
-        """Read all that was simulated, one row a frame, bit-exact as it was written.
+        """Read the simulation, one row per frame, bit-exact.
 
         Raises:
             RecordingError: demorec did not simulate this episode.
@@ -94,7 +94,7 @@ class Recording(EpisodeFile):
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
-        """(frame, what is begun there), in order, as the source states it; empty where nobody said any."""
+        """(frame, subtask that begins there), in order; empty if the source states none."""
         found = []
         for time_ns, text in self._read(channels.SUBTASK, messages.read_string):
             frame = int(np.searchsorted(self.time_ns, time_ns))
@@ -168,7 +168,7 @@ class Recording(EpisodeFile):
         return np.flatnonzero([is_keyframe(codec, image) for image in self.coded_images([camera])[camera].messages()])
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
-        """Segmentation images, (H, W) int32 as in `CameraImages`, one a frame; `segment_names` tells what is what."""
+        """Segmentation images, (H, W) int32 as in `CameraImages`, one per frame; `segment_names` has their names."""
         topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
         for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
             yield labels

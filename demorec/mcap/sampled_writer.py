@@ -1,6 +1,6 @@
 """Write an episode that demorec does not simulate: images come at their own times, and several frames may show one.
 
-Images are written in front of the frames that show them, so that whatever a crash leaves of the frames has its images.
+Images are written in front of the frames that show them, so that all frames left by a crash have their images.
 """
 
 from __future__ import annotations

@@ -128,7 +128,7 @@ class FrameCheck:
         self._sensed = {name: (len(feature.names),) for name, feature in info.sensors.items()}
 
     def __call__(self, frame: Frame) -> None:
-        """Raise RecordingError for what is wrong with a frame; images are looked at when they are encoded."""
+        """Raise RecordingError for a frame that does not fit; images are checked when they are encoded."""
         poses, images = frame.observation.object_poses, frame.images
         for what, found, known, fits in (
             ("poses of the objects", poses, self._objects, poses.keys() == self._objects),
@@ -151,7 +151,7 @@ class FrameCheck:
             raise RecordingError(f"Frame {frame.frame_index} has a {name} in its {owner} that is not finite.")
 
     def _vectors(self, frame: Frame) -> Iterator[tuple[str, str, Any, tuple[int, ...]]]:
-        """Where, what, numbers, their shape; None for the numbers of what is missing."""
+        """Yield owner, name, numbers and expected shape of each vector; None for missing numbers."""
         seen = frame.observation
         for state in (seen, *frame.joint_samples):
             owner = f"joint sample at {state.time_ns} ns" if isinstance(state, JointSample) else "observation"

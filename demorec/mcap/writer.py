@@ -65,7 +65,7 @@ class BatchWriter(Closing, ABC):
         keeps_part: Whether NAME.mcap.part stays for `recover` when it is left without `finish`.
 
     Attributes:
-        num_frames: Frames so far.
+        num_frames: Number of written frames.
 
     Raises:
         ConfigError: The description is impossible, or a file of that name, or an unfinished one, is there already and
@@ -99,7 +99,7 @@ class BatchWriter(Closing, ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Write what is complete: when this returns, it survives the end of this process.
+        """Write everything complete, which then survives the end of this process.
 
         Raises:
             RecordingError: The disk is full or gone.
@@ -112,7 +112,7 @@ class BatchWriter(Closing, ABC):
             self.flush()
 
     def _write_description(self) -> None:
-        """Write what is stated once, or leave nothing."""
+        """Write the messages that come once, or leave nothing."""
         self._is_described = True
         streams = {name: camera.streams for name, camera in self._cameras.items()}
         try:
@@ -189,7 +189,7 @@ class BatchWriter(Closing, ABC):
             self._file.discard()
 
     def discard(self) -> None:
-        """Give the episode up and remove what was written of it."""
+        """Give the episode up and remove its file."""
         self._file.discard()
 
 

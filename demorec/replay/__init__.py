@@ -1,4 +1,4 @@
-"""Recorded actions back into the simulator: the proof that a recording is what it says.
+"""Recorded actions, simulated again: the proof of a recording.
 
 The world is rebuilt from the recording's own scene, the recorded float64 commands are sent again, and every state on
 the way is compared with the recorded one, bit by bit. On one type of machine nothing may differ. The same driver

@@ -1,8 +1,8 @@
-"""What is replayed, a recording or the episodes of a dataset opened for it, and how its actions shall be sent.
+"""Recordings, and episodes of datasets, opened for replay, and the options of a replay.
 
-Datasets have float32 actions of any kind; their scenes come from the sidecar. Of a real arm nothing but its own numbers
-is known: the simulated one starts where it was, on an empty table, and is sent its actions. How far it is from the
-recorded states says how well the simulator (or the calibration) fits that arm.
+Datasets have float32 actions of any kind; their scenes come from the sidecar. The data of a real arm are its numbers
+alone: the simulated arm starts in the same state, on an empty table, and is sent the same actions. Its distance from
+the recorded states shows how well the simulator (or the calibration) fits that arm.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 JOINTS, OPENING, EE_POSE, POSE_OF = "joint positions", "gripper opening", "the EE pose", "the pose of "
 _LEAST_HZ = Physics.hz
-"""Of the physics of a real arm's replay, which takes whole steps between frames."""
+"""Minimum rate of the physics in the replay of a real arm, with a whole number of steps per frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,10 +49,10 @@ class ReplayOptions:
         noise: Standard deviation of Gaussian noise on every joint target, rad.
         delay: Steps by which every command comes late.
         seed: Of the noise.
-        allowed: The user's own modules that may be imported for what the demonstrations name.
-        robot: The arm that does what a real one did, by its numbers alone; None: that of each recorded scene.
-        motors: The servos whose values the states and actions of datasets are, if the user says so.
-        named: Features of a real arm's data whose role the user names.
+        allowed: The user's own modules that may be imported for the demonstrations.
+        robot: Simulated arm for the actions of a real one; None: that of each recorded scene.
+        motors: Servos of states and actions in datasets, if the user names them.
+        named: Roles that the user names, of features of a real arm.
     """
 
     states: bool = False
@@ -96,7 +96,7 @@ class ReplayOptions:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Demonstration:
-    """What is replayed: a start, commands, and what the recorded states were.
+    """An episode to replay: a start, commands, and recorded states.
 
     Attributes:
         name: Of the file or of the dataset's episode.
@@ -104,15 +104,15 @@ class Demonstration:
         fps: Commands a second.
         commands: What to send, one a step; of a recording.
         actions: (T, D) what to send is decoded from these; of a dataset.
-        action_kind: What `actions` mean; None where `commands` tell.
-        compared: Words for what is compared, as of `seen_in` -> (T, D) recorded before each command; of a dataset
-            the opening and the joints of the arm alone.
+        action_kind: Meaning of `actions`; None with `commands`.
+        compared: Name, as of `seen_in` -> (T, D) recorded before each command; of a dataset the opening and the joints
+            of the arm alone.
         outcome: How it ended when it was recorded; without a final state where that is not compared, None if unknown.
         tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
         source: The recording's file; None for an episode of a dataset.
         digest: Of its content.
         recorded: The recorded frames, without images, where every one of them is replayed.
-        gave_up: Whether the recording shows why it failed whatever the conditions say (`gave_up`).
+        gave_up: Whether the recording shows the reason of its failure (`gave_up`).
         is_measured: Whether the states are those of a real arm, which no simulated one has to the bit.
     """
 
@@ -143,7 +143,7 @@ class Demonstration:
 
     @property
     def objects(self) -> tuple[str, ...]:
-        """Names of those whose poses are recorded."""
+        """Names of objects with recorded poses."""
         return tuple(name.removeprefix(POSE_OF) for name in self.compared if name.startswith(POSE_OF))
 
 
@@ -287,7 +287,7 @@ def dataset_demonstrations(
 def demonstration_of(
     motion: Motion | None, robot: RobotSpec, *, name: str, where: Path, episode_index: int
 ) -> Demonstration:
-    """What an arm was told to do in an episode, for a simulated one of its kind.
+    """The actions of a real arm in an episode, for a simulated arm of its kind.
 
     Args:
         motion: Of the episode; None for one without a state.

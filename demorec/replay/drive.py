@@ -34,10 +34,10 @@ class ReplayReport:
     """How a replay compares with the recording.
 
     Attributes:
-        name: What was replayed.
+        name: Name of the demonstration.
         num_steps: Commands sent.
         is_bitwise: Whether full float64 states were compared, so that nothing may differ.
-        compared: What of each frame was compared, in words.
+        compared: Names of the compared quantities.
         is_identical: No bit of any of this differs, nor of the final state's digest and the conditions of a recording's
             outcome (float32 datasets: no more than rounding).
         first_difference: First step with another state, and what differed there; None when none does.
@@ -49,7 +49,7 @@ class ReplayReport:
         is_outcome_as_recorded: Both are the same, or one is not known. A failure whose reason the recording shows (the
             expert gave up) stays one though the conditions hold.
         failed_checks: Conditions that do not hold now.
-        unreachable: Steps whose pose inverse kinematics did not reach (the arm held its last target).
+        unreachable: Number of steps with a pose out of reach (the arm held its last target).
         tracking: Joint of the arm (rad) or "gripper" (m) -> median and largest difference from what was measured of a
             real one; empty for simulated episodes.
     """
@@ -109,7 +109,7 @@ def replay(
 
 
 class DemonstrationAgent:
-    """Says what was recorded, as the options want it sent: late, with noise, or as it is."""
+    """Sends the recorded commands as the options say: late, with noise, or unchanged."""
 
     num_retries = 0
 
@@ -120,7 +120,7 @@ class DemonstrationAgent:
 
     @property
     def num_unreachable(self) -> int:
-        """Steps whose pose inverse kinematics did not reach, or whose target is not a number."""
+        """Number of steps with a pose out of reach, or a target that is not a number."""
         return self._num_held + (0 if self._decoder is None else self._decoder.num_unreachable)
 
     def decide(self, world: World) -> Iterator[Step]:
@@ -252,7 +252,7 @@ def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessChec
 
 
 def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Array]:
-    """What was compared -> (T, D), what is seen now minus what was recorded."""
+    """Compared quantity -> (T, D), replayed minus recorded values."""
     width = d.compared[JOINTS].shape[1]  # of a dataset the arm's alone
     now = [seen_in(observation) | {JOINTS: observation.joint_position[:width]} for observation in seen]
     return {
@@ -262,7 +262,7 @@ def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Arr
 
 
 def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: bool = True) -> bool:
-    """Whether a replay is what the recording says.
+    """Whether a replay agrees with the recording.
 
     Args:
         report: Of the replay.

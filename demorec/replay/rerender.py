@@ -119,7 +119,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions, allowed: Sequence[str]
 
 
 def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
-    """What was drawn for an episode, without the calibration errors of cameras that have none in the view."""
+    """The behaviour of an episode, without calibration errors of cameras that have none in the view."""
     off = {f"calibration_{name}" for name in view.true_from_recorded}
     return {
         name: value
@@ -197,7 +197,7 @@ def rerender(
     Args:
         source: The recording.
         out: The file to be made.
-        options: What is to change.
+        options: Changes of the images.
         allowed: The user's own modules that may be imported for what the recording or the options name.
         overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
         renderers: Gives the renderer, warm from one recording to the next; None makes and frees one.

@@ -1,4 +1,4 @@
-"""What the expert knows about an episode, the steps that its script is made of, and what these wait for."""
+"""The expert's knowledge of an episode, the steps of its script, and conditions to wait for."""
 
 from __future__ import annotations
 
@@ -59,8 +59,8 @@ class Step:
     """What an agent, the script or any other, wants in one control step; recorded in the `Frame` of that step.
 
     Attributes:
-        action: The label, what a policy is to learn.
-        command: What is sent to the motors; None: the action.
+        action: The label, which a policy learns.
+        command: Command for the motors; None: the action.
         phase: "approach", "lift", ...
         noise_allowed: Whether exploration noise does no harm now (free motion, away from objects).
         events: What happened since the step before.

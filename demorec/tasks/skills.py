@@ -50,7 +50,7 @@ still held the arm a centimetre off, a policy would learn that a centimetre off 
 LOST_WIDTH = 0.012
 """Opening, metres, below which the hand holds nothing."""
 ROCKING_SECONDS = 0.5
-"""How long what the hand has let go of may rock."""
+"""Maximum time that a released object may rock."""
 CARRIED_ABOVE_M = 0.04
 """As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
 
@@ -62,7 +62,7 @@ class Expert:
         world: After reset.
         behaviour: How fast, how high, with which errors.
         reach: Where the hand gets to.
-        joint_target, gripper_target: What the next step commands: (n_arm,) rad, and metres.
+        joint_target, gripper_target: Command of the next step: (n_arm,) rad, and metres.
         phase: Present phase.
         num_retries: How often something had to be tried again.
         trouble: (phase, reason) of what went wrong last.
@@ -293,7 +293,7 @@ class Expert:
         return self.world.grip_force(name) > 0.5 and self._is_apart(0.01)
 
     def place(self, goal: Goal, *, is_begun: bool = False) -> Generator[Step, None, bool]:
-        """Carry the held object to its goal and let go; the generator returns whether it lies well.
+        """Carry the held object to its goal and let go; the generator returns whether it is well placed.
 
         Args:
             goal: Of the object.
@@ -354,7 +354,7 @@ class Expert:
         return self.world.arm.gripper_width() > self._closed_width + self._scale * by
 
     def _recover(self, world_from_tcp: Pose) -> Iterator[Step]:
-        """Let go of whatever is there and rise."""
+        """Release and rise."""
         self.phase = "recover"
         self.joint_target = self.world.arm.arm_position()
         yield from self.open_gripper(max_seconds=0.3)

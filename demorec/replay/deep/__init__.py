@@ -1,4 +1,4 @@
-"""`demorec check --deep`: a recording made again from what it says of itself, and compared in every byte.
+"""`demorec check --deep`: a recording made again from its own description, and compared byte by byte.
 
 The script is run again from config and seed, so that commands, states, labels, phases, events, calibration, images
 and outcome come out once more; a derived recording (a replay, a rendering) has its commands sent again. What differs

@@ -109,7 +109,7 @@ def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
 
 
 def _unlike_here(info: EpisodeInfo, allowed: Sequence[str]) -> tuple[str, ...]:
-    """Describe in which versions, and in which type of CPU, what made an episode differs from what is here."""
+    """Describe the differences in versions, and in the type of CPU, between an episode and this machine."""
     lines = list(version_differences(info.versions, _versions_here(info, allowed)))
     if info.simulated.cpu != cpu_type():
         lines.append(f"it was simulated on {info.simulated.cpu or 'an unknown CPU'}, this is {cpu_type()}")
@@ -127,7 +127,7 @@ def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateCon
     """The config that an episode says it was made with.
 
     Raises:
-        ConfigError: It is none.
+        ConfigError: The config is not valid.
         NotAllowedError: It names something of a module that is not among those `allowed`.
     """
     config = config_as(info.simulated.config, GenerateConfig)
@@ -198,7 +198,7 @@ def _differences(recording: Recording, again: Path) -> Iterator[RemakeDifference
 
 
 def _replayed(recording: Recording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:
-    """Whether the fault is in what was recorded, or in how it is made again: the commands alone, in the scene alone."""
+    """Describe a replay of the recorded commands in the recorded scene, which locates the fault."""
     options = ReplayOptions(allowed=tuple(allowed))
     try:
         demonstration = open_demonstration(recording, options)

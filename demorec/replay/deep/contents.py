@@ -32,12 +32,12 @@ _MADE_BY = ("info.versions", "info.simulation.cpu")
 _SHOWN = reprlib.Repr(maxstring=80, maxother=80)
 
 Differing = tuple[str, str, int | None, Value | None, Value | None]
-"""Two values that differ: stream, field, frame if it belongs to one, what is recorded and what comes out."""
+"""Two values that differ: stream, field, frame if there is one, recorded value, value when made again."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RemakeDifference:
-    """One field of one stream that is not what it is when the recording is made again.
+    """A field of a stream that differs when the recording is made again.
 
     Attributes:
         stream: A topic, or "metadata NAME", "attachment NAME".
@@ -46,7 +46,7 @@ class RemakeDifference:
         frames: In which, ascending; empty for what belongs to no frame.
         recorded, again: What is recorded and what comes out, at the first of these frames, in words; `again` is ""
             where `recorded` says it all.
-        largest: Largest absolute difference over these frames; None of what is no number.
+        largest: Largest absolute difference over these frames; None if they are not numbers.
     """
 
     stream: str
@@ -69,7 +69,7 @@ class RemakeDifference:
 
 
 def difference_in_words(value: Value | None) -> str:
-    """A value as a person reads it; None is what is missing."""
+    """A value in words; None for a missing one."""
     if value is None:
         return "nothing"
     if isinstance(value, bytes):
@@ -258,7 +258,7 @@ def _metadata_differences(
 
 
 def _leaves(values: Mapping[str, str]) -> Iterator[tuple[str, Value]]:
-    """Every single value of a metadata record, whose values may be JSON."""
+    """Yield each value of a metadata record, also within JSON."""
     for key, text in values.items():
         if key == _SEAL:
             continue

@@ -23,13 +23,13 @@ def image_differences(
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
 ) -> Iterator[RemakeDifference]:
-    """One difference for each stream whose encoded images differ.
+    """Yield one difference for each stream of encoded images that differ.
 
     Args:
         recorded, again: The two files.
         remade: The one made again, open.
         cameras: Topic -> camera, of streams of encoded images.
-        differing: Topic -> frames whose encoded images differ.
+        differing: Topic -> frames with different encoded images.
     """
     for topic, frames in differing.items():
         settings = remade.video_settings(cameras[topic])
