@@ -37,18 +37,19 @@ class EpisodeLayout:
     """
 
     def __init__(self, info: EpisodeInfo) -> None:
-        self._info, self._is_simulated = info, info.simulation is not None
-        self.frame_topic = GRIPPER if self._is_simulated else FRAMES
-        self.event_topics = (EVENTS,) if self._is_simulated else ()
+        self._info = info
+        self._is_on_time = info.simulation is not None  # all messages at the times of the frames
+        self.frame_topic = GRIPPER if self._is_on_time else FRAMES
+        self.event_topics = (EVENTS,) if self._is_on_time else ()
 
     @cached_property
     def streams(self) -> tuple[FrameStream, ...]:
         """Streams that become columns; the first one of a simulated episode is dense."""
-        return tuple(simulated_streams(self._info) if self._is_simulated else sampled_streams(self._info))
+        return tuple(simulated_streams(self._info) if self._is_on_time else sampled_streams(self._info))
 
     def due_ns(self, num_frames: int) -> NDArray[np.int64] | None:
         """(T,) times at which all images are due; None if the cameras decide."""
-        return frame_times(num_frames, self._info.fps) if self._is_simulated else None
+        return frame_times(num_frames, self._info.fps) if self._is_on_time else None
 
     def read(
         self, container: Container, num_frames: int, image_topics: Mapping[str, str]
@@ -63,7 +64,7 @@ class EpisodeLayout:
         Raises:
             RecordingError: A stream is damaged or not at the times of the frames, or a frame shows an unknown image.
         """
-        due, changes = self.due_ns(num_frames), (PHASE, DELIBERATE_MISS) if self._is_simulated else ()
+        due, changes = self.due_ns(num_frames), (PHASE, DELIBERATE_MISS) if self._is_on_time else ()
         columns, others = read_columns(
             container,
             self.streams,
@@ -102,7 +103,7 @@ class EpisodeLayout:
             Number of frames; and whether a message belongs to them, given which one of its topic it is, from 1.
         """
         topics = {stream.topic for stream in self.streams if not stream.is_dense}
-        if not self._is_simulated:
+        if not self._is_on_time:
             num_frames = min(counts[topic] for topic in topics)
             topics.add(TF)
             return num_frames, lambda message, count: message.channel.topic not in topics or count <= num_frames

@@ -85,10 +85,12 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
     folder = path.resolve().parent
     with Recording(path) as recording:
         roles, motion = roles_of_recording(recording.info, named), recording.motion()
-        is_simulated = scene_of(recording.info) is not None
-        curves = simulated_curves(recording, motion) if is_simulated else feature_curves(recording, roles)
-        if is_simulated and recording.topics[JOINT_STATES][1] > recording.num_frames:
-            curves |= _joint_curves(recording, curves)
+        if scene_of(recording.info) is None:
+            curves = feature_curves(recording, roles)
+        else:
+            curves = simulated_curves(recording, motion)
+            if recording.topics[JOINT_STATES][1] > recording.num_frames:
+                curves |= _joint_curves(recording, curves)
         yield Playback(
             name=path.name.removesuffix(".mcap"),
             group=folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
