@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from tyro.conf import Positional, arg
 
@@ -17,11 +17,11 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
 from demorec.core.targets import OptionalTarget
-from demorec.robots.motors import Motors
 from demorec.runs.find import find, name_of
-from demorec.sources.formats import FORMATS, SourceFormat
+from demorec.sources.formats import BAGS, FORMATS, SourceFormat
 
 if TYPE_CHECKING:
+    from demorec.sources.episode_writer import FramesImport
     from demorec.sources.import_file import BagReport
 
 MAX_WORKERS = 1000
@@ -73,70 +73,76 @@ class Import:
     """How images are encoded that come as pixels."""
 
     def run(self) -> int:
-        """Import, or suggest a mapping, and say what was found; 1 when bags were skipped."""
+        """Import, or suggest a mapping; print what was found; 1 if bags or episodes were skipped."""
         if not self.bags:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.out is not None:
             refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
-        form, motors = FORMATS.get(word), self.motors.named
-        if motors is not None and (form is None or form.mapping):
-            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
-        if self.roles.named and (form is None or form.mapping):
+        form = FORMATS.get(word, BAGS)
+        self._check_flags(form)
+        paths = self.bags if form is BAGS else self.bags[1:]
+        if not paths:
+            name = name_of(form.kind)
             raise ConfigError(
-                "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
-                "bags and HDF5 files say it in their mapping."
+                f"Name {name} after the word {word}: {form.command} {form.example}. A bag of that name is given with "
+                "its folder."
             )
-        if form is not None:
-            return self._import_frames(word, form, self.bags[1:], motors)
-        if not self.bags[0].exists() and (near := nearest_match(word, FORMATS)):
+        if form is BAGS and not paths[0].exists() and (near := nearest_match(word, FORMATS)):
             raise ConfigError(
                 f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(FORMATS)} and its files."
             )
         from demorec.sources.bag import bags_in, open_bag
 
         if self.suggest:
-            from demorec.sources.suggest import suggested_mapping
-
-            lines = tuple(suggested_mapping(bags_in(self.bags[0])[0], tell))
-            if find(self.bags[0]).kind == "recording":
-                tell(f"Note: demorec made this recording, and reads it as it is, without an import: {self.bags[0]}")
+            lines = form.suggest(paths[0], tell)
+            if find(paths[0]).kind == "recording":
+                tell(f"Note: demorec made this recording, and reads it as it is, without an import: {paths[0]}")
             say(*lines)
             return 0
-        if self.mapping is None or self.out is None:
-            open_bag(bags_in(self.bags[0])[0])  # first of all says what it is, if it is no bag
-            raise _incomplete(f"--suggest {self.bags[0]} > robot.toml")
+        if form.mapping and (self.mapping is None or self.out is None):
+            if form is BAGS:
+                open_bag(bags_in(paths[0])[0])  # says what it is, if it is not a bag
+            raise ConfigError(
+                f"An import needs --mapping and --out: {form.command} {paths[0]} --suggest > mapping.toml writes a "
+                "mapping."
+            )
+        if self.out is None:
+            raise ConfigError(f"An import needs --out: {form.command} {form.example}.")
         self.video.validate()
-        return self._import_bags(self.bags, self.mapping, self.out)
+        if form is BAGS:
+            assert self.mapping is not None, "bags need one"
+            return self._import_bags(paths, self.mapping, self.out)
+        return self._import_frames(form, paths, self.out)
 
-    def _import_frames(self, word: str, form: SourceFormat, paths: Sequence[Path], motors: Motors | None) -> int:
-        if (self.skip_bad and form.mapping) or self.workers > 1:
+    def _check_flags(self, form: SourceFormat) -> None:
+        """Raise ConfigError for flags of another format."""
+        if form.mapping and self.motors.named is not None:
+            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
+        if form.mapping and self.roles.named:
+            raise ConfigError(
+                "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
+                "bags and HDF5 files say it in their mapping."
+            )
+        if form is not BAGS and (self.workers > 1 or (self.skip_bad and form.mapping)):
             raise ConfigError(
                 "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
                 "--workers, --skip-bad out."
             )
-        example, name = f"demorec import {word} {form.example}", name_of(form.kind)
-        if not paths:
-            raise ConfigError(
-                f"Name {name} after the word {word}: {example}. A bag of that name is given with its folder."
-            )
         if form.mapping is None and (self.suggest or self.mapping is not None):
+            name = name_of(form.kind)
             raise ConfigError(f"The import of {name} needs no mapping: leave --mapping and --suggest out.")
-        if self.suggest:
-            say(*form.suggest(paths[0]))
-            return 0
-        if form.mapping is not None and (self.mapping is None or self.out is None):
-            raise _incomplete(f"{word} {paths[0]} --suggest > mapping.toml")
-        if self.out is None:
-            raise ConfigError(f"An import needs --out: {example}.")
-        self.video.validate()
-        named = self.roles.named
-        result = form.read(paths, self.mapping, self.out, self.video, motors, named, skip_bad=self.skip_bad)
+
+    def _import_frames(self, form: SourceFormat, paths: Sequence[Path], out: Path) -> int:
+        options: dict[str, Any] = {"video": self.video}
+        if form.mapping is None:
+            options |= {"motors": self.motors.named, "named": self.roles.named, "skip_bad": self.skip_bad}
+        result = cast("FramesImport", form.read(paths, self.mapping, out, **options))
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
-        say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {self.out}")
+        say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")
         return _list_skipped(result.skipped, result.num_episodes + len(result.skipped), "episode")
 
     def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
@@ -155,12 +161,12 @@ class Import:
             )
         if result.num_new < len(result.reports):
             tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
-        episodes = [episode for report in result.reports for episode in report.episodes]
-        made = [episode for report in result.reports for episode in report.made]
-        dropped = f", {len(episodes) - len(made)} dropped" if len(made) < len(episodes) else ""
+        num_dropped = sum(len(report.episodes) - len(report.made) for report in result.reports)
+        num_frames = sum(episode.num_frames for report in result.reports for episode in report.made)
+        dropped = f", {num_dropped} dropped" if num_dropped else ""
         odd = [finding.kind for report in result.reports for finding in report.odd]
         notes = sum(len(report.findings) for report in result.reports) - len(odd)
-        say(f"{counted(len(made), 'episode')}, {sum(row.num_frames for row in made)} frames{dropped}: {out}")
+        say(f"{counted(result.num_episodes, 'episode')}, {num_frames} frames{dropped}: {out}")
         if odd:
             kinds = ", ".join(sorted(set(odd)))
             say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
@@ -187,7 +193,3 @@ def _list_skipped(skipped: Mapping[Any, str], total: int, word: str) -> int:
     say(f"Skipped {len(skipped)} of {counted(total, word)}:")
     say(*(f"  {name}: {reason}" for name, reason in skipped.items()))
     return 1
-
-
-def _incomplete(suggest: str) -> ConfigError:
-    return ConfigError(f"An import needs --mapping and --out: demorec import {suggest} writes a mapping.")

@@ -14,9 +14,8 @@ from typing import Literal
 import numpy as np
 
 from demorec.mcap.cdr import Values
-from demorec.sources.fields import SourceReader, follow, numbers_in, parse_path, reader_of
+from demorec.sources.fields import SourceReader, follow, parse_path, reader_of
 from demorec.sources.mapping import Source
-from demorec.sources.words import first_numbers
 
 Kind = Literal["joints", "gripper", "pose", "twist"]
 _JOINT_FIELDS = (
@@ -43,24 +42,23 @@ class Candidate:
     """Numbers of a topic that could be part of a feature.
 
     Attributes:
-        topic: Topic of the messages.
-        field: Path of the numbers, as in a source.
-        reader: Reader of the numbers.
+        reader: Reader of the numbers, with their source.
         kind: Joints, a gripper's opening, or a pose or velocity in space.
         is_action: Whether the topic commands the robot, or is a leader arm.
         name: Name of the only element, where the message does not name it; "" elsewhere.
         prefix: Prefix of each name.
-        first: First numbers, for a comment.
     """
 
-    topic: str
-    field: str
     reader: SourceReader
     kind: Kind
     is_action: bool
     name: str = ""
     prefix: str = ""
-    first: str = ""
+
+    @property
+    def topic(self) -> str:
+        """Topic of the messages."""
+        return self.reader.source.topic
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -87,7 +85,7 @@ class Candidate:
         source = replace(self.reader.source, joints=tuple(joints))
         reader = replace(self.reader, source=source, names=tuple(joints), joints=tuple(joints))
         kind: Kind = "gripper" if _are_gripper(joints) else "joints"
-        return replace(self, reader=reader, kind=kind, first="" if joints != self.reader.joints else self.first)
+        return replace(self, reader=reader, kind=kind)
 
 
 def candidates_of(topic: str, type_name: str, values: Values) -> list[Candidate]:
@@ -109,14 +107,11 @@ def candidates_of(topic: str, type_name: str, values: Values) -> list[Candidate]
 
 
 def _candidate(topic: str, field: str, values: Values, kind: Kind, is_action: bool) -> Candidate | None:
-    """The candidate of a field; None where it holds no numbers."""
+    """Return the candidate of a field; None where it holds no numbers."""
     try:
-        reader = reader_of(Source(topic=topic, field=field), values)
-        numbers = np.concatenate([np.ravel(item) for _, item in numbers_in(follow(values, reader.steps))])
+        return Candidate(reader=reader_of(Source(topic=topic, field=field), values), kind=kind, is_action=is_action)
     except ValueError:
         return None
-    first = first_numbers(numbers)
-    return Candidate(topic=topic, field=field, reader=reader, kind=kind, is_action=is_action, first=first)
 
 
 def _joints(topic: str, type_name: str, field: str, values: Values, is_action: bool) -> Candidate | None:
@@ -159,13 +154,11 @@ class Choice:
     Attributes:
         state, action: Parts of them; an empty action is the next state.
         poses: Parts of observation.ee_pose.
-        others: Candidates that no feature takes.
     """
 
     state: list[Candidate]
     action: list[Candidate]
     poses: list[Candidate]
-    others: list[Candidate]
 
 
 def choose_features(candidates: Sequence[Candidate]) -> Choice:
@@ -185,9 +178,7 @@ def choose_features(candidates: Sequence[Candidate]) -> Choice:
         action = []
     poses = [candidate for candidate in measured if candidate.is_robot_pose and candidate not in state]
     poses = poses if state and len({pose.topic for pose in poses}) == 1 and not poses[0].prefix else []
-    taken = {id(candidate) for candidate in (*state, *action, *poses)}
-    others = [candidate for candidate in candidates if id(candidate) not in taken]
-    return Choice(state=state, action=action, poses=poses, others=others)
+    return Choice(state=state, action=action, poses=poses)
 
 
 def _has_arm(candidates: Sequence[Candidate]) -> bool:

@@ -1,7 +1,6 @@
-"""What is read by importing it: a row a format, and `demorec import` and whatever else reads go by the rows.
+"""Formats that are imported, a row each; `demorec import` and commands that read foreign files go by the rows.
 
-Bags have none: `demorec.sources.bag` tells their kinds apart. Other commands read by importing into a temporary run,
-which is removed when the context ends, however it ends: by the same mapping as `demorec import`, in the same words.
+Other commands read through a temporary import, by the same mapping as `demorec import`, in the same words.
 """
 
 from __future__ import annotations
@@ -13,32 +12,39 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import Any, Protocol, cast
 
-from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.plain import listed
-from demorec.episode.roles import NO_NAMES, NamedRoles
-from demorec.robots.motors import Motors
 from demorec.runs.find import IMPORT_WORDS, PathKind, find
 from demorec.sources.mapping import SourceKind, SourceMapping
 
-if TYPE_CHECKING:
-    from demorec.sources.episode_writer import FramesImport
+Tell = Callable[[str], None]
+
+
+class ImportResult(Protocol):
+    """Result of an import."""
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of episodes in the run."""
+
+    def left_out_lines(self) -> Iterator[str]:
+        """Describe what the run does not have."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFormat:
-    """Files or folders of other programs whose episodes have evenly spaced frames.
+    """Format of files or folders of other programs.
 
     Attributes:
-        kind: What `demorec.runs.find` takes them for.
-        name: In a sentence, of many.
-        example: What follows `demorec import` and the format's word.
-        importer: "module:function", which `read` calls with its arguments.
-        mapping: Whose keys its mappings have; None where it needs none, so that its numbers may be those of an arm's
-            servos, the user may name the roles of its features, and episodes that cannot be read may be left out.
-        suggester: "module:function", path -> the lines of a mapping, where it needs one.
+        kind: Kind of path, as `demorec.runs.find` knows it.
+        name: Plural, for a sentence.
+        example: Example of what follows `demorec import` and the format's word.
+        importer: "module:function" of (paths, mapping, out), which makes or continues the run `out`.
+        mapping: Kind of its mappings; None if it needs none.
+        suggester: "module:function" of (path, tell): the lines of a mapping; `tell` is called with what it leaves to
+            the user.
     """
 
     kind: PathKind
@@ -48,28 +54,30 @@ class SourceFormat:
     mapping: SourceKind | None = None
     suggester: str = ""
 
-    def read(
-        self,
-        paths: Sequence[Path],
-        mapping: Path | None,
-        out: Path,
-        video: VideoConfig,
-        motors: Motors | None = None,
-        named: NamedRoles = NO_NAMES,
-        *,
-        skip_bad: bool = False,
-    ) -> FramesImport:
-        """Make or continue the run `out`; arguments and errors as of the importer, the last three without a mapping."""
-        importer = pkgutil.resolve_name(self.importer)
-        own = {} if self.mapping else {"motors": motors, "named": named, "skip_bad": skip_bad}
-        return cast("FramesImport", importer(paths, mapping, out, video=video, **own))
+    @property
+    def command(self) -> str:
+        """The command that imports it, without paths."""
+        return " ".join(filter(None, ("demorec import", IMPORT_WORDS.get(self.kind))))
 
-    def suggest(self, path: Path) -> list[str]:
-        """The lines of a mapping of a format that needs one."""
-        return cast(list[str], pkgutil.resolve_name(self.suggester)(path))
+    def read(self, paths: Sequence[Path], mapping: Path | None, out: Path, **options: Any) -> ImportResult:
+        """Make or continue the run `out`; options, result and errors are those of the importer."""
+        return cast(ImportResult, pkgutil.resolve_name(self.importer)(paths, mapping, out, **options))
+
+    def suggest(self, path: Path, tell: Tell) -> list[str]:
+        """Return the lines of a mapping."""
+        return cast(list[str], pkgutil.resolve_name(self.suggester)(path, tell))
 
 
+BAGS = SourceFormat(
+    kind="rosbag",
+    name="bags",
+    example="monday.mcap --mapping robot.toml --out runs/robot",
+    importer="demorec.sources.import_run:import_bags",
+    mapping="bag",
+    suggester="demorec.sources.suggest:suggested_mapping",
+)
 _ROWS = (
+    BAGS,
     SourceFormat(
         kind="dataset",
         name="LeRobot datasets",
@@ -85,9 +93,9 @@ _ROWS = (
         suggester="demorec.sources.hdf5_suggest:suggested_hdf5_mapping",
     ),
 )
-FORMATS: Mapping[str, SourceFormat] = {IMPORT_WORDS[form.kind]: form for form in _ROWS}
-"""The first word after `demorec import` -> the format."""
-IMPORTED: tuple[PathKind, ...] = ("rosbag", *(kind for kind in IMPORT_WORDS if kind != "dataset"))
+FORMATS: Mapping[str, SourceFormat] = {IMPORT_WORDS[form.kind]: form for form in _ROWS if form.kind in IMPORT_WORDS}
+"""The first word after `demorec import` -> the format; bags need none."""
+IMPORTED: tuple[PathKind, ...] = tuple(form.kind for form in _ROWS if form.mapping)
 """Kinds of paths that no command reads as they are. Datasets are, but where recordings are needed (export)."""
 _MB = 1e6
 _MOST_SHOWN = 6
@@ -95,10 +103,10 @@ _MOST_SHOWN = 6
 
 
 @contextmanager
-def opened(
-    paths: Sequence[Path], mapping: Path | None, *, imports_datasets: bool, tell: Callable[[str], None]
-) -> Iterator[list[Path]]:
+def opened(paths: Sequence[Path], mapping: Path | None, *, imports_datasets: bool, tell: Tell) -> Iterator[list[Path]]:
     """Give for each path a run of its episodes, or the path itself where that is read as it is.
+
+    The runs are temporary: they are removed when the context ends, however it ends.
 
     Args:
         paths: Recordings, runs, folders of recordings, and whatever can be imported.
@@ -109,42 +117,49 @@ def opened(
 
     Raises:
         ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
-        DemorecError: As `import_bags` and `SourceFormat.read`.
+        DemorecError: As of the importers.
     """
+    by_kind = {form.kind: form for form in _ROWS}
     kinds = [import_kind(path, imports_datasets) for path in paths]
-    forms = [FORMATS.get(IMPORT_WORDS.get(kind, "")) if kind else None for kind in kinds]
-    if mapping is not None and "rosbag" not in kinds and not any(form and form.mapping for form in forms):
-        mapped = " and ".join(["bags", *(form.name for form in FORMATS.values() if form.mapping)])
+    forms = {path: by_kind[kind] for path, kind in zip(paths, kinds, strict=True) if kind is not None}
+    if mapping is not None and not any(form.mapping for form in forms.values()):
+        mapped = " and ".join(form.name for form in _ROWS if form.mapping)
         raise ConfigError(f"Only {mapped} are read by a mapping: leave --mapping out: {paths[0]}")
     with tempfile.TemporaryDirectory(prefix="demorec-reading-", ignore_cleanup_errors=True) as folder:
-        _check_space([path for path, kind in zip(paths, kinds, strict=True) if kind], Path(folder))
+        _check_space([*forms], Path(folder))
         found = []
-        for number, (path, kind, form) in enumerate(zip(paths, kinds, forms, strict=True)):
-            if kind is None:
+        for number, path in enumerate(paths):
+            if path not in forms:
                 found.append(path)
                 continue
             run = Path(folder) / str(number) / path.resolve().name
             run.parent.mkdir()
-            chosen = None
-            if form is None or form.mapping:
-                chosen = mapping or _suggested(path, form, Path(folder) / f"{number}.toml", tell)
-            if form is not None:
-                for line in form.read([path], chosen, run, VideoConfig()).left_out_lines():
-                    tell(line)
-            elif chosen is not None:
-                _import_bag(path, chosen, run, tell)
-            found.append(run)
+            found.append(_imported(path, forms[path], mapping, run, tell))
         yield found
 
 
+def _imported(path: Path, form: SourceFormat, mapping: Path | None, run: Path, tell: Tell) -> Path:
+    """Import a path and return its run."""
+    if form.mapping is None:
+        mapping = None
+    elif mapping is None:
+        mapping = _suggested(path, form, run.with_suffix(".toml"), tell)
+    result = form.read([path], mapping, run)
+    for line in result.left_out_lines():
+        tell(line)
+    if not result.num_episodes:
+        raise DemorecError(f"The mapping makes no episode of this, so there is nothing to read: {path}")
+    return run
+
+
 def import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
-    """What a path is to be imported as; None for what is read as it is, and for what no command reads."""
+    """Return the kind that a path is to be imported as; None for what is read as it is, or by no command."""
     kind = find(path).kind
     return kind if kind in IMPORTED or (imports_datasets and kind == "dataset") else None
 
 
 def _check_space(paths: Sequence[Path], folder: Path) -> None:
-    """ConfigError unless there is room for what is read: encoded images stay as they are, pixels become smaller."""
+    """Raise ConfigError unless there is room: encoded images stay as they are, pixels become smaller."""
     files = [file for path in paths for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file()]
     needed, free = sum(file.stat().st_size for file in files), shutil.disk_usage(folder).free
     if needed > free:
@@ -154,24 +169,17 @@ def _check_space(paths: Sequence[Path], folder: Path) -> None:
         )
 
 
-def _suggested(path: Path, form: SourceFormat | None, target: Path, tell: Callable[[str], None]) -> Path:
-    """The mapping that --suggest writes of a format, or of bags, where it can be used as it is.
-
-    Raises:
-        ConfigError: It leaves something to the user.
-    """
-    from demorec.sources.bag import bags_in
+def _suggested(path: Path, form: SourceFormat, target: Path, tell: Tell) -> Path:
+    """Write the mapping that --suggest writes; ConfigError if it leaves something to the user."""
     from demorec.sources.mapping_file import read_mapping
-    from demorec.sources.suggest import suggested_mapping
 
     doubts: list[str] = []
-    lines = form.suggest(path) if form else suggested_mapping(bags_in(path)[0], doubts.append)
-    target.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    suggest = f"demorec import {f'{IMPORT_WORDS[form.kind]} ' if form else ''}{path} --suggest > mapping.toml"
+    target.write_text("\n".join(form.suggest(path, doubts.append)) + "\n", encoding="utf-8")
+    suggest = f"{form.command} {path} --suggest > mapping.toml"
     try:
         if doubts:
             raise ConfigError(doubts[0])
-        used = read_mapping(target, (form and form.mapping) or "bag")
+        used = read_mapping(target, form.mapping or "bag")
     except ConfigError as error:
         reason = str(error).removesuffix(f": {target}")
         raise ConfigError(
@@ -183,22 +191,9 @@ def _suggested(path: Path, form: SourceFormat | None, target: Path, tell: Callab
 
 
 def _taken(mapping: SourceMapping) -> str:
-    """What a mapping takes, in a line."""
+    """Describe what a mapping takes, in a line."""
     parts = [
         f"{name} from {' and '.join(dict.fromkeys(source.place for source in of))}"
         for name, of in mapping.features.items()
     ]
     return listed([*parts, *(f"camera {name}" for name in mapping.cameras)], _MOST_SHOWN, ", ")
-
-
-def _import_bag(path: Path, mapping: Path, run: Path, tell: Callable[[str], None]) -> None:
-    from demorec.sources.bag_files import BagError
-    from demorec.sources.import_file import dropped_lines
-    from demorec.sources.import_run import import_bags
-
-    result = import_bags([path], mapping, run)
-    for report in result.reports:
-        for line in dropped_lines(report):
-            tell(f"{report.name}: {line}")
-    if not any(row.episode_index is not None for report in result.reports for row in report.episodes):
-        raise BagError(f"The mapping makes no episode of this, so there is nothing to read: {path}")

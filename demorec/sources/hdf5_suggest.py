@@ -7,7 +7,7 @@ groups at the root. What neither the file nor the layout specifies is commented 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +33,7 @@ _ALOHA_FPS = 50
 """ALOHA's recorders take a row every `DT = 0.02` seconds; nothing in their files says so."""
 _ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 _TASKS = ("instruction", "ep_meta.lang", "problem_info.language_instruction", "language_instruction")
+_NO_STATE = "# No dataset is known to be the robot's state: take one of those above."
 _ROBOTS = ("env_args.env_kwargs.robot", "env_args.env_kwargs.robots", "env_args.env_kwargs.robots.0")
 
 
@@ -104,8 +105,12 @@ class _Contents:
         return len(array.shape) <= 2 and not array.is_ragged and name not in self.cameras
 
 
-def suggested_hdf5_mapping(path: Path) -> list[str]:
-    """The lines of a mapping for a file, with what is in it as comments.
+def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
+    """Return the lines of a mapping for a file, with what is in it as comments.
+
+    Args:
+        path: The file.
+        tell: Called with what the user has to decide before the mapping can be used.
 
     Raises:
         ConfigError: There is no HDF5 file.
@@ -129,8 +134,10 @@ def suggested_hdf5_mapping(path: Path) -> list[str]:
         lines += ["[task]", *_task(contents, path), ""]
         lines += ["[clock]", *_clock(contents, layout), ""]
         lines += ["[episodes]", *_episodes(contents, places, layout)]
-        lines += [*_features(contents, layout), *_cameras(contents, layout)]
-    return lines
+        features = [*_features(contents, layout)]
+        if _NO_STATE in features:
+            tell(_NO_STATE.removeprefix("# "))
+        return [*lines, *features, *_cameras(contents, layout)]
 
 
 def _listed(contents: _Contents, count: int) -> Iterator[str]:
@@ -231,7 +238,7 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
     if STATE not in observed and EE_POSE in observed:
         observed[STATE] = observed.pop(EE_POSE)
     if STATE not in observed:
-        yield from ("", "# Nothing says that it is the robot's state: take one of those above.")
+        yield from ("", _NO_STATE)
     for feature in sorted(observed, key=lambda name: name != STATE):
         yield from _parts(feature, sorted(observed[feature], key=_order), contents, is_isaac=bool(absolute))
     yield from _parts("action", [name for name in layout.actions if name in vectors], contents)

@@ -86,6 +86,14 @@ class BagReport:
         """Episodes that were not dropped."""
         return tuple(episode for episode in self.episodes if episode.episode_index is not None)
 
+    def dropped_lines(self) -> Iterator[str]:
+        """Describe the parts that became no episode, and what was odd."""
+        for episode in self.episodes:
+            if episode.episode_index is None:
+                yield from episode.lines()
+        if kinds := sorted({finding.kind for finding in self.odd}):
+            yield f"findings in the bag ({', '.join(kinds)}), which demorec check lists"
+
 
 def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str, str]:
     """Return the figures of a stream by their name in the report's table.
@@ -108,14 +116,6 @@ def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str,
         "lost": str(int(lost_in(line).sum()) if line.is_regular else 0),
         "age ms": f"{max(ages) / 1e6:.1f}" if ages else "-",
     }
-
-
-def dropped_lines(report: BagReport) -> list[str]:
-    """Describe the parts of a bag that became no episode, and what was odd in it."""
-    lines = [line for row in report.episodes if row.episode_index is None for line in row.lines()]
-    if kinds := sorted({finding.kind for finding in report.odd}):
-        lines.append(f"findings in the bag ({', '.join(kinds)}), which demorec check lists")
-    return lines
 
 
 FORMAT = 1

@@ -260,6 +260,15 @@ class ImportBatch:
         return (*before, *(SkippedBag(name=path.name, reason=reason) for path, reason in self.skipped.items()))
 
     @property
+    def num_episodes(self) -> int:
+        """Number of episodes that the bags gave."""
+        return sum(len(report.made) for report in self.reports)
+
+    def left_out_lines(self) -> Iterator[str]:
+        """Describe what became no episode, and what was odd."""
+        yield from (f"{report.name}: {line}" for report in self.reports for line in report.dropped_lines())
+
+    @property
     def reports(self) -> tuple[BagReport, ...]:
         """Of every bag that is in the run, in the order in which they were given."""
         reports = {report.files: report for report in self._known.bags}

@@ -1,7 +1,4 @@
-"""A mapping suggested from what is in a bag: every topic is listed with its type, recognised ones are mapped.
-
-`candidates` recognises topics. What is recognised but not taken is a source that is commented out.
-"""
+"""A mapping suggested from what is in a bag: every topic is listed with its type, recognised ones are mapped."""
 
 from __future__ import annotations
 
@@ -19,7 +16,7 @@ import numpy as np
 from demorec.episode.info import DEPTH_UNITS
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
-from demorec.sources.bag import Bag, TopicSummary, open_bag
+from demorec.sources.bag import Bag, TopicSummary, bags_in, open_bag
 from demorec.sources.bag_files import BagError
 from demorec.sources.candidates import Candidate, Choice, candidates_of, choose_features, of_publishers
 from demorec.sources.clock import NS, SKEW_S
@@ -31,8 +28,6 @@ from demorec.sources.words import SHOWN, first_numbers, quoted, task_in_name, un
 
 _MAX_DECODED = 64
 """Messages of a topic that are decoded."""
-_MAX_OFFERED = 24
-"""Sources that are commented out."""
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
@@ -84,13 +79,14 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     """The lines of a mapping for a bag, with what is in it as comments.
 
     Args:
-        path: The bag.
+        path: The bag, or a folder of bags, of which the first is looked at.
         tell: Called with what the user has to decide before the mapping can be used.
 
     Raises:
         ConfigError: There is no bag.
         BagError: It cannot be read, or holds no messages.
     """
+    path = bags_in(path)[0]
     bag = open_bag(path)
     problems: list[str] = []
     topics = _topics(bag, problems)
@@ -285,11 +281,6 @@ def _features(choice: Choice, topics: Mapping[str, _Topic]) -> Iterator[str]:
         yield from ("[[features.action]]", 'next = "observation.state"')
     for pose in choice.poses:
         yield from _source("observation.ee_pose", pose, topics)
-    for candidate in choice.others[:_MAX_OFFERED]:
-        for line in _source("action" if candidate.is_action else "observation.state", candidate, topics):
-            yield f"# {line}" if line else ""
-    if len(choice.others) > _MAX_OFFERED:
-        yield f"# and {len(choice.others) - _MAX_OFFERED} more"
 
 
 def _chosen(feature: str, parts: Sequence[Candidate], topics: Mapping[str, _Topic]) -> Iterator[str]:
@@ -305,7 +296,7 @@ def _source(feature: str, part: Candidate, topics: Mapping[str, _Topic], *, pref
     key = feature if "." not in feature else quoted(feature)
     topic = topics[part.topic]
     yield from ("", f"[[features.{key}]]", f"topic = {quoted(part.topic)}")
-    yield f"field = {quoted(part.field)}" + (f"  # first: {part.first}" if part.first else "")
+    yield f"field = {quoted(part.reader.source.field)}"
     if part.reader.joints:
         yield f"joints = [{', '.join(map(quoted, part.reader.joints))}]"
     if part.name:

@@ -78,7 +78,7 @@ def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.Ca
     assert warned.startswith("No topic was recognised as the state of an arm")
     assert f"# ATTENTION: {warned}" in text
     assert "#   /tf  tf2_msgs/msg/TFMessage, 50.0 Hz, 50 messages" in text
-    assert '# topic = "/franka_gripper/joint_states"' in text
+    assert "#   /franka_gripper/joint_states  sensor_msgs/msg/JointState, 50.0 Hz, 50 messages" in text
     assert "observation.state" not in tomllib.loads(text)["features"]
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)

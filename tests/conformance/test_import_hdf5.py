@@ -37,7 +37,7 @@ DEMOS = ("demo_0", "demo_1", "demo_10")
 
 def suggested(file: Path, changes: dict[str, str] | None = None) -> Path:
     """The suggested mapping of a file, with some texts exchanged."""
-    text = "\n".join(suggested_hdf5_mapping(file))
+    text = "\n".join(suggested_hdf5_mapping(file, print))
     for old, new in (changes or {}).items():
         assert old in text
         text = text.replace(old, new)
@@ -410,7 +410,7 @@ def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
         group = opened["observations"].id
         stored = h5py.h5d.create(group, b"effort", h5py.h5t.NATIVE_DOUBLE, space, settings)
         stored.write_direct_chunk((0, 0), bytes(8 * 7 * 8), 0)
-    lines = suggested_hdf5_mapping(file)
+    lines = suggested_hdf5_mapping(file, print)
     told = "observations/effort cannot be read (it is compressed in a way that is not installed here)"
     assert f"#     {told}" in lines
     assert 'dataset = "observations/qpos"' in lines
