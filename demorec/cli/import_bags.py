@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 
 from tyro.conf import Positional, arg
 
-from demorec.cli.shared.output import aligned, counted, say, tell
+from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
@@ -183,7 +183,7 @@ def _report_lines(report: BagReport) -> list[str]:
         place = f"{finding.stream}: " if finding.stream else ""
         lines.append(f"{finding.kind}: {place}{finding.text}")
     lines += [line for episode in report.episodes for line in episode.lines()]
-    return [f"{report.name} ({report.num_bytes / 1e6:,.1f} MB)", *(f"  {line}" for line in lines)]
+    return [f"{report.name} ({size_in_words(report.num_bytes)})", *(f"  {line}" for line in lines)]
 
 
 def _list_skipped(skipped: Mapping[Any, str], total: int, word: str) -> int:

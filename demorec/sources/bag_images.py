@@ -70,7 +70,7 @@ class _BagImages:
         for number, rows in enumerate(episodes):
             for name, camera in rows.cameras.items():
                 order = np.argsort(camera.taken)
-                takers = zip(camera.taken[order].tolist(), repeat(number), repeat(name), order.tolist())
+                takers = zip(camera.taken[order], repeat(number), repeat(name), order, strict=False)
                 taken.setdefault(camera.topic, []).append(takers)
         self._takers = {topic: merge(*takers) for topic, takers in taken.items()}
         self._next = {topic: next(takers, None) for topic, takers in self._takers.items()}

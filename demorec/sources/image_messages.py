@@ -219,9 +219,13 @@ def image_head(values: Values) -> ImageHead:
 
 
 def _checked(head: ImageHead) -> ImageHead:
-    if head.width < 1 or head.height < 1 or head.width * head.height > MAX_PIXELS:
-        raise FieldError(f"its image has {head.width}x{head.height} pixels, at most {MAX_PIXELS} are read")
+    _check_size(head.width, head.height)
     return head
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are read")
 
 
 @contextmanager
@@ -329,28 +333,18 @@ def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
 
 def _compressed_depth(data: bytes) -> NDArray[np.uint16]:
     """(H, W) millimetres; FieldError when they are too many, or cannot be decoded."""
-    width, height = _size(data)
     if data.startswith(_PNG, _HEAD_BYTES):
         with _opened(data[_HEAD_BYTES:], ["PNG"], "its distances cannot be decoded") as image:
+            _check_size(*image.size)
             if image.mode not in ("I;16", "I"):
                 raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
             return np.asarray(image).astype(np.uint16)
+    size = data[_HEAD_BYTES : _HEAD_BYTES + 8]
+    if len(size) < 8:
+        raise FieldError("its distances are cut off")
+    width, height = (int.from_bytes(part, "little") for part in (size[:4], size[4:]))
+    _check_size(width, height)
     try:
         return decode_millimetres(data, (height, width))
     except ValueError as error:
         raise FieldError(f"its distances cannot be decoded ({describe_error(error)})") from error
-
-
-def _size(data: bytes) -> tuple[int, int]:
-    """Width and height, within bounds."""
-    if data.startswith(_PNG, _HEAD_BYTES):
-        size = data[_HEAD_BYTES + 16 : _HEAD_BYTES + 24]  # of the first chunk, IHDR
-        order = "big"
-    else:
-        size, order = data[_HEAD_BYTES : _HEAD_BYTES + 8], "little"
-    if len(size) < 8:
-        raise FieldError("its distances are cut off")
-    width, height = (int.from_bytes(size[at : at + 4], order) for at in (0, 4))  # type: ignore[arg-type]
-    if not 1 <= width * height <= MAX_PIXELS:
-        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are read")
-    return width, height

@@ -253,21 +253,6 @@ class SourceMapping:
         """16 hex digits of all that it says of its kind of source."""
         return digest(_said(self, self.kind))
 
-    @property
-    def topics(self) -> frozenset[str]:
-        """All of a bag that it names."""
-        named = {source.topic for sources in self.features.values() for source in sources}
-        named |= {topic for camera in self.cameras.values() for topic in (camera.topic, camera.info_topic)}
-        named |= {
-            self.task.topic,
-            self.subtasks.topic,
-            self.robot.urdf_topic,
-            "" if self.clock.rows in ROWS else self.clock.rows,
-        }
-        if self.episodes.cut == "marker":
-            named.add(self.episodes.topic)
-        return frozenset(named - {""})
-
     def leaves_out(self, dataset: str) -> bool:
         """Whether it says that a dataset, or a group that holds it, shall not be imported."""
         return any(f"{dataset}/".startswith(f"{name.strip('/')}/") for name in self.leave_out)

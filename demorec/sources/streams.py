@@ -36,7 +36,7 @@ from demorec.sources.fields import (
     stamp_of,
 )
 from demorec.sources.image_messages import ImageHeads, image_head
-from demorec.sources.mapping import CameraSource, Source, SourceMapping, Unit
+from demorec.sources.mapping import ROWS, CameraSource, Source, SourceMapping, Unit
 from demorec.sources.words import quoted
 
 NO_STAMP = -(2**63)
@@ -231,7 +231,8 @@ class BagStreams:
         self.texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
         self.infos: dict[str, Values] = {}
         self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
-        self._wanted = mapping.topics
+        followed = {mapping.clock.rows}.difference(ROWS)
+        self._wanted = {*self._of_topic, *self._fields, *self._info_topics, *followed}
         self._counts: dict[str, int] = {}
         self._types: defaultdict[str, set[str]] = defaultdict(set)
         self._refused: dict[str, str] = {}

@@ -127,19 +127,6 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
         assert {time for time in times if begin <= time <= end} <= set(stamps)
 
 
-def test_distances_registered_to_another_camera_are_no_swap(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Stereo cameras give them in the coordinate frame of the left one."""
-    left, right, depth = "/zed/left/image_rect_color", "/zed/right/image_rect_color", "/zed/depth/depth_registered"
-    notes = bag({left: ticks(15, 40)}) + bags.jpeg_images(right, ticks(15, 40), 1, "right")
-    for note in bags.raw_images(depth, ticks(15, 40), 2, "left"):
-        width, height = note.body["width"], note.body["height"]
-        data = np.linspace(0.3, 2.0, width * height, dtype=np.float32).view(np.uint8)
-        notes.append(bags.with_body(note, encoding="32FC1", step=4 * width, data=data))
-    path = WRITERS["mcap"](bags.in_order(notes), tmp_path)
-    told, _ = imported(path, suggested(path, capsys), tmp_path, capsys)
-    assert "swapped" not in told
-
-
 def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Rows follow the camera of which images are missing, and so have no place for as many of the other."""
     side = [time for k, time in enumerate(ticks(30, 300, phase=0.1)) if k % 50 != 20]

@@ -135,19 +135,6 @@ def test_headers_without_time_are_no_finding_where_the_mapping_knows(notes: bags
     assert _findings(bag, tmp_path, MAPPING.replace(place, f'{place}\nstamp = "log"')) == set()
 
 
-def test_a_quaternion_of_the_other_sign_is_no_jump(tmp_path: Path) -> None:
-    """Both mean the same rotation, and drivers send either."""
-
-    def turned(number: int, note: bags.Note) -> bags.Note:
-        pose = note.body["pose"]
-        orientation = {axis: -value for axis, value in pose["orientation"].items()}
-        return bags.with_body(note, pose={**pose, "orientation": orientation}) if number % 90 > 60 else note
-
-    notes = bags.changed(bags.franka(2.0), "/franka_robot_state_broadcaster/current_pose", turned)
-    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
-    assert _findings(bag, tmp_path, bag_mappings.FRANKA) == set()
-
-
 @pytest.mark.parametrize("kind", ["drops", "frozen", "nothing"])
 def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) -> None:
     """The bag itself is gone by then."""
