@@ -23,7 +23,7 @@ from demorec.sources.mapping import SourceMapping
 
 @cache
 def importing_versions() -> Mapping[str, str]:
-    """Of what reads and writes an episode, for its recording."""
+    """Return the versions of the packages that read and write an episode, for its recording."""
     return {name: version(name) for name in ("demorec", "av")}
 
 
@@ -53,13 +53,13 @@ def imported_info(
     cameras: Iterable[Camera],
     files: Iterable[SourceFile],
 ) -> EpisodeInfo:
-    """What is known of an episode that was imported by a mapping.
+    """Describe an episode that was imported by a mapping.
 
     Args:
-        urdf: The robot's model; None where there is none.
+        urdf: The robot's model; None if there is none.
 
     Raises:
-        FieldError: The model is none.
+        FieldError: The model is not a URDF.
     """
     try:
         joints = set() if urdf is None else {joint.name for joint in Urdf.parse(urdf).joints}

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from demorec.core.config import MAX_PIXELS
 from demorec.datasets.hdf5.foreign import Hdf5Error, StoredArray
@@ -18,7 +18,7 @@ from demorec.sources.description import imported_feature
 from demorec.sources.episode_writer import Image
 from demorec.sources.fields import FieldError, converted, names_of, picked
 from demorec.sources.image_messages import decode_image, image_head
-from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source, conversion_factor
+from demorec.sources.mapping import MAX_ELEMENTS, CameraSource, Source
 
 _EXACT = 2**53
 """Up to which float64 holds every whole number."""
@@ -26,74 +26,66 @@ _EXACT = 2**53
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _Column:
-    """One part of a feature, and where its numbers are."""
+    """One part of a feature with its dataset."""
 
     part: Source
     array: StoredArray
     names: tuple[str, ...]
 
-    @property
-    def is_single(self) -> bool:
-        """Whether float32 holds all its numbers."""
-        kind = self.array.dtype
-        return kind.kind == "f" and kind.itemsize <= 4 and conversion_factor(self.part.unit, self.part.to) is None
-
     def rows(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
+        """Read (end - begin, D): float32 where that holds all numbers, otherwise float64.
+
+        Raises:
+            FieldError: A number is not finite, or float64 cannot hold it.
+            Hdf5Error: They cannot be read.
+        """
         rows: NDArray[Any] = self.array.read(begin, end).reshape(end - begin, -1)
         rows = rows[:, list(self.part.elements)] if self.part.elements else rows
         if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
             raise FieldError(f"{self.array.place} has whole numbers that float64 cannot hold")
         is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
-        return converted(self.part, rows.astype(np.float32 if is_small else np.float64))
+        values = converted(self.part, rows.astype(np.float32 if is_small else np.float64))
+        if len(wrong := np.argwhere(~np.isfinite(values))):
+            row, element = wrong[0].tolist()
+            raise FieldError(
+                f"{self.array.place} is {values[row, element]} in row {begin + row} ({self.names[element]}), numbers "
+                "must be finite"
+            )
+        return values
 
 
 class StoredFeature:
     """A feature of an episode.
 
     Args:
-        name: Of it.
-        parts, arrays: What it is made of, and where each is.
-        shift: By how many rows the frames are behind the datasets' rows: 1 for what another feature is next.
+        name: Its name.
+        parts, arrays: Its parts, and the dataset of each.
+        shift: Number of rows by which the frames are behind the datasets' rows: 1 for the next row of a feature.
 
     Raises:
-        FieldError: They are no vectors.
+        FieldError: The datasets are not vectors.
     """
 
     def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
         self.name, self.shift = name, shift
         pairs = zip(parts, arrays, strict=True)
         self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
-        self._dtype = np.float32 if all(column.is_single for column in self.columns) else np.float64
 
-    def described(self) -> Feature:
-        """The feature as recordings know it."""
+    def described(self, dtype: DTypeLike) -> Feature:
+        """Describe it, with vectors of a type, as recordings do."""
         names = tuple(name for column in self.columns for name in column.names)
         units = (column.part.to or column.part.unit for column in self.columns for _ in column.names)
         called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
         source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
-        return imported_feature(self.name, self._dtype, names, units, called=called, source=source)
+        return imported_feature(self.name, dtype, names, units, called=called, source=source)
 
     def vectors(self, count: int) -> NDArray[np.floating[Any]]:
-        """Read (T, D) of the first `count` frames.
-
-        Raises:
-            FieldError: A number is not finite, or not to be held.
-            Hdf5Error: They cannot be read.
-        """
-        parts = [column.rows(self.shift, self.shift + count) for column in self.columns]
-        for column, part in zip(self.columns, parts, strict=True):
-            if len(wrong := np.argwhere(~np.isfinite(part))):
-                row, element = wrong[0].tolist()
-                raise FieldError(
-                    f"{column.array.place} is {part[row, element]} in row {self.shift + row} "
-                    f"({column.names[element]}), numbers must be finite"
-                )
-        vectors: NDArray[np.floating[Any]] = np.concatenate(parts, axis=1).astype(self._dtype, copy=False)
-        return vectors
+        """Read (T, D) of the first `count` frames; errors are those of `_Column.rows`."""
+        return np.concatenate([column.rows(self.shift, self.shift + count) for column in self.columns], axis=1)
 
 
 def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
-    """Of the elements that are taken."""
+    """Return the names of the elements that are taken."""
     if len(array.shape) > 2:
         shape = "x".join(map(str, array.shape))
         raise FieldError(f"{array.place} is an array of {shape}, a feature takes rows of numbers")

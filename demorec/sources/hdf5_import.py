@@ -171,10 +171,9 @@ class _Stored:
         )
 
     def described(self, urdf: str | None, source: SourceFile, episode_index: int) -> EpisodeInfo:
-        """What the recording shall say of it; every number is looked at."""
+        """Describe it for its recording; every number is looked at."""
         file, place, mapping = self._file, self._place, self._mapping
-        for feature in self.features:
-            feature.vectors(self.num_frames)
+        dtypes = [feature.vectors(self.num_frames).dtype for feature in self.features]
         if attribute := mapping.robot.urdf_attribute:
             urdf = str(found_attribute(file, place, attribute) or "")
         try:
@@ -184,7 +183,7 @@ class _Stored:
                 instruction=self._task(),
                 urdf=urdf,
                 fps=self._rate(),
-                features=(feature.described() for feature in self.features),
+                features=(one.described(dtype) for one, dtype in zip(self.features, dtypes, strict=True)),
                 cameras=(camera.described() for camera in self.cameras),
                 files=[source],
             )

@@ -138,8 +138,8 @@ class ImportFile:
         format: Of this file.
         mapping: Of all bags, as plain data: that of an older release may have other keys.
         mapping_digest: Of it.
-        bags: What was read, in order; those that are not whole yet are missing.
-        skipped: What was left out, when it was last given.
+        bags: Reports of the imported bags in order; those that are not whole yet are missing.
+        skipped: Bags that were left out when they were last given.
     """
 
     format: int = FORMAT
@@ -150,12 +150,12 @@ class ImportFile:
 
     @property
     def num_episodes(self) -> int:
-        """That were made; the next one has this number."""
+        """Number of episodes that were made; the next one has this number."""
         return sum(len(bag.made) for bag in self.bags)
 
 
 def load_import_file(folder: Path) -> ImportFile | None:
-    """That of a run; None when there is none, BagError when it cannot be read."""
+    """Load the import.json of a run; None if it has none, BagError if it cannot be read."""
     path = folder / IMPORT_NAME
     try:
         found = from_json(read_text_limited(path, _MAX_BYTES), ImportFile)

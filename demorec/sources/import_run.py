@@ -55,7 +55,7 @@ def import_bags(
         progress: Called with the number of bags that are done, and of all.
 
     Returns:
-        What came of the bags: `reports`, `num_new` and `skipped`.
+        The batch, with `reports`, `num_new` and `skipped`.
 
     Raises:
         ConfigError: The mapping is impossible, or the folder holds something else.
@@ -202,7 +202,7 @@ class ImportBatch:
             self._failure = error
 
     def _take(self, folder: ExternalFolder, path: Path, report: BagReport, lines: Sequence[Attempt]) -> None:
-        """Take a bag whose episodes are written into the run; run.json, which says that it is done, comes last."""
+        """Add a written bag to the run; run.json, which marks it as done, comes last."""
         self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
         save_import_file(self._known, folder.path)
         self.num_new += 1
@@ -211,7 +211,7 @@ class ImportBatch:
         folder.extend(lines)
 
     def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> PlannedBag | None:
-        """What is to be written of a bag, with its episodes' numbers; None for one that is left out or there."""
+        """Return the bag with the numbers of its new episodes; None for one that is left out or was there."""
         try:
             planned = read.result()
             if planned.episodes:
@@ -270,7 +270,7 @@ class ImportBatch:
 
     @property
     def reports(self) -> tuple[BagReport, ...]:
-        """Of every bag that is in the run, in the order in which they were given."""
+        """Reports of the bags in the run, in the order in which they were given."""
         reports = {report.files: report for report in self._known.bags}
         files = dict.fromkeys(self._files[path] for path in self._paths if path in self._files)
         return tuple(reports[key] for key in files)
