@@ -261,7 +261,7 @@ def _hdf5(folder: Path) -> None:
     from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
     from support.hdf5 import write_robomimic
 
-    (folder / HDF5).write_text("\n".join(suggested_hdf5_mapping(write_robomimic(folder / "demo.hdf5"))))
+    (folder / HDF5).write_text("\n".join(suggested_hdf5_mapping(write_robomimic(folder / "demo.hdf5"), print)))
 
 
 def _bags(folder: Path) -> None:
