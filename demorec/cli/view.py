@@ -102,6 +102,7 @@ class View:
         sources = select(found, self.episodes)
         tell_unfinished(self.paths)
         tell_incomplete(self.paths)
+        tell(*dict.fromkeys(note for source in sources for note in source.notes))
         if self.rank is not None:
             sources = self._ranked(sources)
         if self.save is None and self.screenshot is None and not self.web:

@@ -31,10 +31,12 @@ class PlaybackSource:
     Attributes:
         name: For people.
         open: A context manager that gives the episode; RecordingError when it cannot be read.
+        notes: Sentences on how its dataset was read.
     """
 
     name: str
     open: Callable[[], AbstractContextManager[Playback]]
+    notes: tuple[str, ...] = ()
 
 
 def find_episodes(
@@ -60,9 +62,13 @@ def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[Play
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
         dataset = LeRobotFolder(path, named=named)
+        missing = dataset.leave_out_missing_cameras()
+        notes = tuple(f"No episode has a video of {key}, which is not shown: {path}" for key in missing)
         return [
             PlaybackSource(
-                name=f"{path}: episode {place.episode_index}", open=partial(open_dataset_episode, dataset, number)
+                name=f"{path}: episode {place.episode_index}",
+                open=partial(open_dataset_episode, dataset, number),
+                notes=notes,
             )
             for number, place in enumerate(dataset.places)
         ]

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import av
+import h5py
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -223,8 +224,30 @@ def test_a_camera_without_videos_is_named_with_what_to_do(tmp_path: Path, capsys
     for words in (["import", "lerobot"], ["dataset", "shuffle"]):
         assert exit_code(*words, source, "--out", tmp_path / "new") == 1
         assert "demorec dataset drop-features DATASET observation.images.top --out NEW" in capsys.readouterr().err
+    assert exit_code("view", source, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
+    assert "No episode has a video of observation.images.top, which is not shown" in capsys.readouterr().err
     assert exit_code("dataset", "drop-features", source, "observation.images.top", "--out", tmp_path / "rest") == 0
     assert exit_code("import", "lerobot", tmp_path / "rest", "--out", tmp_path / "run") == 0
+
+
+def test_episodes_without_videos_are_listed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = write_drawn(tmp_path / "set", replace(PLAIN, lengths=(4, 5, 4, 4)))
+    for number in (1, 3):
+        (source / f"videos/chunk-000/observation.images.top/episode_{number:06d}.mp4").unlink()
+    assert exit_code("dataset", "shuffle", source, "--out", tmp_path / "new") == 1
+    assert "demorec dataset drop DATASET --episodes 1,3 --out NEW" in capsys.readouterr().err
+    assert exit_code("dataset", "drop", source, "--episodes", "1,3", "--out", tmp_path / "new") == 0
+
+
+def test_actions_of_another_name_are_exported_to_hdf5(tmp_path: Path) -> None:
+    source = write_drawn(tmp_path / "set", replace(PLAIN, camera=""))
+    assert exit_code("dataset", "rename", source, "action=actions", "--out", tmp_path / "new") == 0
+    assert exit_code("import", "lerobot", tmp_path / "new", "--out", tmp_path / "run") == 0
+    assert exit_code("export", "hdf5", tmp_path / "run", "--out", tmp_path / "x.hdf5") == 0
+    before = pq.read_table(source / "data/chunk-000/episode_000001.parquet")
+    with h5py.File(tmp_path / "x.hdf5") as file:
+        assert file["data/demo_1/actions"][:].tolist() == before["action"].to_pylist()
+        assert list(file["data/demo_1/obs"]) == ["state"]
 
 
 def test_pointers_of_git_lfs_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -20,6 +20,7 @@ from demorec.datasets.hdf5.options import Hdf5Options
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
+from demorec.episode.roles import NO_NAMES, roles_of_recording
 from demorec.mcap import open_recording
 
 Hdf5Episode = ExportEpisode[Hdf5Options]
@@ -128,7 +129,9 @@ def _fill(demo: h5py.Group, episode: Hdf5Episode) -> None:
         demo.attrs["success"] = success
         demo["rewards"] = (dones * success).astype(np.float32)
     demo["dones"] = dones
-    _add_vectors(demo, "actions", episode.vectors[ACTION], episode.names[ACTION])
+    actions = _action_features(episode)
+    parts = [name for feature in actions for name in episode.names[feature]]
+    _add_vectors(demo, "actions", np.hstack([episode.vectors[feature] for feature in actions]), parts)
     if episode.scene is not None:
         _add_vectors(demo, "states", *_states(episode))
     group = demo.create_group("obs")
@@ -150,19 +153,33 @@ def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
         root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
 
 
+def _action_features(episode: Hdf5Episode) -> tuple[str, ...]:
+    """Find the features that are the action, whatever their names; several are joined in this order.
+
+    Raises:
+        ConfigError: The episode has no actions.
+    """
+    if ACTION in episode.names:
+        return (ACTION,)
+    roles = roles_of_recording(episode.info, NO_NAMES)
+    found = tuple(name for name in roles.action if name in episode.names)
+    if not found:
+        raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {episode.recording.path}")
+    return found
+
+
 def _observation_names(episode: Hdf5Episode) -> dict[str, tuple[str, slice]]:
     """Return observation -> feature and its elements: robosuite's names, or "force" for "observation.force".
 
     Raises:
         ConfigError: The episode has no actions, or two streams would get one name.
     """
-    if ACTION not in episode.names:
-        raise ConfigError(f"robomimic's layout needs actions, and the episode has none: {episode.recording.path}")
+    actions = _action_features(episode)
     known = {} if episode.scene is None else _ROBOSUITE
     found = [
         (name, (feature, elements))
         for feature in episode.names
-        if feature != ACTION
+        if feature not in actions
         for name, elements in known.get(feature, {feature.removeprefix("observation."): slice(None)}).items()
     ]
     given = [*(name for name, _ in found), *_image_names(episode)]

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from demorec.episode.info import Camera, Feature, Kept
     from demorec.robots.motors import Motors
 
+_MAX_LISTED = 50
+"""Episodes that a sentence names."""
 _MAX_OPEN_VIDEOS = 16
 """Video files of which the index is kept: that of 15 minutes takes one MB."""
 _KNOWN = ("source", "success", "failure_reason", "root_seed", "cameras", "robot_digest")
@@ -157,9 +159,14 @@ class LeRobotFolder:
         from demorec.datasets.lerobot.videos import EpisodeVideo
 
         if not (path := place.videos[key][0]).exists():
+            without = [other for other in self.listed if not other.videos[key][0].exists()]
+            numbers = ",".join(str(other.episode_index) for other in without[:_MAX_LISTED])
+            more = ",..." if len(without) > _MAX_LISTED else ""
+            drop = f"drop these episodes (demorec dataset drop DATASET --episodes {numbers}{more} --out NEW), or "
             raise ExportError(
-                f"Episode {place.episode_index} has no video of {key}. Restore the file, drop the episode, or leave "
-                f"the camera out (demorec dataset drop-features DATASET {key} --out NEW): {path}"
+                f"Episode {place.episode_index} has no video of {key}. Restore the file, "
+                f"{drop if len(without) < len(self.listed) else ''}leave the camera out (demorec dataset drop-features "
+                f"DATASET {key} --out NEW): {path}"
             )
         return EpisodeVideo(self.open_video, key, self.info.features[key], place, int(self.info.fps))
 
@@ -251,6 +258,13 @@ class LeRobotFolder:
             for name, feature in self.info.features.items()
             if not (feature.is_camera or name in AUTOMATIC_FEATURES or why_not_recorded(name, feature))
         )
+
+    def leave_out_missing_cameras(self) -> tuple[str, ...]:
+        """Let no recording have the cameras of which no episode has its video, and return their features."""
+        videos = [key for key in self.keys.values() if self.info.features[key].is_video]
+        found = tuple(key for key in videos if not any(place.videos[key][0].exists() for place in self.listed))
+        self.keys = {name: key for name, key in self.keys.items() if key not in found}
+        return found
 
     def leave_out(self, name: str) -> None:
         """Let no recording have a feature."""
