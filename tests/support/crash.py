@@ -16,7 +16,7 @@ import pytest
 
 from demorec.cli import main
 
-TIMEOUT_S = 240
+TIMEOUT_S = 600
 """After this a child counts as hung, and is killed."""
 _UNEXPECTED = 99
 """Exit code of a child whose command raised an exception."""
