@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from demorec.core.registry import nearest_match
 from demorec.mcap.cdr import Values
 from demorec.sources.bag_files import MAX_TIME_NS
-from demorec.sources.mapping import MAX_ELEMENTS, Source, conversion_factor
+from demorec.sources.mapping import CONVERSIONS, MAX_ELEMENTS, Source
 
 _STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
 _STAMP_PATHS = (
@@ -321,8 +321,8 @@ def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
 
 
 def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """(N, D) in the unit of the feature; the very same array where that is the source's."""
-    factor = conversion_factor(part.unit, part.to)
+    """Return (N, D) in the unit of the feature; the same array if that is the source's."""
+    factor = CONVERSIONS.get((part.unit, part.to or part.unit))
     if factor is None:
         return vectors
     if math.isnan(factor):

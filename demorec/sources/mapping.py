@@ -285,8 +285,3 @@ CONVERSIONS: Mapping[tuple[str, str], float] = {
     ("percent", "m"): math.nan,
 }
 """(unit of the source, unit of the feature) -> factor; NaN where each element has its own."""
-
-
-def conversion_factor(unit: str, to: str) -> float | None:
-    """What numbers are multiplied with; None for not at all, NaN where `Source.limits` say it for each element."""
-    return CONVERSIONS.get((unit, to or unit))
