@@ -14,7 +14,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -68,45 +68,62 @@ def import_hdf5(
         expect(path, "hdf5")
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigError("A file is given twice: name each once.")
-    plans: list[tuple[Path, str, EpisodeInfo, Outcome]] = []
-    left_out: dict[str, str] = {}
+    plan = _planned(paths, mapping, urdf)
+    with open_external_run(out, recovers=False) as folder:
+        missing = [episode for episode in plan.episodes if not folder.has(episode.info)]
+        folder.planned = [planned_episode(episode.info.episode_index) for episode in missing]
+        for episode in missing:
+            with ForeignFile(episode.path) as file, _named(episode.path):
+                stored = _Stored(file, episode.place, mapping)
+                table = stored.table(episode.info.fps)
+                images = {camera.name: camera.images() for camera in stored.cameras}
+                settings = video or VideoConfig()
+                add_episode(folder, episode.info, table, images, outcome=episode.outcome, video=settings, subtasks={})
+    return FramesImport(
+        num_episodes=len(plan.episodes),
+        num_frames=sum(episode.outcome.num_frames for episode in plan.episodes),
+        num_new=len(missing),
+        cameras=plan.cameras,
+        left_out=plan.left_out,
+    )
+
+
+class _PlannedDemo(NamedTuple):
+    """An episode that is to be imported, by its place in a file."""
+
+    path: Path
+    place: str
+    info: EpisodeInfo
+    outcome: Outcome
+
+
+class _Plan(NamedTuple):
+    """Episodes of all files; `cameras` and `left_out` are those of `FramesImport`."""
+
+    episodes: list[_PlannedDemo]
+    cameras: dict[str, str]
+    left_out: dict[str, str]
+
+
+def _planned(paths: Sequence[Path], mapping: SourceMapping, urdf: str | None) -> _Plan:
+    """Look through all files; errors are those of `import_hdf5`."""
+    episodes: list[_PlannedDemo] = []
     cameras: dict[str, str] = {}
+    left_out: dict[str, str] = {}
     for path in paths:
         with ForeignFile(path) as file, _named(path):
             source = SourceFile(name=path.name, sha256=sha256_of(path))
             places = episode_places(file, mapping.episodes)
             for place in places:
-                episode = _Stored(file, place, mapping)
-                info = episode.described(urdf, source, len(plans))
-                first = plans[0][2] if plans else info
-                plans.append((path, place, _alike(info, first, file, place), episode.outcome()))
-                cameras = cameras or {c.name: f"{c.width}x{c.height}, {c.description}" for c in episode.cameras}
-                if episode.has_last:
+                stored = _Stored(file, place, mapping)
+                info = stored.described(urdf, source, len(episodes))
+                info = _alike(info, episodes[0].info if episodes else info, file, place)
+                episodes.append(_PlannedDemo(path, place, info, stored.outcome()))
+                cameras = cameras or {c.name: f"{c.width}x{c.height}, {c.description}" for c in stored.cameras}
+                if stored.has_last:
                     left_out["the last observation of each episode"] = "no action follows it"
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
-    with open_external_run(out, recovers=False) as folder:
-        missing = [plan for plan in plans if not folder.has(plan[2])]
-        folder.planned = [planned_episode(info.episode_index) for _, _, info, _ in missing]
-        for path, place, info, outcome in missing:
-            with ForeignFile(path) as file, _named(path):
-                episode = _Stored(file, place, mapping)
-                images = {camera.name: camera.images() for camera in episode.cameras}
-                add_episode(
-                    folder,
-                    info,
-                    episode.table(info.fps),
-                    images,
-                    outcome=outcome,
-                    video=video or VideoConfig(),
-                    subtasks={},
-                )
-    return FramesImport(
-        num_episodes=len(plans),
-        num_frames=sum(outcome.num_frames for _, _, _, outcome in plans),
-        num_new=len(missing),
-        cameras=cameras,
-        left_out=left_out,
-    )
+    return _Plan(episodes, cameras, left_out)
 
 
 class _Stored:
