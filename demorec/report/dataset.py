@@ -44,7 +44,7 @@ def dataset_report(
     folder = LeRobotFolder(root, named=named)
     info, roles = folder.info, folder.roles
     rows = {row["episode_index"]: row for row in folder.sidecar(_EPISODE_COLUMNS)}
-    left_out = folder.attempts.failures()
+    left_out = folder.attempts.failures
     missing = list(_missing(info, roles, has_sidecar=bool(rows)))
     key = _camera_key(info, camera, root)
     wanted = dict.fromkeys((*roles.state, *roles.action))

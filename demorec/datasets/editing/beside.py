@@ -15,24 +15,17 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import Closing, sync_path
+from demorec.core.files import sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import EpisodeSlice, Plan
-from demorec.datasets.lerobot.boxes import BOXES_DIR, BoxWriter
+from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.rows import IndexedRows
-from demorec.datasets.lerobot.sidecar import (
-    ATTEMPT_SCHEMA,
-    CONFIGS_PATH,
-    EPISODE_SCHEMA,
-    EXPORT_PATH,
-    EpisodeRecord,
-    SidecarWriter,
-)
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
@@ -77,8 +70,10 @@ def _progress_is_kept(plan: Plan) -> bool:
     )
 
 
-def _write_kept_progress(plan: Plan, folder: Path) -> None:
+def write_kept_progress(plan: Plan, folder: Path) -> None:
     """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
+    if not _progress_is_kept(plan):
+        return
     if _has_stages(plan):
         write_progress(folder)
         return
@@ -106,87 +101,76 @@ def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.
     return rows
 
 
-class Beside(Closing):
-    """Context manager; `add` takes the episodes as they are written, `finish` completes the files."""
+class SidecarReader:
+    """What stands beside the tables of one source, for the episodes of a plan.
 
-    def __init__(self, plan: Plan, folder: Path) -> None:
-        self._plan, self._folder = plan, folder
-        configs: dict[str, Any] = {}
-        for source in plan.sources:
-            if (source.root / CONFIGS_PATH).exists():
-                configs |= read_json(source.root / CONFIGS_PATH)
-        has_any = any(source.sidecar_tables("episodes") for source in plan.sources)
-        self._sidecar = SidecarWriter(folder, plan.info, configs) if has_any else None
-        sources = plan.sources if has_any else ()
-        self._rows = [IndexedRows(source.sidecar_tables("episodes"), EPISODE_SCHEMA, rows=64) for source in sources]
-        with_poses = sources if _poses_are_kept(plan) else ()
-        self._poses = [IndexedRows(source.sidecar_tables("camera_poses"), rows=_ROWS_AT_ONCE) for source in with_poses]
-        self._boxes = BoxWriter(folder, fps=plan.info.fps)
-        self._stored_boxes = [
-            {name: boxes for name, mapping in mappings.items() if (boxes := source.boxes(mapping.feature)) is not None}
-            for source, mappings in zip(plan.sources, plan.mappings, strict=True)
-        ]
+    Args:
+        plan: The new dataset.
+        number: Number of the source in it.
 
-    def close(self) -> None:
-        """Let go of the files."""
-        self._boxes.close()
-        if self._sidecar is not None:
-            self._sidecar.close()
+    Methods raise ExportError if the files cannot be read.
+    """
 
-    def add(self, cut: EpisodeSlice, episode_index: int, digest: str) -> None:
-        """What belongs to an episode that was written, and has this digest."""
-        boxes = {
-            name: file.read(cut.episode, cut.first, cut.last) for name, file in self._stored_boxes[cut.source].items()
-        }
-        seen = {name: found for name, found in boxes.items() if found is not None}
-        self._boxes.add(episode_index, seen, cut.last - cut.first)
-        if self._sidecar is None:
-            return
-        source = self._plan.sources[cut.source]
+    def __init__(self, plan: Plan, number: int) -> None:
+        self._plan, self._source = plan, plan.sources[number]
+        self._rows = IndexedRows(self._source.sidecar_tables("episodes"), EPISODE_SCHEMA, rows=64)
+        tables = self._source.sidecar_tables("camera_poses") if _poses_are_kept(plan) else ()
+        self._poses = IndexedRows(tables, rows=_ROWS_AT_ONCE)
+        found = {name: self._source.boxes(mapping.feature) for name, mapping in plan.mappings[number].items()}
+        self._boxes = {name: boxes for name, boxes in found.items() if boxes is not None}
+
+    def boxes(self, cut: EpisodeSlice) -> dict[str, SeenByCamera]:
+        """Return camera feature -> visible objects of an episode."""
+        found = {name: file.read(cut.episode, cut.first, cut.last) for name, file in self._boxes.items()}
+        return {name: seen for name, seen in found.items() if seen is not None}
+
+    def record(self, cut: EpisodeSlice) -> EpisodeRecord:
+        """Return the sidecar's data about an episode."""
+        source = self._source
         index = source.places[cut.episode].episode_index
-        table = self._rows[cut.source].read(index)
-        found: dict[str, Any] = {} if table is None else table.to_pylist()[-1]
-        robot = found.get("robot_digest")
-        row = {name: value for name, value in found.items() if name not in ("episode_index", "content_digest")}
+        table = self._rows.read(index)
+        row: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
         row.setdefault("source", source.root.name)
+        robot = row.get("robot_digest")
         if not self._plan.keeps_scene(cut):
             row |= dict.fromkeys(_OF_SCENE)
             row["phases"] = _cut_phases(row, cut)
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
-        attempts = source.attempts
-        for attempt in attempts.failed(index):
-            self._sidecar.add_attempt(attempt)
-        attempt = attempts.of(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
-        record = EpisodeRecord(
+        return EpisodeRecord(
             row=row,
-            moving_cameras=self._camera_poses(cut, index) if self._poses else {},
+            attempt=source.attempts.own.get(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names},
+            failed=source.attempts.failed.get(index, ()),
+            moving_cameras=self._camera_poses(cut, index),
             robot=None if robot is None else source.robot(str(robot)),
         )
-        self._sidecar.add(episode_index, digest, record, attempt)
 
     def _camera_poses(self, cut: EpisodeSlice, episode_index: int) -> dict[str, Array]:
-        """Camera -> (T, 7) world_from_camera; none for an episode without; ExportError where frames lack."""
-        rows = self._poses[cut.source].frames(episode_index, cut.first, cut.last)
+        """Camera -> (T, 7) world_from_camera; empty if unknown. Raises ExportError if frames are missing."""
+        rows = self._poses.frames(episode_index, cut.first, cut.last)
         if rows is None or not rows.num_rows:
             return {}
         if rows.num_rows != cut.last - cut.first:
-            root = self._plan.sources[cut.source].root
-            raise ExportError(f"Poses of cameras are missing in episode {episode_index}: {root}")
+            raise ExportError(f"Poses of cameras are missing in episode {episode_index}: {self._source.root}")
         names = [name for name in rows.column_names if name not in _COUNTERS]
         return {name: column_numbers(rows.column(name).combine_chunks()) for name in names}
 
-    def finish(self) -> None:
-        """Complete the files."""
-        self._boxes.finish()
-        if self._sidecar is not None:
-            for number, source in enumerate(self._plan.sources):
-                for attempt in source.attempts.homeless() if self._plan.takes_all_of(number) else ():
-                    self._sidecar.add_attempt(attempt)
-            found = next((s.root for s in self._plan.sources if (s.root / EXPORT_PATH).exists()), None)
-            self._sidecar.finish(read_json(found / EXPORT_PATH) if found else {})
-        if _progress_is_kept(self._plan):
-            _write_kept_progress(self._plan, self._folder)
+
+def kept_configs(plan: Plan) -> dict[str, Any] | None:
+    """Return config digest -> configuration, of all sources; None if no source has a sidecar."""
+    if not any(source.sidecar_tables("episodes") for source in plan.sources):
+        return None
+    configs: dict[str, Any] = {}
+    for source in plan.sources:
+        if (source.root / CONFIGS_PATH).exists():
+            configs |= read_json(source.root / CONFIGS_PATH)
+    return configs
+
+
+def kept_export(plan: Plan) -> Mapping[str, Any]:
+    """Return how the first source that says it was exported; empty if none does."""
+    found = next((s.root for s in plan.sources if (s.root / EXPORT_PATH).exists()), None)
+    return dict(read_json(found / EXPORT_PATH)) if found else {}
 
 
 def _reworded(info: str, task: str, root: Path) -> str:
@@ -296,8 +280,8 @@ def _attempts(plan: Plan) -> Iterator[str]:
     for number, source in enumerate(plan.sources):
         kept = {cut.episode for cut in plan.cuts if cut.source == number}
         gone = [place.episode_index for episode, place in enumerate(source.places) if episode not in kept]
-        lost += sum(len(source.attempts.failed(index)) for index in gone)
-        lost += 0 if plan.takes_all_of(number) else len(source.attempts.homeless())
+        lost += sum(len(source.attempts.failed.get(index, ())) for index in gone)
+        lost += 0 if plan.takes_all_of(number) else len(source.attempts.homeless)
     if lost:
         yield f"failed attempts: {lost} (at episodes that are not in the result)"
 

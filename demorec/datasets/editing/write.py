@@ -19,7 +19,13 @@ from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
 from demorec.core.replacing import check_replaceable
-from demorec.datasets.editing.beside import Beside, copied_files
+from demorec.datasets.editing.beside import (
+    SidecarReader,
+    copied_files,
+    kept_configs,
+    kept_export,
+    write_kept_progress,
+)
 from demorec.datasets.editing.episode_records import episode_statistics
 from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan
 from demorec.datasets.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
@@ -34,7 +40,7 @@ from demorec.datasets.lerobot.paths import DATASET
 from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.videos import EpisodeVideo
-from demorec.datasets.lerobot.writer import DatasetWriter, EpisodeData
+from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter, EpisodeData
 from demorec.datasets.options import ProgressCallback
 
 if TYPE_CHECKING:
@@ -88,23 +94,24 @@ def write_plan(
         OSError: The dataset cannot be written.
     """
     readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
-    with (
-        DatasetWriter(folder, plan.info, _fact_types(plan), kept_tasks(plan)) as writer,
-        Beside(plan, folder) as beside,
-    ):
+    start = DatasetStart(info=plan.info, facts=_fact_types(plan), tasks=kept_tasks(plan), configs=kept_configs(plan))
+    with DatasetWriter(folder, start) as writer:
         around = 0
         for done, cut in enumerate(plan.cuts, start=1):
             data = readers[cut.source].episode(cut)
             around += sum(video.lead + video.tail for video in data.videos.values())
-            beside.add(cut, done - 1, writer.add(data))
+            writer.add(data)
             if progress is not None:
                 progress(done, len(plan.cuts))
-        writer.finish()
-        beside.finish()
+        for number, source in enumerate(plan.sources):
+            for attempt in source.attempts.homeless if plan.takes_all_of(number) else ():
+                writer.add_attempt(attempt)
+        writer.finish(kept_export(plan))
+    write_kept_progress(plan, folder)
     for name in copied_files(plan):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
-        with open_regular(plan.sources[0].root / name) as source, (folder / name).open("wb") as target:
-            shutil.copyfileobj(source, target)
+        with open_regular(plan.sources[0].root / name) as source_file, (folder / name).open("wb") as target:
+            shutil.copyfileobj(source_file, target)
     return sum(reader.num_decoded for reader in readers), around
 
 
@@ -134,7 +141,8 @@ class _Reader:
         tables = tables_in(self.source.root, "meta/episodes") if self.source.fact_types else ()
         self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
         self._known = {} if decode else _kept_statistics(self.source)
-        self._has_digests = any(source.sidecar_tables("episodes") for source in plan.sources)
+        self._sidecar = SidecarReader(plan, number)
+        self._has_sidecar = any(source.sidecar_tables("episodes") for source in plan.sources)
 
     def episode(self, cut: EpisodeSlice) -> EpisodeData:
         """Read an episode."""
@@ -160,7 +168,7 @@ class _Reader:
             if feature.is_video:
                 stored = self.source.video(mapping.feature, place)
                 video = stored.cut(cut.first, cut.last)
-                videos[name] = video.with_digest() if self._has_digests else video
+                videos[name] = video.with_digest() if self._has_sidecar else video
                 video_info[name] = feature.info or stored.file.stream_info()
             else:
                 columns[name] = self._column(rows, mapping, feature)
@@ -182,6 +190,8 @@ class _Reader:
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
             timestamps=self._timestamps(rows, cut),
+            record=self._sidecar.record(cut) if self._has_sidecar else None,
+            boxes=self._sidecar.boxes(cut),
         )
 
     def _timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[Any] | None:

@@ -14,14 +14,13 @@ from typing import Any
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
 from demorec.datasets.lerobot.episode_table import read_tasks
-from demorec.datasets.lerobot.files import rows_in
+from demorec.datasets.lerobot.files import read_json, rows_in, write_text
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.robots import ROBOTS_DIR
-from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA
-from demorec.datasets.lerobot.writer import write_text
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -89,7 +88,6 @@ def write_card(
     root: Path,
     info: DatasetInfo,
     options: ExportOptions,
-    configs: Mapping[str, Any],
     *,
     meanings: Mapping[str, str],
     is_transcoded: bool,
@@ -97,14 +95,13 @@ def write_card(
     """Write the card of a finished dataset folder.
 
     Args:
-        configs: Config digest -> configuration of the runs; empty if demorec simulated no episode.
         meanings: Feature -> its description in the recordings.
         is_transcoded: Whether any images were transcoded.
     """
     there = root / CARD_PATH
     path = root / SECOND_CARD_PATH if has_own_card(root) else there
     path.unlink(missing_ok=True)
-    write_text(path, _marked("\n".join(_card(root, info, options, configs, meanings, is_transcoded)) + "\n"))
+    write_text(path, _marked("\n".join(_card(root, info, options, meanings, is_transcoded)) + "\n"))
 
 
 def has_own_card(root: Path) -> bool:
@@ -126,10 +123,10 @@ def _card(
     root: Path,
     info: DatasetInfo,
     options: ExportOptions,
-    configs: Mapping[str, Any],
     meanings: Mapping[str, str],
     is_transcoded: bool,
 ) -> Iterable[str]:
+    configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
     sensed = {name: markdown(source) for name, source in meanings.items() if source}
     meaning = {**_MEANING, **({**sensed, **_simulated_meaning(options)} if configs else {})}
     tasks = read_tasks(root)

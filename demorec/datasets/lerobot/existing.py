@@ -9,11 +9,9 @@ import os
 import shlex
 import shutil
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
-
-import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH
@@ -29,37 +27,16 @@ from demorec.datasets.lerobot.layout import (
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.datasets.lerobot.stats import Statistics
+from demorec.datasets.lerobot.writer import DatasetStart
 
 
-@dataclass(frozen=True, kw_only=True)
-class Existing:
-    """A dataset to be continued.
-
-    Attributes:
-        root: Its folder.
-        info: What meta/info.json says.
-        tasks: In the order of their indices.
-        statistics: Of the camera features.
-        configs: Of the sidecar: config digest -> configuration.
-        facts: Columns of its table of episodes beyond LeRobot's own -> type.
-    """
-
-    root: Path
-    info: DatasetInfo
-    tasks: tuple[str, ...]
-    statistics: Mapping[str, Statistics]
-    configs: Mapping[str, Any]
-    facts: Mapping[str, pa.DataType]
-
-
-def open_existing(root: Path) -> Existing:
-    """Read what a writer needs to go on.
+def start_after(folder: LeRobotFolder) -> DatasetStart:
+    """Read what a writer needs to go on in a dataset.
 
     Raises:
-        ExportError: No LeRobot dataset of this format, or one that is not whole.
+        ExportError: It is not of this format, or not whole.
     """
-    folder = LeRobotFolder(root)
-    info = folder.info
+    root, info = folder.root, folder.info
     if info.is_old:
         raise ExportError(
             f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to. This writes it as "
@@ -79,7 +56,7 @@ def open_existing(root: Path) -> Existing:
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ExportError(f"The dataset cannot be read ({describe_error(error)}): {root}") from error
     info = replace(info, total_episodes=episodes, total_frames=frames)  # other writers have some as 30.0
-    return Existing(root=root, info=info, tasks=tasks, statistics=statistics, configs=configs, facts=folder.fact_types)
+    return DatasetStart(info=info, facts=folder.fact_types, tasks=tasks, statistics=statistics, configs=configs)
 
 
 def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
@@ -93,14 +70,17 @@ def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statis
     return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
 
 
-def features_to_append(existing: Existing, new: DatasetInfo) -> tuple[str, ...]:
-    """Check that the recordings, of which alone `new` would be made, can give every feature of the dataset; return
-    those that it does not have.
+def features_to_append(root: Path, info: DatasetInfo, new: DatasetInfo) -> tuple[str, ...]:
+    """Check that recordings can give every feature of a dataset; return those that it does not have.
+
+    Args:
+        root, info: The existing dataset.
+        new: A dataset of the recordings alone.
 
     Raises:
         ConfigError: All differences in one message.
     """
-    info, offered = existing.info, new.features
+    offered = new.features
     wrong = []
     if info.fps != new.fps:
         wrong.append(f"fps is {info.fps}, the recordings give {new.fps}")
@@ -117,7 +97,7 @@ def features_to_append(existing: Existing, new: DatasetInfo) -> tuple[str, ...]:
     if wrong:
         raise ConfigError(
             f"These recordings cannot be appended, since the dataset differs: {'; '.join(wrong)}. "
-            f"Export into a new folder, or with other options: {existing.root}"
+            f"Export into a new folder, or with other options: {root}"
         )
     return tuple(name for name in offered if name not in info.features)
 

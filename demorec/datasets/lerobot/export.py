@@ -18,9 +18,8 @@ from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.boxes import BoxWriter
 from demorec.datasets.lerobot.card import has_own_card, write_card
-from demorec.datasets.lerobot.existing import Existing, features_to_append, link_files, open_existing
+from demorec.datasets.lerobot.existing import features_to_append, link_files, start_after
 from demorec.datasets.lerobot.facts import STAGE_COLUMNS, fact_types, write_progress
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
@@ -29,13 +28,12 @@ from demorec.datasets.lerobot.motor_units import NO_PLACE, export_episode
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import ExportedEpisode, prepare_episode
-from demorec.datasets.lerobot.sidecar import SidecarWriter, attempt_row
+from demorec.datasets.lerobot.sidecar import attempt_row
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
-from demorec.datasets.lerobot.writer import DatasetWriter
+from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter
 from demorec.datasets.options import ExportReport, ProgressCallback
 from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
 from demorec.episode.episode import Outcome
-from demorec.episode.simulated import scene_of
 from demorec.mcap import open_recording
 
 _STATED_OPTIONS = (
@@ -64,7 +62,8 @@ def export_lerobot(
     """
     options.validate()
     found = find_recordings(sources)
-    existing = open_existing(out) if options.append and out.exists() else None
+    existing = LeRobotFolder(out) if options.append and out.exists() else None
+    export = _Export(found, options, existing)
     verifies = options.verify and lerobot_is_installed()
     kind, replace_it = (DATASET, options.overwrite) if existing is None else (GROWING_DATASET, True)
     with (
@@ -72,11 +71,10 @@ def export_lerobot(
         Verifier() if verifies else nullcontext() as verifier,
     ):
         if existing is not None:
-            link_files(existing.root, folder)
+            link_files(out, folder)
         elif options.overwrite and has_own_card(out) and (out / CARD_PATH).is_file():
             shutil.copy2(out / CARD_PATH, folder / CARD_PATH)  # a card that a user edited is kept
-        export = _Export(folder, found, options, existing)
-        report = export.run(progress)
+        report = export.run(folder, progress)
         if verifier is not None:
             report = replace(report, verified_frames=verifier.verify(folder, export.samples(), options))
     why = f"LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'."
@@ -91,22 +89,23 @@ _ENCODED = ".encoded"
 
 
 class _Export:
-    """One export into an empty folder, or one with links to the files of a dataset."""
+    """One export of recordings, into a new dataset or to the end of an existing one."""
 
-    def __init__(self, folder: Path, found: list[Path], options: ExportOptions, existing: Existing | None) -> None:
-        self._folder = folder
+    def __init__(self, found: list[Path], options: ExportOptions, existing: LeRobotFolder | None) -> None:
         self._found = found
         self._options = options
         self._existing = existing
-        self._before = episode_digests(LeRobotFolder(existing.root)) if existing is not None else []
+        self._begin = start_after(existing) if existing is not None else None
+        self._before = episode_digests(existing) if existing is not None else []
         self._left_out: tuple[str, ...] = ()
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}
         self._silent: list[str] = []
         self._intake = Intake(found, options, lambda recording: export_episode(recording, options).traits())
 
-    def run(self, progress: ProgressCallback | None) -> ExportReport:
-        aside = self._folder.with_name(_ENCODED)  # removed with everything next to the new folder
+    def run(self, folder: Path, progress: ProgressCallback | None) -> ExportReport:
+        """Write all recordings into an empty folder, or one with links to the files of the existing dataset."""
+        aside = folder.with_name(_ENCODED)  # removed with everything next to the new folder
         aside.mkdir(exist_ok=True)
         found = self._noted(_read_recordings(self._found, self._options, progress, folder=aside))
         begun: list[ReadRecording] = []  # up to the first episode, which decides what features there are
@@ -116,34 +115,20 @@ class _Export:
                 raise self._intake.nothing_to_export()
             begun.append(recording)
             first = recording.episode
-        start = self._start(first)
-        with (
-            DatasetWriter(self._folder, start.info, start.facts, start.tasks, start.statistics) as writer,
-            SidecarWriter(self._folder, start.info, start.configs) as sidecar,
-            BoxWriter(self._folder, fps=start.info.fps) as boxes,
-        ):
+        with DatasetWriter(folder, self._start(first)) as writer:
             for recording in chain(begun, found):
-                self._add(writer, sidecar, boxes, recording)
+                self._add(writer, recording)
             self._refuse_duplicates()
             self._refuse_silence()
-            finished = writer.finish()
-            boxes.finish()
-            configs = sidecar.finish(self._about_this_export())
+            finished = writer.finish(self._about_this_export())
         if self._options.progress:
-            write_progress(self._folder)
-        write_card(
-            self._folder,
-            finished,
-            self._options,
-            configs,
-            meanings=first.meanings,
-            is_transcoded=bool(self._transcoded),
-        )
+            write_progress(folder)
+        write_card(folder, finished, self._options, meanings=first.meanings, is_transcoded=bool(self._transcoded))
         return ExportReport(
-            path=self._folder,
+            path=folder,
             num_episodes=finished.total_episodes,
             num_frames=finished.total_frames,
-            new_episodes=finished.total_episodes - start.info.total_episodes,
+            new_episodes=len(self._digests),
             skipped_failures=self._intake.skipped_failures,
             skipped_unknown=self._intake.skipped_unknown,
             skipped_unwanted=self._intake.skipped_unwanted,
@@ -156,24 +141,23 @@ class _Export:
 
     def samples(self) -> list[tuple[int, Path]]:
         """Choose the new episodes to verify: all, or `MAX_EPISODES` of them, evenly spaced."""
-        first = self._existing.info.total_episodes if self._existing else 0
         paths = list(self._digests)
         chosen = np.unique(np.linspace(0, len(paths) - 1, min(len(paths), MAX_EPISODES)).round().astype(int)).tolist()
-        return [(first + index, paths[index]) for index in chosen]
+        return [(len(self._before) + index, paths[index]) for index in chosen]
 
-    def _start(self, first: ExportedEpisode) -> Existing:
-        """Describe the folder before the first new episode."""
-        if (existing := self._existing) is None:
-            facts = fact_types(first.data.facts)
-            return Existing(root=self._folder, info=first.info, tasks=(), statistics={}, configs={}, facts=facts)
-        self._left_out = features_to_append(existing, first.info)
-        has_progress = set(STAGE_COLUMNS) <= set(existing.facts)
+    def _start(self, first: ExportedEpisode) -> DatasetStart:
+        """Return the state of the folder before the first new episode."""
+        existing, start = self._existing, self._begin
+        if existing is None or start is None:
+            return DatasetStart(info=first.info, facts=fact_types(first.data.facts), configs={})
+        self._left_out = features_to_append(existing.root, start.info, first.info)
+        has_progress = set(STAGE_COLUMNS) <= set(start.facts)
         if has_progress != self._options.progress:
             raise ConfigError(
                 f"These recordings cannot be appended, since the dataset {'has' if has_progress else 'lacks'} the "
                 f"stages of --progress: export {'with' if has_progress else 'without'} it: {existing.root}"
             )
-        return existing
+        return start
 
     def _noted(self, found: Iterable[ReadRecording]) -> Iterator[ReadRecording]:
         """Count each recording, and hold it against the others, before it is written."""
@@ -184,17 +168,13 @@ class _Export:
                 self._intake.take(recording.path, recording.episode.traits)
             yield recording
 
-    def _add(self, writer: DatasetWriter, sidecar: SidecarWriter, boxes: BoxWriter, recording: ReadRecording) -> None:
+    def _add(self, writer: DatasetWriter, recording: ReadRecording) -> None:
         if (episode := recording.episode) is None:
-            sidecar.add_attempt(recording.attempt)
+            writer.add_attempt(recording.attempt)
             return
-        number = writer.num_episodes
-        digest = writer.add(episode.data)
-        sidecar.add(number, digest, episode.record, recording.attempt)
-        boxes.add(number, episode.boxes, episode.data.num_frames)
+        self._digests[recording.path] = writer.add(episode.data)
         if self._options.language is not None and not episode.data.language.persistent:
             self._silent.append(recording.path.name)
-        self._digests[recording.path] = digest
         self._transcoded.update(dict.fromkeys(episode.transcoded))
 
     def _refuse_duplicates(self) -> None:
@@ -297,8 +277,7 @@ def _read(path: Path, options: ExportOptions, folder: Path | None) -> ReadRecord
     with open_recording(path) as recording:
         if not is_wanted(recording, options):
             return None
-        scene = scene_of(recording.info) if options.motor_units is None else None
-        attempt = attempt_row(recording, scene)
+        attempt = attempt_row(recording)
         episode = prepare_episode(export_episode(recording, options)) if goes_in(recording, options) else None
         outcome = recording.outcome
     if episode is not None and folder is not None:

@@ -143,22 +143,26 @@ def episode_facts(recording: Recording) -> dict[str, Any]:
         "run_episode_index": info.episode_index,
         "attempt": info.attempt,
         "num_goals": len(simulation.scene.goals),
-        **first_goal(simulation.scene),
+        **_first_goal(simulation.scene),
     }
     facts |= {f"drawn/{name}": value for name, value in sorted(_drawn(simulation).items())}
     checks = () if outcome is None else outcome.checks
     return facts | {f"success_checks/{name}": value for name, value in _nearest_to_limit(checks).items()}
 
 
-def first_goal(scene: Scene | None) -> dict[str, Any]:
+def _first_goal(scene: Scene) -> dict[str, Any]:
     """Return the first object to be moved, its position and that of its goal at the start (m, world frame)."""
-    found: dict[str, Any] = {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
-    if scene is not None and scene.goals:
-        goal = scene.goals[0]
-        here, there = scene.body(goal.object).world_from_body.position, scene.world_from_goal(goal).position
-        found |= {"object": goal.object, "object_x": float(here[0]), "object_y": float(here[1])}
-        found |= {"goal_x": float(there[0]), "goal_y": float(there[1])}
-    return found
+    if not scene.goals:
+        return {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
+    goal = scene.goals[0]
+    here, there = scene.body(goal.object).world_from_body.position, scene.world_from_goal(goal).position
+    return {
+        "object": goal.object,
+        "object_x": float(here[0]),
+        "object_y": float(here[1]),
+        "goal_x": float(there[0]),
+        "goal_y": float(there[1]),
+    }
 
 
 def _drawn(simulation: Simulation) -> Mapping[str, float]:

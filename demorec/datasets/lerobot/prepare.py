@@ -39,9 +39,7 @@ class ExportedEpisode:
     """An episode in memory, ready to be written.
 
     Attributes:
-        data: Rows and videos.
-        record: Row of the sidecar.
-        boxes: Camera feature -> visible objects, if asked for.
+        data: Rows, videos and row of the sidecar.
         traits: Properties that all episodes of the dataset share.
         info: Description of a dataset made from this episode.
         depth_left_out: Depth cameras that were not asked for.
@@ -50,8 +48,6 @@ class ExportedEpisode:
     """
 
     data: EpisodeData
-    record: EpisodeRecord
-    boxes: Mapping[str, SeenByCamera]
     traits: Mapping[str, str]
     info: DatasetInfo
     depth_left_out: tuple[str, ...]
@@ -92,6 +88,8 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         pixels=pixels,
         language=language_of(episode),
         facts=_facts(episode),
+        record=EpisodeRecord.of(episode),
+        boxes=_episode_boxes(episode) if options.boxes else {},
     )
     info = DatasetInfo(
         fps=episode.fps,
@@ -103,8 +101,6 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
     )
     return ExportedEpisode(
         data=data,
-        record=EpisodeRecord.of(episode),
-        boxes=_episode_boxes(episode) if options.boxes else {},
         traits=episode.traits(),
         info=info,
         depth_left_out=episode.depth_left_out,

@@ -19,9 +19,8 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import read_text_limited
 from demorec.core.plain import digest, from_json, to_json
 from demorec.core.tables import ROBOTS
-from demorec.datasets.lerobot.files import MAX_JSON_BYTES
+from demorec.datasets.lerobot.files import MAX_JSON_BYTES, write_text
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.lerobot.writer import write_text
 from demorec.episode.element_names import joint_of
 from demorec.episode.features import ACTION, EE_POSE, STATE
 from demorec.episode.info import Feature

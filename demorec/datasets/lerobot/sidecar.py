@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,8 +25,7 @@ import pyarrow as pa
 from demorec.core.files import Closing
 from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
-from demorec.datasets.lerobot.facts import first_goal
-from demorec.datasets.lerobot.files import read_table
+from demorec.datasets.lerobot.files import read_table, write_text
 from demorec.datasets.lerobot.layout import (
     SIDECAR_ATTEMPTS_PATH,
     SIDECAR_CAMERAS_PATH,
@@ -35,13 +35,11 @@ from demorec.datasets.lerobot.layout import (
 from demorec.datasets.lerobot.parquet import RollingParquet, vector_array
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.robots import DatasetRobot, robot_of, write_robot
-from demorec.datasets.lerobot.writer import write_text
 from demorec.episode.episode import Outcome, consecutive_runs
 
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
     from demorec.episode.info import Camera, Simulation
-    from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
@@ -97,8 +95,6 @@ ATTEMPT_SCHEMA = pa.schema(
         "success": _FLAG,
         "failure_phase": _TEXT,
         "failure_reason": _TEXT,
-        "object": _TEXT,
-        **dict.fromkeys(("object_x", "object_y", "goal_x", "goal_y"), _NUMBER),
     }
 )
 
@@ -109,35 +105,41 @@ class EpisodeRecord:
 
     Attributes:
         row: Row of the table of episodes, without the index.
+        attempt: Row of the table of attempts, likewise.
+        failed: Rows of the failed attempts before it, of an episode that comes from another dataset.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config: Configuration of the run.
         robot: The arm; None if unknown.
     """
 
     row: Mapping[str, Any]
-    moving_cameras: Mapping[str, Array]
-    robot: DatasetRobot | None
+    attempt: Mapping[str, Any]
+    failed: Sequence[Mapping[str, Any]] = ()
+    moving_cameras: Mapping[str, Array] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
+    robot: DatasetRobot | None = None
 
     @classmethod
     def of(cls, episode: ExportEpisode[Any]) -> EpisodeRecord:
         """Describe an episode; frame numbers are those of the dataset."""
-        info, recording = episode.info, episode.recording
-        attempt, simulation = attempt_row(recording, episode.scene), info.simulation
+        info, recording, simulation = episode.info, episode.recording, episode.info.simulation
+        attempt, robot = attempt_row(recording), robot_of(episode)
         row = {
             **{name: attempt[name] for name in ("source", "run_episode_index", "attempt", "success", "failure_reason")},
             "origin": info.origin if isinstance(info.origin, str) else to_json(info.origin),
             "cameras": [_described_camera(camera) for camera in info.cameras],
+            "robot_digest": None if robot is None else robot.digest,
         }
         if simulation is None:
-            return cls(row=row, moving_cameras={}, robot=robot_of(episode))
+            return cls(row=row, attempt=attempt, robot=robot)
         poses = recording.trajectory().world_from_camera
         moving = [camera.name for camera in info.cameras if camera.mount != "world"]
         return cls(
             row=row | _simulated_row(simulation, episode),
+            attempt=attempt,
             moving_cameras={name: poses[name][episode.rows] for name in moving},
             config=simulation.config,
-            robot=robot_of(episode),
+            robot=robot,
         )
 
 
@@ -204,16 +206,16 @@ class SidecarWriter(Closing):
         for table in self._tables:
             table.abort()
 
-    def add(self, episode_index: int, digest: str, record: EpisodeRecord, attempt: Mapping[str, Any]) -> None:
-        """Add an episode of the dataset, its digest, and the attempt that it was."""
-        robot = record.robot
-        added = {"episode_index": episode_index, "content_digest": digest}
-        self._episodes.add_row({**added, **record.row, "robot_digest": None if robot is None else robot.digest})
-        if robot is not None:
-            write_robot(self._root, robot)
+    def add(self, episode_index: int, digest: str, record: EpisodeRecord) -> None:
+        """Add an episode of the dataset, its digest, and the attempts that led to it."""
+        self._episodes.add_row({**record.row, "episode_index": episode_index, "content_digest": digest})
+        if record.robot is not None:
+            write_robot(self._root, record.robot)
         if record.config:
             self._configs.setdefault(record.row["config_digest"], record.config)
-        self.add_attempt(attempt, episode_index)
+        for attempt in record.failed:
+            self.add_attempt(attempt)
+        self.add_attempt(record.attempt, episode_index)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
 
@@ -233,20 +235,16 @@ class SidecarWriter(Closing):
         self._camera_poses.make_room(frames)
         self._camera_poses.write(pa.Table.from_arrays(arrays, schema=self._camera_poses.schema))
 
-    def finish(self, export: Mapping[str, Any]) -> Mapping[str, Any]:
-        """Close the tables and write the two JSON files; return config digest -> configuration."""
+    def finish(self, export: Mapping[str, Any]) -> None:
+        """Close the tables and write the two JSON files."""
         for table in self._tables:
             table.close()
         write_text(self._root / CONFIGS_PATH, json.dumps(self._configs, indent=2, sort_keys=True) + "\n")
         write_text(self._root / EXPORT_PATH, json.dumps(dict(export), indent=2, sort_keys=True) + "\n")
-        return self._configs
 
 
-def attempt_row(recording: Recording, scene: Scene | None) -> dict[str, Any]:
-    """Return one attempt, as far as success rates need it, from the recording's metadata alone, less `episode_index`.
-
-    Positions are in the world frame, metres, at the start; `success` is None where it is unknown.
-    """
+def attempt_row(recording: Recording) -> dict[str, Any]:
+    """Return one attempt, less `episode_index`, from the recording's metadata; `success` is None if unknown."""
     info, outcome = recording.info, recording.outcome
     return {
         "source": recording.path.name,
@@ -255,55 +253,41 @@ def attempt_row(recording: Recording, scene: Scene | None) -> dict[str, Any]:
         "success": recording.success,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
-        **first_goal(scene),
     }
 
 
 class Attempts:
-    """The attempts of a sidecar, by the episode to which each belongs.
+    """The rows of a sidecar's table of attempts, by the episode to which each belongs.
 
     Args:
         paths: Tables of the sidecar.
+
+    Attributes:
+        own: Episode -> the attempt that became it.
+        failed: Episode -> failed attempts before it.
+        homeless: Failed attempts at episodes that the dataset does not have.
+        failures: All failed attempts, in order.
 
     Raises:
         ExportError: A table cannot be read.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:
-        tables = [read_table(path, ATTEMPT_SCHEMA.names, schema=ATTEMPT_SCHEMA) for path in paths]
-        self._table = pa.concat_tables(tables or [ATTEMPT_SCHEMA.empty_table()]).combine_chunks()
-        self._own: dict[int, int] = {}
-        self._failed: dict[int, list[int]] = {}
-        self._homeless: list[int] = []
-        run_indices = self._table.column("run_episode_index").to_pylist()
-        waiting: list[int] = []
-        for number, episode in enumerate(self._table.column("episode_index").to_pylist()):
+        self.own: dict[int, dict[str, Any]] = {}
+        self.failed: dict[int, list[dict[str, Any]]] = {}
+        self.homeless: list[dict[str, Any]] = []
+        self.failures: list[dict[str, Any]] = []
+        waiting: list[dict[str, Any]] = []
+        for row in chain.from_iterable(
+            read_table(path, ATTEMPT_SCHEMA.names, schema=ATTEMPT_SCHEMA).to_pylist() for path in paths
+        ):
+            episode, run_episode = row["episode_index"], row["run_episode_index"]
             if episode is None:
-                waiting.append(number)
+                waiting.append(row)
+                self.failures.append(row)
                 continue
-            self._own[episode] = number
-            self._failed[episode] = [n for n in waiting if run_indices[n] == run_indices[number]]
-            self._homeless += [n for n in waiting if run_indices[n] != run_indices[number]]
+            self.own[episode] = row
+            self.failed[episode] = [attempt for attempt in waiting if attempt["run_episode_index"] == run_episode]
+            self.homeless += [attempt for attempt in waiting if attempt["run_episode_index"] != run_episode]
             waiting = []
-        self._homeless += waiting
-
-    def _rows(self, numbers: Sequence[int]) -> list[dict[str, Any]]:
-        return [row for number in numbers for row in self._table.slice(number, 1).to_pylist()]
-
-    def of(self, episode_index: int) -> dict[str, Any] | None:
-        """Return the attempt that became an episode of the dataset."""
-        number = self._own.get(episode_index)
-        return None if number is None else self._rows([number])[0]
-
-    def failed(self, episode_index: int) -> list[dict[str, Any]]:
-        """Return the failed attempts before an episode."""
-        return self._rows(self._failed.get(episode_index, []))
-
-    def failures(self) -> list[dict[str, Any]]:
-        """Return all attempts that are not in the dataset."""
-        episodes = self._table.column("episode_index").to_pylist()
-        return self._rows([number for number, episode in enumerate(episodes) if episode is None])
-
-    def homeless(self) -> list[dict[str, Any]]:
-        """Return the failed attempts at episodes that the dataset does not have."""
-        return self._rows(self._homeless)
+        self.homeless += waiting

@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,8 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing, sync_path
-from demorec.datasets.lerobot.files import tables_in
+from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
+from demorec.datasets.lerobot.files import tables_in, write_text
 from demorec.datasets.lerobot.language import (
     REPEATING,
     EpisodeLanguage,
@@ -46,6 +46,7 @@ from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.datasets.lerobot.parquet import RollingParquet, next_position, vector_array
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.rows import column_values
+from demorec.datasets.lerobot.sidecar import EpisodeRecord, SidecarWriter
 from demorec.datasets.lerobot.stats import (
     NAMES,
     PixelHistogram,
@@ -77,6 +78,8 @@ class EpisodeData:
         facts: Column of the table of episodes -> value; written where the dataset has the column.
         row_tasks: Instruction of each row, where there is more than one; `task` is the first.
         timestamps: (T,) float32 or float64 seconds; None for multiples of 1/fps.
+        record: What the sidecar has about it; None in a dataset without one.
+        boxes: Camera feature -> visible objects, where they are known.
     """
 
     task: str
@@ -88,6 +91,8 @@ class EpisodeData:
     facts: Mapping[str, Any] = field(default_factory=dict)
     row_tasks: Sequence[str] = ()
     timestamps: NDArray[Any] | None = None
+    record: EpisodeRecord | None = None
+    boxes: Mapping[str, SeenByCamera] = field(default_factory=dict)
 
     @property
     def num_frames(self) -> int:
@@ -95,35 +100,44 @@ class EpisodeData:
         return len(next(iter(self.columns.values())))
 
 
+@dataclass(frozen=True, kw_only=True, eq=False)
+class DatasetStart:
+    """A dataset before the first new episode.
+
+    Attributes:
+        info: Features, limits, and the numbers of existing episodes and frames.
+        facts: Columns of the episodes' facts in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
+        tasks: Existing instructions in the order of their indices.
+        statistics: Statistics of the camera features over the existing episodes.
+        configs: Config digest -> configuration, of the existing episodes; None for a dataset without a sidecar.
+    """
+
+    info: DatasetInfo
+    facts: Mapping[str, pa.DataType]
+    tasks: Sequence[str] = ()
+    statistics: Mapping[str, Statistics] = field(default_factory=dict)
+    configs: Mapping[str, Any] | None = None
+
+
 class DatasetWriter(Closing):
     """Context manager; `finish` completes the metadata.
 
     Args:
-        root: Folder of the dataset; for an appending writer it holds the old files already.
-        info: Features, limits, and how many episodes and frames are there.
-        facts: Columns of the episodes' facts in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
-        tasks: That are there, in the order of their indices.
-        statistics: Of the camera features over what is there.
+        root: Folder of the dataset; it holds the existing files already.
+        start: What it begins with.
     """
 
-    def __init__(
-        self,
-        root: Path,
-        info: DatasetInfo,
-        facts: Mapping[str, pa.DataType],
-        tasks: Sequence[str] = (),
-        statistics: Mapping[str, Statistics] = MappingProxyType({}),
-    ) -> None:
+    def __init__(self, root: Path, start: DatasetStart) -> None:
         self._root = root
-        self._info = info
-        self._facts = dict(facts)
-        self._old_statistics = statistics
+        self._info = info = start.info
+        self._facts = dict(start.facts)
+        self._old_statistics = start.statistics
         self._schema = data_schema(info.features)
         self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
         arrays = [name for name in self._numeric if len(info.features[name].shape) > 1]
         self._arrays = {name: info.features[name].shape[-1] for name in arrays}
         self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
-        self._tasks = {task: index for index, task in enumerate(tasks)}
+        self._tasks = {task: index for index, task in enumerate(start.tasks)}
         self.num_episodes = info.total_episodes
         self.num_frames = info.total_frames
         strings = [name for name in self._schema.names if info.features[name].dtype == "string"]
@@ -141,9 +155,14 @@ class DatasetWriter(Closing):
         self._video_info = {key: info.features[key].info for key in info.video_keys}
         self._pixels: dict[str, PixelHistogram] = {}
         self._unseen: dict[str, list[Statistics]] = {}
+        self._sidecar = None if start.configs is None else SidecarWriter(root, info, start.configs)
+        self._boxes = BoxWriter(root, fps=info.fps)
 
     def close(self) -> None:
         """Let go of the files; those that are not finished are dropped, or left as they are."""
+        self._boxes.close()
+        if self._sidecar is not None:
+            self._sidecar.close()
         for video in self._videos.values():
             video.abort()
         self._data.abort()
@@ -200,12 +219,21 @@ class DatasetWriter(Closing):
         statistics |= {key: self._count(key, episode.pixels[key]) for key in self._cameras}
         row |= {f"stats/{key}/{name}": found.nested(name) for key, found in statistics.items() for name in NAMES}
         self._episodes.add_row(row)
-        self.num_frames += frames
-        self.num_episodes += 1
         if spoken:
             values.update(language_digests(episode.language, frames))
         has_digest = len(digests) == len(self._cameras) and all(digests.values())
-        return episode_digest(episode.task, values, digests) if has_digest else ""
+        digest = episode_digest(episode.task, values, digests) if has_digest else ""
+        if self._sidecar is not None and episode.record is not None:
+            self._sidecar.add(self.num_episodes, digest, episode.record)
+        self._boxes.add(self.num_episodes, episode.boxes, frames)
+        self.num_frames += frames
+        self.num_episodes += 1
+        return digest
+
+    def add_attempt(self, attempt: Mapping[str, Any]) -> None:
+        """Add an attempt that is not in the dataset to the sidecar."""
+        if self._sidecar is not None:
+            self._sidecar.add_attempt(attempt)
 
     def _write_rows(self, columns: Mapping[str, NDArray[Any] | pa.Array]) -> None:
         arrays = []
@@ -257,8 +285,12 @@ class DatasetWriter(Closing):
             f"videos/{key}/to_timestamp": (start + frames) / fps,
         }
 
-    def finish(self) -> DatasetInfo:
-        """Close all files and write tasks, statistics and info.json; return what it says."""
+    def finish(self, export: Mapping[str, Any]) -> DatasetInfo:
+        """Close all files, write tasks, statistics and info.json; return the content of the last.
+
+        Args:
+            export: How the dataset was made, for the sidecar.
+        """
         for video in self._videos.values():
             video.close()
         self._data.close()
@@ -281,6 +313,9 @@ class DatasetWriter(Closing):
             total_tasks=len(self._tasks),
         )
         write_text(self._root / INFO_PATH, info.to_json())
+        self._boxes.finish()
+        if self._sidecar is not None:
+            self._sidecar.finish(export)
         return info
 
     def _episode_schema(self) -> pa.Schema:
@@ -325,11 +360,4 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(description)}), path)
-    sync_path(path)
-
-
-def write_text(path: Path, text: str) -> None:
-    """A durable text file."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(text)
     sync_path(path)
