@@ -1,8 +1,7 @@
 """Mp4 files written from encoded images as they are: no image is decoded or encoded anew.
 
-A file has one video track at a constant rate, the index (`moov`) in front so that it can be read over a network
-(ISO/IEC 14496-12). LeRobot's own writer copies the whole file for every episode; here the images of an episode are
-appended, images that lie in other files are copied once, and the index is written once, at the end.
+A file has one video track at a constant rate, and its index in front so that it can be read over a network. LeRobot's
+own writer copies the whole file for every episode; here images are appended, and the index is written once, at the end.
 """
 
 from __future__ import annotations
@@ -13,20 +12,19 @@ import io
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from itertools import groupby, pairwise
-from operator import itemgetter
+from itertools import pairwise
 from pathlib import Path
-from typing import IO
 
 import av
 import numpy as np
+from av.container import OutputContainer
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
 from demorec.core.files import sync_path
-from demorec.datasets.lerobot.mp4_index import mp4_head
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
@@ -46,9 +44,12 @@ class Stored:
     is_own: bool = False
 
     def read(self) -> bytes:
-        """All of them; OSError where the file cannot be read."""
+        """Read all of them. Raises OSError if the file cannot be read, or ends before."""
         with self.path.open("rb", buffering=0) as file:
-            return b"".join(os.pread(file.fileno(), count, begin) for begin, count in self.spans)
+            data = b"".join(os.pread(file.fileno(), count, begin) for begin, count in self.spans)
+        if len(data) != sum(count for _, count in self.spans):
+            raise OSError(errno.EIO, "the file ends before it should", str(self.path))
+        return data
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -86,13 +87,13 @@ class EncodedVideo:
         cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64], lead: int = 0
     ) -> EncodedVideo:
         """From images back to back, as they were encoded, and the length of each; ExportError if that is none."""
-        from demorec.mcap.video import is_keyframe  # loads all that reads recordings
-
         ends = np.cumsum(np.asarray(lengths, dtype=np.int64)).tolist()
         units = [data[begin:end] for begin, end in pairwise([0, *ends])]
-        samples = [b"".join(stored for _, stored in _units(codec, unit)) for unit in units]
+        parts = [list(_units(codec, unit)) for unit in units]
+        samples = [b"".join(stored for _, stored in part) for part in parts]
         if not all(samples):
             raise ExportError(f"A packet of the {codec} video holds no image.")
+        keyframes = [any(kind in _KEYFRAMES[codec] for kind, _ in part) for part in parts]
         video = cls(
             codec=codec,
             width=width,
@@ -100,7 +101,7 @@ class EncodedVideo:
             first=units[0] if units else b"",
             samples=b"".join(samples),
             sizes=np.array([len(sample) for sample in samples], dtype=np.int64),
-            is_keyframe=np.array([is_keyframe(codec, unit) for unit in units], dtype=np.bool_),
+            is_keyframe=np.array(keyframes, dtype=np.bool_),
             lead=lead,
         )
         return video.with_digest()
@@ -153,9 +154,8 @@ class EncodedVideo:
 class Mp4Writer:
     """One mp4 file; episodes are appended, `close` puts the index in front and makes the file durable.
 
-    Images that lie in files are copied from there by `close`, others wait in a file beside. Until then the file has
-    another name, so that an unfinished one is never taken for a finished one. All methods raise OSError when the file
-    cannot be written, and ExportError for images that libav does not understand.
+    Until then the file has another name, so that an unfinished one is never taken for a finished one. All methods raise
+    OSError if the file cannot be written, and ExportError for images that libav does not understand.
     """
 
     def __init__(self, path: Path, first: EncodedVideo, *, fps: int) -> None:
@@ -163,58 +163,56 @@ class Mp4Writer:
         self.delay = first.delay
         self.num_images = 0
         self.num_bytes = 0
-        self._path = path
-        try:
-            self._template = _first_image_file(first, fps)
-        except av.FFmpegError as error:
-            raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {path}") from error
-        self._videos: list[EncodedVideo] = []
-        self._spans: list[tuple[Path, int, int]] = []
-        self._waiting, self._unfinished = path.with_suffix(".waiting"), path.with_suffix(".unfinished")
+        self._path, self._unfinished = path, path.with_suffix(".unfinished")
+        template = _first_image_file(first, path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._own: IO[bytes] | None = self._waiting.open("wb", buffering=0)
+        # The bit rate would be that of the first image, and without `bitexact` the file would name libav's version.
+        options = {"movflags": "faststart", "write_btrt": "0", "fflags": "bitexact"}
+        self._file: OutputContainer | None = av.open(
+            str(self._unfinished), "w", format="mp4", container_options=options
+        )
+        with av.open(template, format="mp4") as image:
+            self._stream = self._file.add_stream_from_template(image.streams.video[0], opaque=True)
+        self._stream.codec_context.thread_count = 1  # nothing is decoded: no threads for it
+        self._stream.time_base = Fraction(1, fps)
+        self._file.start_encoding()
+        self._ticks = int(1 / (fps * self._stream.time_base))  # a frame, in the unit that libav has chosen now
 
     def add(self, video: EncodedVideo) -> None:
         """Append the images of an episode; if they are in a file of their own, it is deleted."""
-        assert self._own is not None
-        samples = video.samples
-        if isinstance(samples, Stored) and not samples.is_own:
-            self._spans += [(samples.path, *span) for span in samples.spans]
-        else:
-            self._spans.append((self._waiting, self._own.tell(), video.num_bytes))
-            self._own.write(video.read())
-            if isinstance(samples, Stored):
-                samples.path.unlink()
-        self._videos.append(replace(video, first=b"", samples=b""))
-        self.num_images += len(video.sizes)
+        assert self._file is not None
+        data, begin = video.read(), 0
+        sizes, are_keyframes = video.sizes.tolist(), video.is_keyframe.tolist()
+        shifts = [0] * len(sizes) if video.shifts is None else video.shifts.tolist()
+        for size, is_keyframe, shift in zip(sizes, are_keyframes, shifts, strict=True):
+            packet = av.Packet(data[begin : begin + size])
+            packet.stream = self._stream
+            packet.dts = (self.num_images - self.delay) * self._ticks
+            packet.pts = (self.num_images + shift) * self._ticks
+            packet.duration = self._ticks
+            packet.is_keyframe = is_keyframe
+            self._file.mux_one(packet)
+            begin += size
+            self.num_images += 1
         self.num_bytes += video.num_bytes
+        if isinstance(video.samples, Stored) and video.samples.is_own:
+            video.samples.path.unlink()
 
     def close(self) -> None:
-        """Write the file and give it its name; harmless when called twice."""
-        if self._own is None:
-            return
-        self._own.close()
-        sizes = np.concatenate([video.sizes for video in self._videos])
-        keys = np.concatenate([video.is_keyframe for video in self._videos])
-        shifts = [np.zeros(len(v.sizes), np.int64) if v.shifts is None else v.shifts for v in self._videos]
-        with self._unfinished.open("wb", buffering=0) as file:
-            file.write(mp4_head(self._template, sizes, keys, np.concatenate(shifts) + self.delay))
-            for path, spans in groupby(self._spans, key=itemgetter(0)):
-                with path.open("rb", buffering=0) as source:
-                    for _, begin, count in spans:
-                        _copy_bytes(source, begin, count, file)
-        sync_path(self._unfinished)
-        self._unfinished.rename(self._path)
-        self._waiting.unlink()
-        self._own = None
+        """Write the index and give the file its name; harmless when called twice."""
+        if self._file is not None:
+            self._file.close()
+            sync_path(self._unfinished)
+            self._unfinished.rename(self._path)
+            self._file = None
 
     def abort(self) -> None:
-        """Drop what was gathered; nothing after `close`."""
-        if self._own is not None:
-            self._own.close()
-            self._own = None
+        """Drop what was written; nothing after `close`."""
+        if self._file is not None:
+            with suppress(OSError):  # which libav may raise again
+                self._file.close()
+            self._file = None
             self._unfinished.unlink(missing_ok=True)
-            self._waiting.unlink(missing_ok=True)
 
 
 def one_image_file(image: bytes, stream: av.VideoStream) -> bytes:
@@ -229,33 +227,21 @@ def one_image_file(image: bytes, stream: av.VideoStream) -> bytes:
     return described.getvalue()
 
 
-def _first_image_file(video: EncodedVideo, fps: int) -> bytes:
-    """Write a file of the first image alone, as libav does, with the time base of the whole video."""
-    buffer = io.BytesIO()
-    described = io.BytesIO(video.first)
-    if video.codec in _DEMUXERS:
-        with av.open(described, format=_DEMUXERS[video.codec]) as source:
-            described = io.BytesIO(one_image_file(video.first, source.streams.video[0]))
-    # The bit rate would be that of the first image, and without `bitexact` the file would name the version of libav.
-    options = {"write_btrt": "0", "fflags": "bitexact"}
-    with (
-        av.open(described, "r", format="mp4") as image,
-        av.open(buffer, "w", format="mp4", container_options=options) as target,
-    ):
-        stream = target.add_stream_from_template(image.streams.video[0], opaque=True)
-        stream.codec_context.thread_count = 1  # nothing is decoded: no threads for it
-        stream.time_base = Fraction(1, fps)
-        target.start_encoding()
-        ticks = int(1 / (fps * stream.time_base))  # a frame, in the unit that libav has chosen now
-        packet = next(image.demux())
-        packet.stream, packet.time_base = stream, stream.time_base
-        packet.pts, packet.dts, packet.duration = 0, -video.delay * ticks, ticks
-        target.mux_one(packet)
-    return buffer.getvalue()
+def _first_image_file(video: EncodedVideo, path: Path) -> io.BytesIO:
+    """Return an mp4 file of the first image alone, which describes the encoding, for the file at `path`."""
+    if video.codec not in _DEMUXERS:
+        return io.BytesIO(video.first)
+    try:
+        with av.open(io.BytesIO(video.first), format=_DEMUXERS[video.codec]) as source:
+            return io.BytesIO(one_image_file(video.first, source.streams.video[0]))
+    except av.FFmpegError as error:
+        raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {path}") from error
 
 
 _TEMPORAL_DELIMITER = 2
 """Kind of a unit of AV1 that mp4 files leave out."""
+_KEYFRAMES = {"h264": (5,), "hevc": range(16, 22), "av1": (1,)}
+"""Kinds of the units that only images have that are decoded without others: slices of IDR and IRAP, AV1's headers."""
 _PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34), "av1": (1,)}
 """Kinds of the units of which one mp4 file holds one set: a decoder must know them before the first image."""
 
@@ -298,23 +284,3 @@ def _open_bitstream_units(access_unit: bytes) -> list[tuple[int, int, int]]:
         units.append(((header >> 3) & 15, start, end))
         start = end
     return units
-
-
-_COPIED_BYTES = 1 << 16
-"""Copied at a time: pages of the file cache are taken faster one by one than a quarter of a megabyte together."""
-
-
-def _copy_bytes(source: IO[bytes], begin: int, count: int, target: IO[bytes]) -> None:
-    """Append a part of a file to another, both without a buffer.
-
-    Raises:
-        OSError: The part is not there, or cannot be written.
-    """
-    place = target.tell()
-    while count:
-        # In whole pages of the target: of parts that lie at any byte the kernel's own copying takes half as much again.
-        data = os.pread(source.fileno(), min(count, _COPIED_BYTES - place % _COPIED_BYTES), begin)
-        if not data:
-            raise OSError(errno.EIO, "the file ends before it should", source.name)
-        done = target.write(data)
-        begin, count, place = begin + done, count - done, place + done

@@ -1,11 +1,10 @@
-"""The index of an mp4 file, read and written: the tables in its `moov` box (ISO/IEC 14496-12)."""
+"""The index of an mp4 file: the tables in its `moov` box (ISO/IEC 14496-12)."""
 
 from __future__ import annotations
 
-import io
 import os
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,10 +15,6 @@ from numpy.typing import NDArray
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 
-_MAX_INDEX_BYTES = 256 << 20
-"""Room for the index in a file whose places still fit 32 bits."""
-_CHUNK = 1 << 20
-"""Bytes, below which images that follow each other are listed as one chunk, as libav does."""
 _PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
 
 
@@ -169,98 +164,3 @@ def _offsets(track: Mapping[bytes, bytes], sizes: NDArray[np.int64]) -> NDArray[
     before = np.concatenate([[0], np.cumsum(sizes)[:-1]])
     firsts = np.concatenate([[0], np.cumsum(per_chunk)[:-1]])
     return np.asarray(before + np.repeat(chunks - before[np.minimum(firsts, len(sizes) - 1)], per_chunk))
-
-
-def mp4_head(
-    template: bytes, sizes: NDArray[np.int64], is_keyframe: NDArray[np.bool_], delays: NDArray[np.int64]
-) -> bytes:
-    """What stands in front of the images in a file: its index, and the beginning of the box that holds them.
-
-    To the byte what libav writes with `faststart`, which would copy the whole file once more to make room for it.
-
-    Args:
-        template: A file by libav with the first image alone.
-        sizes: (N,) bytes of each image.
-        is_keyframe: (N,) which ones can be decoded by themselves.
-        delays: (N,) by how many frames each is shown later than it is decoded.
-    """
-    file = io.BytesIO(template)
-    found = {kind: (begin, end) for kind, begin, end in _boxes(file, 0, len(template))}
-    track = _flat(file, *found[b"moov"])
-    step = int(_repeated(track[b"stts"], 1)[0])
-    timescale, movie_scale = (struct.unpack_from(">I", box, 12)[0] for box in (track[b"mdhd"], track[b"mvhd"]))
-    duration, total = len(sizes) * step, int(sizes.sum())
-    in_movie = -(-duration * movie_scale // timescale)
-    durations = {b"mvhd": (16, in_movie), b"tkhd": (20, in_movie), b"elst": (8, in_movie), b"mdhd": (16, duration)}
-    begins, counts = _chunks(sizes)
-    is_even, is_long = bool((sizes == sizes[0]).all()), total + _MAX_INDEX_BYTES >= 1 << 32
-    in_chunks = _runs(counts)
-    firsts = 1 + np.cumsum(in_chunks[:, 0]) - in_chunks[:, 0]
-    tables = {
-        b"stts": _table([[len(sizes), step]]),
-        **({} if is_keyframe.all() else {b"stss": _table(np.flatnonzero(is_keyframe) + 1)}),
-        **({b"ctts": _table(_runs(delays * step))} if delays.any() else {}),
-        b"stsc": _table([[first, count, 1] for first, count in zip(firsts, in_chunks[:, 1], strict=True)]),
-        b"stsz": struct.pack(">III", 0, int(sizes[0]) if is_even else 0, len(sizes))
-        + (b"" if is_even else sizes.astype(">u4").tobytes()),
-    }
-
-    def index(begin: int) -> bytes:
-        offsets = {b"co64": _table(begins + begin, ">u8")} if is_long else {b"stco": _table(begins + begin)}
-        return _box(b"moov", _with_tables(file, found[b"moov"], {**tables, **offsets}, durations))
-
-    start = _box(b"ftyp", template[slice(*found[b"ftyp"])])
-    head = start + index(len(start) + len(index(0)) + 16)
-    if is_long:
-        return head + struct.pack(">I4sQ", 1, b"mdat", total + 16)
-    return head + _box(b"free", b"") + struct.pack(">I4s", total + 8, b"mdat")
-
-
-def _chunks(sizes: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Where each chunk begins behind the first one, bytes, and how many images it has."""
-    ends = np.cumsum(sizes)
-    firsts = [0]
-    while True:
-        first = firsts[-1]
-        room = ends[first] - sizes[first] + _CHUNK
-        first = max(first + 1, int(np.searchsorted(ends, room)))
-        if first >= len(sizes):
-            return (ends - sizes)[firsts], np.diff([*firsts, len(sizes)])
-        firsts.append(first)
-
-
-def _runs(values: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(R, 2) how often, value: equal values that follow each other."""
-    begins = np.flatnonzero(np.diff(values, prepend=values[0] - 1))
-    return np.stack([np.diff([*begins, len(values)]), values[begins]], axis=1)
-
-
-def _table(rows: Sequence[Sequence[int]] | NDArray[np.int64], kind: str = ">u4") -> bytes:
-    """The content of a box that holds a table of numbers."""
-    return struct.pack(">II", 0, len(rows)) + np.asarray(rows).astype(kind).tobytes()
-
-
-def _box(kind: bytes, content: bytes) -> bytes:
-    return struct.pack(">I4s", 8 + len(content), kind) + content
-
-
-def _with_tables(
-    file: io.BytesIO,
-    part: tuple[int, int],
-    tables: Mapping[bytes, bytes],
-    durations: Mapping[bytes, tuple[int, int]],
-) -> bytes:
-    """Boxes with other tables of images, and numbers of four bytes at some places."""
-    parts = []
-    for kind, begin, end in _boxes(file, *part):
-        content = file.getvalue()[begin:end]
-        if kind == b"stbl":
-            of_images = (_box(name, table) for name, table in tables.items())
-            parts.append(_box(kind, _box(b"stsd", _flat(file, begin, end)[b"stsd"]) + b"".join(of_images)))
-        elif kind in _PARENTS:
-            parts.append(_box(kind, _with_tables(file, (begin, end), tables, durations)))
-        else:
-            place, number = durations.get(kind, (len(content), None))
-            new = b"" if number is None else struct.pack(">I", number)
-            parts.append(_box(kind, content[:place] + new + content[place + len(new) :]))
-    return b"".join(parts)
