@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Level, Result
+from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome
+from demorec.episode.roles import Roles
 from demorec.learn.evaluate.statistics import Rate
 from demorec.report.filmstrip import Filmstrip
 
@@ -77,6 +79,8 @@ class ReportedEpisode:
         return f"{reason} in phase {phase}" if phase else reason
 
 
+MAX_COMPONENTS = 64
+"""Components of the state or of the action that are drawn."""
 MAX_SAMPLES = 200
 """Frames of each episode that a distribution is drawn from, beside its extremes."""
 
@@ -84,14 +88,32 @@ Components = dict[tuple[Literal["state", "action"], str], list[NDArray[np.float3
 """(role, name of the component) -> its sampled values, episode by episode."""
 
 
-def add_values(into: Components, role: Literal["state", "action"], names: Iterable[str], values: NDArray[Any]) -> None:
-    """Add the values of state or action (T, D) in one episode: finite ones, evenly spaced, and the extremes."""
-    for name, column in zip(names, values.T, strict=False):
-        finite = column[np.isfinite(column)]
-        if len(finite):
-            sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
-            parts = into.setdefault((role, name), [])
-            parts.append(np.array([*sampled, finite.min(), finite.max()], dtype=np.float32))
+def motion_components(roles: Roles, columns: Mapping[str, NDArray[Any]]) -> Components:
+    """Sample the state and the action of one episode: finite values, evenly spaced, and the extremes.
+
+    Args:
+        roles: Roles of its features.
+        columns: Feature -> (T, D).
+    """
+    found: Components = {}
+    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
+    for role, parts in drawn.items():
+        names = roles.elements(parts)[:MAX_COMPONENTS]
+        if is_numbered(names):
+            names = tuple(f"component {name}" for name in names)
+        values = np.hstack([columns[part] for part in parts]) if parts else np.zeros((0, 0))
+        for name, column in zip(names, values.T, strict=False):
+            finite = column[np.isfinite(column)]
+            if len(finite):
+                sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
+                found[role, name] = [np.array([*sampled, finite.min(), finite.max()], dtype=np.float32)]
+    return found
+
+
+def add_components(into: Components, found: Components) -> None:
+    """Add the components of one more episode."""
+    for key, parts in found.items():
+        into.setdefault(key, []).extend(parts)
 
 
 class CheckSummaries:

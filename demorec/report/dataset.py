@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
-import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Result
@@ -20,16 +19,22 @@ from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.scoring import MIN_EPISODES, MIN_SOUND, score_dataset
-from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.roles import NamedRoles, Roles
-from demorec.report.content import CheckSummaries, Components, Report, ReportedEpisode, add_values, common_facts
+from demorec.report.content import (
+    MAX_COMPONENTS,
+    CheckSummaries,
+    Components,
+    Report,
+    ReportedEpisode,
+    add_components,
+    common_facts,
+    motion_components,
+)
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 
 _SUCCESS = "next.success"
-_MAX_COMPONENTS = 64
-"""Of one feature that are drawn."""
 _EPISODE_COLUMNS = (
     "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
     "failure_reason", "num_retries", "checks", "phases", "episode_info",
@@ -63,7 +68,7 @@ def dataset_report(
         odd = flags.get(place.episode_index, ())
         with noted(problems, root):
             columns = {} if reader is None else reader.numbers(place)
-            _count_components(components, roles, columns)
+            add_components(components, motion_components(roles, columns))
             if key is not None and (odd or number % stride == 0):
                 strip = _strip(folder, key, place)
         episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
@@ -185,17 +190,6 @@ def _left_out(row: _Row) -> ReportedEpisode:
     )
 
 
-def _count_components(into: Components, roles: Roles, columns: Mapping[str, NDArray[Any]]) -> None:
-    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
-    for role, parts in drawn.items():
-        if parts:
-            values = np.hstack([columns[part] for part in parts])
-            names = roles.elements(parts)
-            if is_numbered(names):
-                names = tuple(f"component {name}" for name in names)
-            add_values(into, role, names[:_MAX_COMPONENTS], values)
-
-
 def _missing(info: DatasetInfo, roles: Roles, *, has_sidecar: bool) -> Iterator[str]:
     """Sentences about what the dataset does not contain."""
     if not has_sidecar:
@@ -209,8 +203,8 @@ def _missing(info: DatasetInfo, roles: Roles, *, has_sidecar: bool) -> Iterator[
         yield "It has no color images, so there are no filmstrips."
     yield from roles.notes()
     for role, parts in (("state", roles.state), ("action", roles.action)):
-        if (count := len(roles.elements(parts))) > _MAX_COMPONENTS:
-            yield f"Of the {count} components of the {role} the first {_MAX_COMPONENTS} are drawn."
+        if (count := len(roles.elements(parts))) > MAX_COMPONENTS:
+            yield f"Of the {count} components of the {role} the first {MAX_COMPONENTS} are drawn."
 
 
 def _facts(

@@ -6,16 +6,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
-
-import numpy as np
-from numpy.typing import NDArray
 
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
-from demorec.core.errors import ConfigError, ExportError, RecordingError, without_path
+from demorec.core.errors import ConfigError, RecordingError, without_path
 from demorec.core.processes import in_turn
-from demorec.datasets.episode import ExportEpisode
-from demorec.datasets.options import CommonOptions
 from demorec.episode.episode import Outcome, consecutive_runs
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
@@ -25,9 +19,10 @@ from demorec.report.content import (
     Components,
     Report,
     ReportedEpisode,
-    add_values,
+    add_components,
     common_facts,
     few,
+    motion_components,
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
 from demorec.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
@@ -48,9 +43,7 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
-_Vectors = dict[Literal["state", "action"], tuple[Sequence[str], NDArray[Any]]]
-"""Role -> the names of its components, and its values (T, D)."""
-_Read = tuple[ReportedEpisode, _Vectors, SubjectReport | None]
+_Read = tuple[ReportedEpisode, Components, SubjectReport | None]
 _AHEAD = 2
 """Episodes that a process may have read before they are counted here."""
 
@@ -107,10 +100,9 @@ def _recordings_report(
     total = len(subjects) + len(folders)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for episode, vectors, checked in _read_all(path, camera, checks, subjects, workers, named):
+    for episode, found_in, checked in _read_all(path, camera, checks, subjects, workers, named):
         episodes.append(episode)
-        for role, (names, values) in vectors.items():
-            add_values(components, role, names, values)
+        add_components(components, found_in)
         if checked is not None:
             summaries.add(checked.results, episode.name)
             missing += [note for note in checked.notes if note not in missing]
@@ -163,16 +155,15 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, named: NamedRole
     source = path.name if path == root else path.relative_to(root).as_posix()
     try:
         with open_recording(path) as recording:
-            episode, vectors = _read_recording(recording, camera, strip_bytes, named)
+            episode = _read_recording(recording, camera, strip_bytes)
+            components = motion_components(roles_of_recording(recording.info, named), recording.table().features)
     except RecordingError as error:
-        episode, vectors = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
-    return replace(episode, source=source, flags=tuple(flags)), vectors, checked
+        episode, components = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
+    return replace(episode, source=source, flags=tuple(flags)), components, checked
 
 
-def _read_recording(
-    recording: Recording, camera: str, strip_bytes: int, named: NamedRoles
-) -> tuple[ReportedEpisode, _Vectors]:
-    info, content = recording.info, ExportEpisode(recording, CommonOptions())
+def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> ReportedEpisode:
+    info = recording.info
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
@@ -184,7 +175,7 @@ def _read_recording(
         )
     is_failed = recording.path.parent.name == FAILED
     attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
-    episode = ReportedEpisode(
+    return ReportedEpisode(
         name=f"episode {info.episode_index}{attempt}",
         problem="A crash cut the recording off; it was recovered." if recording.outcome is None else "",
         instruction=info.instruction,
@@ -196,22 +187,6 @@ def _read_recording(
         filmstrip=strip,
         facts=tuple(_facts_of(recording)),
     )
-    return episode, _vectors(content, named)
-
-
-def _vectors(content: ExportEpisode[CommonOptions], named: NamedRoles) -> _Vectors:
-    """State and action as an export has them; nothing of an episode that could not be exported."""
-    roles = roles_of_recording(content.recording.info, named)
-    try:
-        vectors = content.vectors
-    except ExportError:  # no frames, or numbers that are not finite, which the checks report
-        return {}
-    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
-    return {
-        role: (roles.elements(parts), np.hstack([vectors[part] for part in parts]))
-        for role, parts in drawn.items()
-        if parts
-    }
 
 
 def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:

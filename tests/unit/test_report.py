@@ -23,9 +23,10 @@ from support.mcap import rewritten
 from support.recording import frame_number, write_episode
 
 from demorec.check.report import CheckOptions
+from demorec.episode.roles import NO_NAMES, Column, find_roles
 from demorec.mcap import Recording
 from demorec.report.charts import distribution
-from demorec.report.content import Components, Report, add_values
+from demorec.report.content import Report, motion_components
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, strip_budget
 from demorec.report.gather import gather
 from demorec.report.page import page
@@ -252,10 +253,11 @@ def test_a_large_run_stays_small(run: Path, count: int) -> None:
 
 def test_distributions_are_drawn_from_frames_and_extremes() -> None:
     """Of 1,000 values every fifth, the extremes, and nothing that is not finite."""
-    found: Components = {}
     values = np.stack([np.arange(1000.0), np.full(1000, 7.0)], axis=1)
     values[500, 0] = np.nan
-    add_values(found, "action", ("rising", "constant"), values)
+    found = motion_components(
+        find_roles({"action": Column("float64", ("rising", "constant"))}, NO_NAMES), {"action": values}
+    )
     (rising,), (constant,) = found["action", "rising"], found["action", "constant"]
     assert (rising.min(), rising.max(), len(rising)) == (0, 999, 202)
     chart = distribution("rising", [("action", rising)])
