@@ -167,11 +167,12 @@ def _rename(old: Path, new: Path, flag: int) -> bool:
 
 
 def _sync(part: Path) -> None:
-    """Make a file, or the names in a folder, last; what writes the files of a folder does so for their content."""
+    """Make a file, or all files and names in a folder, last through a power cut."""
     if not part.is_dir():
         sync_path(part)
-    for folder, _, _ in os.walk(part, topdown=False):
-        sync_path(Path(folder))
+    for folder, _, names in os.walk(part, topdown=False):
+        for path in (*(Path(folder, name) for name in names), Path(folder)):
+            sync_path(path)
 
 
 @contextmanager

@@ -50,49 +50,44 @@ def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: py
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "message"),
+    ("arguments", "message"),
     [
-        (("--features", "observation.stat"), 2, "'observation.state'"),
-        (("--features", "observation.effor"), 2, "Did you mean 'observation.effort'?"),
-        (("--fps", "7"), 2, "does not divide"),
-        (("--episodes", "5:2"), 2, "5:2 ends before it begins"),
-        (("--repo-id", "cubes"), 2, "must be OWNER/NAME"),
-        (("--append", "--overwrite"), 2, "exclude each other"),
-        (("--episodes", "x"), 2, "0:100"),
-        (("--action", "velocity"), 2, "joint_increment"),
+        (("--features", "observation.effor"), "Did you mean 'observation.effort'?"),
+        (("--episodes", "5:2"), "5:2 ends before it begins"),
+        (("--repo-id", "cubes"), "must be OWNER/NAME"),
+        (("--append", "--overwrite"), "exclude each other"),
+        (("--action", "velocity"), "joint_increment"),
     ],
 )
 def test_a_mistake_is_told_in_one_sentence(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], code: int, message: str
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
 ) -> None:
-    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", *arguments) == code
+    assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", *arguments) == 2
     printed = capsys.readouterr()
     assert message in printed.err
     assert "Traceback" not in printed.err
     assert list(tmp_path.iterdir()) == []
 
 
-def test_uploading_without_a_token_keeps_the_dataset(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("token", "message"), [(None, "hf auth login"), ("hf_made_up", "was not uploaded to me/cubes")]
+)
+def test_a_failed_upload_keeps_the_dataset(
+    run: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    token: str | None,
+    message: str,
 ) -> None:
-    monkeypatch.setattr("huggingface_hub.get_token", lambda: None)
-    out = tmp_path / "d"
-    arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
-    assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 1
-    assert "hf auth login" in capsys.readouterr().err
-    assert len(episode_rows(out)) == 2
-
-
-def test_uploading_without_a_network_keeps_the_dataset(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("huggingface_hub.get_token", lambda: "hf_made_up")
+    """Without a token, and without a network."""
+    monkeypatch.setattr("huggingface_hub.get_token", lambda: token)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     out = tmp_path / "d"
     arguments = ("--no-verify", "--push-to-hub", "--repo-id", "me/cubes")
     assert exit_code("export", "lerobot", run, "--out", out, *arguments) == 1
     printed = capsys.readouterr().err
-    assert "was not uploaded to me/cubes" in printed
+    assert message in printed
     assert "Traceback" not in printed
     assert len(episode_rows(out)) == 2
 

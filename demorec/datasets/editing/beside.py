@@ -15,7 +15,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import sync_path
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import EpisodeSlice, Plan
@@ -88,7 +87,6 @@ def write_kept_progress(plan: Plan, folder: Path) -> None:
             tables.append(_counted(rows, cut, episode, total))
         total += cut.last - cut.first
     pq.write_table(pa.concat_tables(tables), folder / PROGRESS_PATH)
-    sync_path(folder / PROGRESS_PATH)
 
 
 def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:

@@ -12,7 +12,7 @@ from typing import IO
 
 from demorec.annotate import BoxEntry
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import Closing, open_regular, sync_path
+from demorec.core.files import Closing, open_regular
 from demorec.core.plain import parse_json
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 
@@ -119,7 +119,7 @@ class BoxWriter(Closing):
         self._num_frames += num_frames
 
     def finish(self) -> None:
-        """Complete all files, durably."""
+        """Complete all files."""
         for camera in self._cameras.values():
             camera.finish()
 
@@ -170,7 +170,6 @@ class _CameraFile:
         self._annotations.write(f'\n],\n"categories": {json.dumps(categories)}}}\n')
         self.close()
         self._path.with_suffix(".images").unlink()
-        sync_path(self._path)
 
     def close(self) -> None:
         self._annotations.close()

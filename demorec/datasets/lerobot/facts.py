@@ -27,7 +27,6 @@ import pyarrow.parquet as pq
 
 from demorec.annotate.progress import StageRun, dense_stages, progress, proportions
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 
 if TYPE_CHECKING:
@@ -70,7 +69,7 @@ def _stage_runs(row: Mapping[str, Any]) -> list[StageRun]:
 
 
 def write_progress(root: Path) -> None:
-    """Write the files of progress durably, from the stages in the dataset's table of episodes.
+    """Write the files of progress from the stages in the dataset's table of episodes.
 
     Raises:
         ExportError: The stages cannot be read.
@@ -93,9 +92,7 @@ def write_progress(root: Path) -> None:
         "progress_dense": np.concatenate(parts).astype(np.float32),
     }
     pq.write_table(pa.table(columns), root / PROGRESS_PATH, use_dictionary=["episode_index"])
-    sync_path(root / PROGRESS_PATH)
     (root / PROPORTIONS_PATH).write_text(json.dumps(shares, indent=2) + "\n")
-    sync_path(root / PROPORTIONS_PATH)
 
 
 _TYPES: dict[str, pa.DataType] = {

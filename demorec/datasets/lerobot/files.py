@@ -15,7 +15,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error, resource_error
-from demorec.core.files import open_regular, read_text_limited, sync_path
+from demorec.core.files import open_regular, read_text_limited
 from demorec.core.plain import parse_json
 
 MAX_JSON_BYTES = 32 << 20
@@ -44,10 +44,9 @@ class _NoPandas(MetaPathFinder):
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a new text file durably, and its folder."""
+    """Write a new text file, and make its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
-    sync_path(path)
 
 
 def read_json(path: Path) -> Any:

@@ -24,7 +24,6 @@ from av.container import OutputContainer
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
-from demorec.core.files import sync_path
 
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
@@ -152,7 +151,7 @@ class EncodedVideo:
 
 
 class Mp4Writer:
-    """One mp4 file; episodes are appended, `close` puts the index in front and makes the file durable.
+    """One mp4 file; episodes are appended, `close` puts the index in front.
 
     Until then the file has another name, so that an unfinished one is never taken for a finished one. All methods raise
     OSError if the file cannot be written, and ExportError for images that libav does not understand.
@@ -202,7 +201,6 @@ class Mp4Writer:
         """Write the index and give the file its name; harmless when called twice."""
         if self._file is not None:
             self._file.close()
-            sync_path(self._unfinished)
             self._unfinished.rename(self._path)
             self._file = None
 
@@ -233,9 +231,10 @@ def _first_image_file(video: EncodedVideo, path: Path) -> io.BytesIO:
         return io.BytesIO(video.first)
     try:
         with av.open(io.BytesIO(video.first), format=_DEMUXERS[video.codec]) as source:
-            return io.BytesIO(one_image_file(video.first, source.streams.video[0]))
+            described = one_image_file(video.first, source.streams.video[0])
     except av.FFmpegError as error:
         raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {path}") from error
+    return io.BytesIO(described)
 
 
 _TEMPORAL_DELIMITER = 2

@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
-from demorec.core.files import sync_path
 from demorec.datasets.lerobot.files import plain_column
 from demorec.datasets.lerobot.layout import MEBIBYTE, DatasetInfo, FilePosition
 
@@ -75,7 +74,6 @@ class RollingParquet:
         self._waiting_bytes = 0
         self._sink: Any = None
         self._writer: Any = None
-        self._path = Path()
 
     def make_room(self, rows: int) -> FilePosition:
         """Begin the next file if these rows would not fit into this one; return where they will be."""
@@ -102,9 +100,9 @@ class RollingParquet:
     def write(self, table: pa.Table) -> None:
         """Append a table."""
         if self._writer is None:
-            self._path = self._root / self.position.path(self._template)
-            self._path.parent.mkdir(parents=True, exist_ok=True)
-            self._sink = pa.OSFile(str(self._path), "wb")
+            path = self._root / self.position.path(self._template)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._sink = pa.OSFile(str(path), "wb")
             self._writer = pq.ParquetWriter(
                 self._sink, self.schema, compression=self._compression, use_dictionary=self._dictionary
             )
@@ -123,7 +121,7 @@ class RollingParquet:
             self._waiting, self._waiting_rows, self._waiting_bytes = [], 0, 0
 
     def close(self) -> None:
-        """Finish the last file and make it durable; harmless when called twice."""
+        """Finish the last file; harmless when called twice."""
         self._write_rows()
         if self._writer is not None:
             self._finish_file()
@@ -136,7 +134,6 @@ class RollingParquet:
         finally:
             self._writer = None
             self._sink.close()
-        sync_path(self._path)
 
     def abort(self) -> None:
         """Let go of the file after an error, whatever state it is in."""

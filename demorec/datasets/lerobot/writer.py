@@ -18,7 +18,7 @@ import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
-from demorec.core.files import Closing, sync_path
+from demorec.core.files import Closing
 from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
 from demorec.datasets.lerobot.files import tables_in, write_text
 from demorec.datasets.lerobot.language import (
@@ -360,4 +360,3 @@ def write_tasks(path: Path, tasks: Sequence[str]) -> None:
     table = pa.table({"task_index": pa.array(range(len(tasks)), pa.int64()), "task": pa.array(tasks, pa.string())})
     path.parent.mkdir(parents=True, exist_ok=True)
     pq.write_table(table.replace_schema_metadata({"pandas": json.dumps(description)}), path)
-    sync_path(path)
