@@ -12,7 +12,7 @@ import io
 import os
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from fractions import Fraction
 from itertools import pairwise
@@ -179,35 +179,40 @@ class Mp4Writer:
 
     def add(self, video: EncodedVideo) -> None:
         """Append the images of an episode; if they are in a file of their own, it is deleted."""
-        assert self._file is not None
+        shifts = [0] * len(video.sizes) if video.shifts is None else video.shifts.tolist()
         data, begin = video.read(), 0
-        sizes, are_keyframes = video.sizes.tolist(), video.is_keyframe.tolist()
-        shifts = [0] * len(sizes) if video.shifts is None else video.shifts.tolist()
-        for size, is_keyframe, shift in zip(sizes, are_keyframes, shifts, strict=True):
-            packet = av.Packet(data[begin : begin + size])
-            packet.stream = self._stream
-            packet.dts = (self.num_images - self.delay) * self._ticks
-            packet.pts = (self.num_images + shift) * self._ticks
-            packet.duration = self._ticks
-            packet.is_keyframe = is_keyframe
-            self._file.mux_one(packet)
-            begin += size
-            self.num_images += 1
+        with _mux_errors(self._path):
+            for size, is_key, shift in zip(video.sizes.tolist(), video.is_keyframe.tolist(), shifts, strict=True):
+                self._mux(data[begin : begin + size], is_key, shift)
+                begin += size
         self.num_bytes += video.num_bytes
         if isinstance(video.samples, Stored) and video.samples.is_own:
             video.samples.path.unlink()
 
+    def _mux(self, sample: bytes, is_keyframe: bool, shift: int) -> None:
+        """Append an image that is shown `shift` places after the place at which it is stored."""
+        assert self._file is not None
+        packet = av.Packet(sample)
+        packet.stream = self._stream
+        packet.dts = (self.num_images - self.delay) * self._ticks
+        packet.pts = (self.num_images + shift) * self._ticks
+        packet.duration = self._ticks
+        packet.is_keyframe = is_keyframe
+        self._file.mux_one(packet)
+        self.num_images += 1
+
     def close(self) -> None:
         """Write the index and give the file its name; harmless when called twice."""
         if self._file is not None:
-            self._file.close()
+            with _mux_errors(self._path):
+                self._file.close()
             self._unfinished.rename(self._path)
             self._file = None
 
     def abort(self) -> None:
         """Drop what was written; nothing after `close`."""
         if self._file is not None:
-            with suppress(OSError):  # which libav may raise again
+            with suppress(OSError, av.FFmpegError):  # which libav may raise again
                 self._file.close()
             self._file = None
             self._unfinished.unlink(missing_ok=True)
@@ -229,12 +234,23 @@ def _first_image_file(video: EncodedVideo, path: Path) -> io.BytesIO:
     """Return an mp4 file of the first image alone, which describes the encoding, for the file at `path`."""
     if video.codec not in _DEMUXERS:
         return io.BytesIO(video.first)
-    try:
-        with av.open(io.BytesIO(video.first), format=_DEMUXERS[video.codec]) as source:
-            described = one_image_file(video.first, source.streams.video[0])
-    except av.FFmpegError as error:
-        raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {path}") from error
+    with (
+        _mux_errors(path),
+        av.open(io.BytesIO(video.first), format=_DEMUXERS[video.codec]) as source,
+    ):
+        described = one_image_file(video.first, source.streams.video[0])
     return io.BytesIO(described)
+
+
+@contextmanager
+def _mux_errors(path: Path) -> Iterator[None]:
+    """Turn libav's errors into an ExportError; those of the file stay OSError."""
+    try:
+        yield
+    except av.FFmpegError as error:
+        if isinstance(error, OSError):
+            raise
+        raise ExportError(f"The video cannot be written as mp4 ({error.strerror}): {path}") from error
 
 
 _TEMPORAL_DELIMITER = 2
