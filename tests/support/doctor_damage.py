@@ -1,0 +1,308 @@
+"""Ways to spoil the rows and images of a dataset before it is written."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from support.doctor_bases import WRIST, DatasetBase, DemoDataset, DemoEpisode, Images, record
+from support.doctor_motion import Array
+
+Pixels = NDArray[np.uint8]
+RowFault = Callable[[DemoDataset, int], None]
+
+
+def copied(dataset: DemoDataset) -> DemoDataset:
+    """A dataset whose rows may be changed without changing the original's."""
+    episodes = [
+        replace(episode, columns={n: v.copy() for n, v in episode.columns.items()}, time_s=episode.time_s.copy(),
+                images=dict(episode.images))
+        for episode in dataset.episodes
+    ]  # fmt: skip
+    return replace(dataset, episodes=episodes)
+
+
+def _kept(episode: DemoEpisode, rows: NDArray[np.int64]) -> None:
+    """Keep or repeat rows of an episode, with their images and timestamps."""
+    episode.columns = {name: values[rows] for name, values in episode.columns.items()}
+    episode.time_s = episode.time_s[rows]
+    episode.images = {camera: _changed(draw, lambda shown: shown[rows]) for camera, draw in episode.images.items()}
+
+
+def _changed(draw: Images, change: Callable[[Pixels], Pixels]) -> Images:
+    return lambda: np.ascontiguousarray(change(draw()))
+
+
+def _regular(dataset: DemoDataset, episode: DemoEpisode) -> None:
+    episode.time_s = np.arange(len(episode.time_s)) / dataset.base.fps
+
+
+def on(feature: str, change: Callable[[Array, DatasetBase], Array], *, whole: bool = False) -> RowFault:
+    """Change the state, the action or another feature of one episode or of all."""
+
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        base = dataset.base
+        name = {"state": base.state, "action": base.action}.get(feature, feature)
+        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
+            before = episode.columns[name].copy()
+            episode.columns[name] = change(before.copy(), base)
+            assert not np.array_equal(before, episode.columns[name], equal_nan=True), f"{name} was not changed"
+
+    return spoil
+
+
+def both(change: Callable[[Array, DatasetBase], Array]) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        for feature in ("state", "action"):
+            on(feature, change)(dataset, number)
+
+    return spoil
+
+
+def time(change: Callable[[Array, DatasetBase], Array], *, whole: bool = False) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
+            episode.time_s = change(episode.time_s, dataset.base)
+
+    return spoil
+
+
+def put(value: float, rows: slice, element: int = 1) -> Callable[[Array, DatasetBase], Array]:
+    def change(values: Array, base: DatasetBase) -> Array:
+        values[rows, element] = value
+        return values
+
+    return change
+
+
+def _is_degrees(base: DatasetBase) -> bool:
+    return base.name in ("degrees", "openpi")
+
+
+def other_unit(values: Array, base: DatasetBase) -> Array:
+    """Degrees become radians and the other way round, -100..100 encoder ticks, metres millimetres."""
+    joints = slice(0, -1)
+    if base.is_delta:
+        values[:, :3] *= 1000
+    elif base.name == "normalised":
+        values[:, joints] = np.round(2048 + values[:, joints] * 12)
+    else:
+        values[:, joints] *= np.pi / 180 if _is_degrees(base) else 180 / np.pi
+    return values
+
+
+def _reach_of(values: Array) -> Array:
+    found: Array = np.ptp(values, axis=0)
+    return found
+
+
+def spiked(values: Array, base: DatasetBase) -> Array:
+    values[len(values) // 2, 1] += 1.5 * _reach_of(values)[1]
+    return values
+
+
+def slipped(values: Array, base: DatasetBase) -> Array:
+    values[len(values) // 2 :, 1] += 0.5 * _reach_of(values)[1]
+    return values
+
+
+def beyond(values: Array, base: DatasetBase) -> Array:
+    """Reach smoothly a value that no joint has, for half a second."""
+    peak = 5.0 if base.is_delta else 8.0 if not (_is_degrees(base) or base.name == "normalised") else 420.0
+    bump = np.exp(-0.5 * ((np.arange(len(values)) - len(values) / 2) / (0.25 * base.fps)) ** 2)
+    values[:, 1] += peak * bump
+    return values
+
+
+def shifted(seconds: float, *, frames: int = 0) -> Callable[[Array, DatasetBase], Array]:
+    """Rows later by some time and some frames; earlier if negative."""
+
+    def change(values: Array, base: DatasetBase) -> Array:
+        later = round(seconds * base.fps) + frames
+        return values[np.clip(np.arange(len(values)) - later, 0, len(values) - 1)]
+
+    return change
+
+
+def held(values: Array, base: DatasetBase) -> Array:
+    return values[np.arange(len(values)) // 4 * 4]
+
+
+def stuck(values: Array, base: DatasetBase) -> Array:
+    begin = len(values) // 3
+    values[begin : begin + round(1.5 * base.fps)] = values[begin]
+    return values
+
+
+def exchanged(values: Array, base: DatasetBase) -> Array:
+    values[:, [0, 1]] = values[:, [1, 0]]
+    return values
+
+
+def gripper(side: int, change: Callable[[Array], Array | float]) -> Callable[[Array, DatasetBase], Array]:
+    """Change the gripper of the state (0) or of the action (1)."""
+
+    def spoil(values: Array, base: DatasetBase) -> Array:
+        values[:, base.grippers[side]] = change(values[:, base.grippers[side]])
+        return values
+
+    return spoil
+
+
+def turned_round(grip: Array) -> Array:
+    found: Array = grip.max() + grip.min() - grip
+    return found
+
+
+def columns_of(values: Array, first: int, count: int, factor: float) -> Array:
+    values[:, first : first + count] *= factor
+    return values
+
+
+def quaternion_flips(values: Array, base: DatasetBase) -> Array:
+    values[len(values) // 3 : len(values) // 2, 3:7] *= -1
+    return values
+
+
+def w_first(values: Array, base: DatasetBase) -> Array:
+    values[:, 3:7] = values[:, [6, 3, 4, 5]]
+    return values
+
+
+def equal_to_state(*, whole: bool) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
+            episode.columns[dataset.base.action] = episode.columns[dataset.base.state].copy()
+
+    return spoil
+
+
+def dropped_rows(*, regular: bool) -> RowFault:
+    """Lose half a second of motion at one place, or single rows at many."""
+
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        episode = dataset.episodes[number]
+        rows = np.arange(len(episode.time_s))
+        lost = rows[len(rows) * 5 // 20 :][: round(0.6 * dataset.base.fps)] if regular else rows[10:-10:9]
+        _kept(episode, np.setdiff1d(rows, lost))
+        if regular:
+            _regular(dataset, episode)
+
+    return spoil
+
+
+def idle(place: float, seconds: float) -> RowFault:
+    """Rest at a place of the episode, 0 to 1, as an operator who does nothing; sensors keep their noise."""
+
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        episode = dataset.episodes[number]
+        rows = np.arange(len(episode.time_s))
+        at = int(place * (len(rows) - 1))
+        rest = np.full(round(seconds * dataset.base.fps), at)
+        rows = np.concatenate([rows[: at + 1], rest, rows[at + 1 :]])
+        _kept(episode, rows)
+        episode.images = {camera: _changed(draw, _noisy) for camera, draw in episode.images.items()}
+        noise = np.random.default_rng(0).normal(0, dataset.base.arms[0].noise, (len(rest), 3))
+        if not dataset.base.arms[0].tick[0]:
+            episode.columns[dataset.base.state][at + 1 : at + 1 + len(rest), :3] += noise
+        if dataset.base.is_delta:
+            episode.columns[dataset.base.action][at + 1 : at + 1 + len(rest), :-1] = 0
+        _regular(dataset, episode)
+
+    return spoil
+
+
+def _noisy(images: Pixels) -> Pixels:
+    noise = np.random.default_rng(0).integers(-2, 3, images.shape)
+    return np.clip(images + noise, 0, 255).astype(np.uint8)
+
+
+def spoilt(kind: str) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        has_cameras = bool(dataset.episodes[number].images)
+        made = record(dataset.base, dataset.seed, number + 1, spoilt={number: kind}, cameras=has_cameras)
+        dataset.episodes[number] = made.episodes[number]
+
+    return spoil
+
+
+def copies(*others: int) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        for other in (number + step for step in others):
+            dataset.episodes[other] = replace(dataset.episodes[number])
+
+    return spoil
+
+
+def shared_piece(dataset: DemoDataset, number: int) -> None:
+    part = replace(dataset.episodes[number - 1])
+    _kept(part, np.arange(len(part.time_s) * 3 // 10, len(part.time_s)))
+    _regular(dataset, part)
+    dataset.episodes[number] = part
+
+
+def two_in_one(dataset: DemoDataset, number: int) -> None:
+    first, second = dataset.episodes[number], dataset.episodes[number - 2]
+    images = {camera: (draw, second.images[camera]) for camera, draw in first.images.items()}
+    first.columns = {n: np.concatenate([v, second.columns[n]]) for n, v in first.columns.items()}
+    first.time_s = np.arange(len(first.time_s) + len(second.time_s)) / dataset.base.fps
+    first.images = {camera: _joined(*pair) for camera, pair in images.items()}
+
+
+def _joined(first: Images, second: Images) -> Images:
+    return lambda: np.concatenate([first(), second()])
+
+
+def task(text: str) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        dataset.episodes[number].task = text
+
+    return spoil
+
+
+def shown(change: Callable[[Pixels], Pixels], *, whole: bool = False) -> RowFault:
+    """Change the images of the last camera of one episode or of all."""
+
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        camera = dataset.base.cameras[-1]
+        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
+            episode.images[camera] = _changed(episode.images[camera], change)
+
+    return spoil
+
+
+def covered(images: Pixels) -> Pixels:
+    """What a hand before the lens leaves: dark, without contrast, with noise."""
+    noise = np.random.default_rng(0).normal(0, 2, images.shape)
+    return np.clip(25 + 0.02 * images + noise, 0, 255).astype(np.uint8)
+
+
+def frozen(share: float) -> Callable[[Pixels], Pixels]:
+    def change(images: Pixels) -> Pixels:
+        begin = int(0.4 * (1 - share) * len(images))
+        images[begin : begin + int(share * len(images))] = images[begin]
+        return images
+
+    return change
+
+
+def exchange_cameras(dataset: DemoDataset, number: int) -> None:
+    images = dataset.episodes[number].images
+    dataset.episodes[number].images = dict(zip(images, reversed(images.values()), strict=True))
+
+
+def double_camera(*, whole: bool) -> RowFault:
+    def spoil(dataset: DemoDataset, number: int) -> None:
+        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
+            episode.images[WRIST] = episode.images[dataset.base.cameras[0]]
+
+    return spoil
+
+
+def other_take(dataset: DemoDataset, number: int) -> None:
+    episode, other = dataset.episodes[number], dataset.episodes[number - 1]
+    rows = np.minimum(np.arange(len(episode.time_s)), len(other.time_s) - 1)
+    episode.images = {camera: _changed(draw, lambda shown: shown[rows]) for camera, draw in other.images.items()}
