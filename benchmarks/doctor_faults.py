@@ -1,13 +1,13 @@
-"""Which planted faults `demorec check` finds in datasets that demorec did not make, and what it says of sound ones.
+"""Planted faults that `demorec check` finds in third-party datasets, and its alarms on sound ones.
 
     python benchmarks/doctor_faults.py                              faults one at a time in every base
-    python benchmarks/doctor_faults.py --beside bad nan             with another bad episode, or a NaN, in the dataset
+    python benchmarks/doctor_faults.py --second bad nan             with a second bad episode, or a NaN, in the dataset
     python benchmarks/doctor_faults.py --bases delta --faults copy "stuck state"
     python benchmarks/doctor_faults.py --sound 300 --seed 5000      alarms on sound datasets of 1 to 200 episodes
     python benchmarks/doctor_faults.py --scores 3                   AUC of the episodes' scores, three datasets a format
 
-A fault is found if the verdict is not "good" and a finding whose check has one of the fault's words names an episode
-that has it, or if all have it, any. Needs tests/support; datasets are made in a temporary folder.
+A fault is found if the verdict is not "good", and a check with one of the fault's words in its name reports a faulty
+episode (any episode if all are faulty). Datasets are written to a temporary folder by tests/support.
 """
 
 from __future__ import annotations
@@ -40,13 +40,13 @@ from demorec.cli import main as demorec
 EPISODES = 8
 PLANTED = 3
 BAD, WITH_NAN = 6, 7
-"""Episodes with the fault, with another unit beside it, with a NaN beside it."""
+"""Episodes with the fault; with the second fault, another unit or a NaN."""
 SEED = 11
 MAX_EPISODES_WITH_CAMERAS = 10
 
 
 def check(*paths: Path) -> dict[str, Any]:
-    """What `demorec check --json` answers."""
+    """Run `demorec check --json` in this process."""
     printed = io.StringIO()
     with (
         contextlib.redirect_stdout(printed),
@@ -100,18 +100,18 @@ class Bench:
     sound: DemoDataset
     sound_digest: str
 
-    def plant(self, name: str, beside: str = "") -> Path:
+    def plant(self, name: str, second: str = "") -> Path:
         """Write the dataset with a fault; raises if nothing changed."""
         fault = FAULTS[name]
         dataset = copied(self.sound)
-        if beside == "bad":
+        if second == "bad":
             for feature in ("state", "action"):
                 on(feature, other_unit)(dataset, BAD)
-        if beside == "nan":
+        if second == "nan":
             on("state", put(np.nan, slice(40, 41), 2))(dataset, WITH_NAN)
         if fault.rows is not None:
             fault.rows(dataset, PLANTED)
-        root = write_dataset(dataset, self.folder / f"{name}_{beside}".replace(" ", "_"), self.store)
+        root = write_dataset(dataset, self.folder / f"{name}_{second}".replace(" ", "_"), self.store)
         if fault.files is not None:
             before = digest(root)
             fault.files(root, self.base, PLANTED)
@@ -135,19 +135,19 @@ class Planted:
 
     base: str
     fault: str
-    beside: str
+    second: str
     is_found: bool
     said: str
 
 
-def planted(bases: Sequence[str], faults: Sequence[str], beside: Sequence[str], folder: Path) -> Iterator[Planted]:
+def planted(bases: Sequence[str], faults: Sequence[str], second: Sequence[str], folder: Path) -> Iterator[Planted]:
     """Plant faults one at a time, and check."""
     for base_name in bases:
         made = bench(BASES[base_name], folder / base_name.replace(" ", "_"))
         for name in faults:
             if name != "leakage" and not applies(FAULTS[name], made.base):
                 continue
-            for other in beside:
+            for other in second:
                 if name == "leakage":
                     answer, fault, episodes = leakage(made, other), LEAKAGE, range(EPISODES)
                 else:
@@ -155,7 +155,7 @@ def planted(bases: Sequence[str], faults: Sequence[str], beside: Sequence[str], 
                     answer, fault, episodes = check(root), FAULTS[name], episodes_of(name)
                 told = Counter(f"{each['check']}/{each['episode']}" for each in findings_of(answer))
                 yield Planted(
-                    base=base_name, fault=name, beside=other, is_found=is_found(fault, answer, episodes),
+                    base=base_name, fault=name, second=other, is_found=is_found(fault, answer, episodes),
                     said=", ".join(told) or str(answer.get("verdict")),
                 )  # fmt: skip
 
@@ -163,15 +163,14 @@ def planted(bases: Sequence[str], faults: Sequence[str], beside: Sequence[str], 
 LEAKAGE = PlantedFault(family="set", words="leak cop duplic shared overlap same", is_whole=True)
 
 
-def leakage(made: Bench, beside: str) -> dict[str, Any]:
-    """Check two sets, of which the second has one episode of the first."""
+def leakage(made: Bench, second: str) -> dict[str, Any]:
+    """Check a training set and a validation set that share an episode."""
     others = record(made.base, SEED + 1, 4, cameras=bool(made.base.cameras))
     others.episodes[2] = copied(made.sound).episodes[PLANTED]
-    if beside:
-        on("state", put(np.nan, slice(40, 41), 2) if beside == "nan" else other_unit)(others, 0)
-    second = made.folder / f"validation_{beside}"
-    write_dataset(others, second, made.store)
-    return check(made.folder / "sound", second)
+    if second:
+        on("state", put(np.nan, slice(40, 41), 2) if second == "nan" else other_unit)(others, 0)
+    validation = write_dataset(others, made.folder / f"validation_{second}", made.store)
+    return check(made.folder / "sound", validation)
 
 
 def episodes_of(name: str) -> range:
@@ -181,14 +180,14 @@ def episodes_of(name: str) -> range:
 
 
 def report_faults(results: Sequence[Planted]) -> None:
-    """Print what was found by fault and base, and the rates."""
+    """Print the rates of faults found, by fault and by base."""
     for fault, rows in _by(results, "fault").items():
         missed = [
-            f"{row.base}{'+' + row.beside if row.beside else ''} ({row.said})" for row in rows if not row.is_found
+            f"{row.base}{'+' + row.second if row.second else ''} ({row.said})" for row in rows if not row.is_found
         ]
         print(f"{fault:<30}{len(rows) - len(missed)}/{len(rows)}{'  missed: ' if missed else ''}{'; '.join(missed)}")
     harmful = [row for row in results if row.fault == "leakage" or FAULTS[row.fault].is_harmful]
-    for key in ("base", "beside"):
+    for key in ("base", "second"):
         print(f"by {key}:", ", ".join(f"{name or 'alone'} {_rate(rows)}" for name, rows in _by(results, key).items()))
     print(f"all {_rate(results)} (at least 90 %), harmful {_rate(harmful)} (at least 95 %)")
 
@@ -256,7 +255,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--bases", nargs="*", default=list(BASES))
     parser.add_argument("--faults", nargs="*", default=[*FAULTS, "leakage"])
-    parser.add_argument("--beside", nargs="*", default=[""], choices=["bad", "nan", ""])
+    parser.add_argument("--second", nargs="*", default=[""], choices=["bad", "nan", ""])
     parser.add_argument("--sound", type=int, default=0, help="number of sound datasets")
     parser.add_argument("--scores", type=int, default=0, help="number of datasets of each base")
     parser.add_argument("--seed", type=int, default=1000)
@@ -269,7 +268,7 @@ def main() -> None:
         elif args.scores:
             report_scores(args.bases, args.scores, args.seed, folder)
         else:
-            report_faults(list(planted(args.bases, args.faults, args.beside, folder)))
+            report_faults(list(planted(args.bases, args.faults, args.second, folder)))
     print(f"{time.process_time() - begun:.0f} CPU s")
 
 

@@ -1,4 +1,4 @@
-"""Datasets that demorec did not make, as LeRobot's recorder and other tools write them, by PyArrow and PyAV alone."""
+"""Third-party datasets, as LeRobot's recorder and other tools make them, without demorec."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ Columns = dict[str, Array]
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetBase:
-    """A way in which other people record.
+    """A convention of third-party recordings.
 
     Attributes:
-        name: Of the base.
+        name: Key in `BASES`.
         version: Of LeRobot's format, "v2.1" or "v3.0".
         state, action: Names of the features.
         robot: `robot_type` in info.json.
         arms: Arms of the robot; the second one rests.
-        columns: What is stored of the motions of all arms; feature -> (T, D).
+        columns: Maps the motions of all arms to features, (T, D) each.
         features: Feature -> element names.
         grippers: Elements of the state and of the action that are grippers.
         is_delta: Whether the action is a displacement.
@@ -105,7 +105,7 @@ def _drawn(camera: str, shot: Shot) -> Images:
 
 
 def _resting(rng: np.random.Generator, arm: ArmModel, length: int) -> Motion:
-    """An arm that nobody moves: its encoders flicker by a tick at times, its leader lies near by."""
+    """Motion of a parked arm: its encoders sometimes flicker by a tick, and its leader is parked a few ticks away."""
     home = np.array(arm.home)
     ticks = np.array([arm.tick[0]] * (len(home) - 1) + [arm.tick[1]])
     flicker = (rng.random((length, len(home))) < 0.02 * (rng.random(len(home)) < 0.5)) * ticks
@@ -183,7 +183,7 @@ def _rows(array: Array) -> tuple[tuple[float, ...], ...]:
 
 
 def _so101(scale: Array, home: tuple[float, ...], **more: Any) -> ArmModel:
-    """An SO-101 whose elements are degrees times `scale`."""
+    """An SO-101 with elements in degrees times `scale`."""
     return ArmModel(
         names=_SO101, home=home, reach=_rows(_SO101_REACH * scale), grip=(40.0, 2.0, 18.0), tick=(0.088, 0.067),
         delay_s=0.06, lag_s=0.07, dead_band=0.9, sag=4.0, noise=0.02, tremor=0.12, **more,
@@ -256,4 +256,4 @@ BASES = {
         ),
     )
 }  # fmt: skip
-"""Ways in which other people record, by their names."""
+"""Conventions of third-party recordings by name."""

@@ -16,7 +16,7 @@ RowFault = Callable[[DemoDataset, int], None]
 
 
 def copied(dataset: DemoDataset) -> DemoDataset:
-    """A dataset whose rows may be changed without changing the original's."""
+    """A deep copy of the rows, with the same images."""
     episodes = [
         replace(episode, columns={n: v.copy() for n, v in episode.columns.items()}, time_s=episode.time_s.copy(),
                 images=dict(episode.images))
@@ -122,13 +122,15 @@ def shifted(seconds: float, *, frames: int = 0) -> Callable[[Array, DatasetBase]
 
     def change(values: Array, base: DatasetBase) -> Array:
         later = round(seconds * base.fps) + frames
-        return values[np.clip(np.arange(len(values)) - later, 0, len(values) - 1)]
+        found: Array = values[np.clip(np.arange(len(values)) - later, 0, len(values) - 1)]
+        return found
 
     return change
 
 
 def held(values: Array, base: DatasetBase) -> Array:
-    return values[np.arange(len(values)) // 4 * 4]
+    found: Array = values[np.arange(len(values)) // 4 * 4]
+    return found
 
 
 def stuck(values: Array, base: DatasetBase) -> Array:
@@ -275,7 +277,7 @@ def shown(change: Callable[[Pixels], Pixels], *, whole: bool = False) -> RowFaul
 
 
 def covered(images: Pixels) -> Pixels:
-    """What a hand before the lens leaves: dark, without contrast, with noise."""
+    """Dark images with noise and hardly any contrast, as with a hand over the lens."""
     noise = np.random.default_rng(0).normal(0, 2, images.shape)
     return np.clip(25 + 0.02 * images + noise, 0, 255).astype(np.uint8)
 

@@ -1,6 +1,6 @@
-"""The faults that the checks of datasets must find, one at a time, a row for each part of the table in their issue.
+"""Faults that the checks of datasets must find, one at a time.
 
-Each names what a check that finds it may be called, in the words of what was asked for; none was fitted to the checks.
+The words of each were chosen from the requirements, before any check existed.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from support.doctor_file_damage import FileFault
 
 @dataclass(frozen=True, kw_only=True)
 class PlantedFault:
-    """A fault and what finds it.
+    """A fault and the checks that may find it.
 
     Attributes:
         family: Of checks.
-        words: Parts of the names of checks that may find it.
-        rows, files: What spoils an episode before or after it is written.
+        words: Parts of check names that are accepted, separated by spaces.
+        rows, files: Functions that spoil an episode before or after it is written.
         is_harmful: Whether training on it is wrong or impossible.
         is_whole: Whether all episodes have it, so that none needs to be named.
-        needs: What the base must have (`traits`).
+        needs: Trait that the base must have (`traits`).
     """
 
     family: str
@@ -40,7 +40,7 @@ class PlantedFault:
 
 
 def traits(base: DatasetBase) -> set[str]:
-    """What a base has that faults may need."""
+    """Traits of a base that faults may need."""
     found = {base.version, "delta" if base.is_delta else "absolute"}
     found |= {"camera"} if base.cameras else set()
     found |= {"two cameras"} if len(base.cameras) > 1 else set()

@@ -47,7 +47,7 @@ def noisy_video(root: Path, base: DatasetBase, number: int) -> None:
 
 
 def short_video(root: Path, base: DatasetBase, number: int) -> None:
-    """Lose the last fifth of the images, as a recorder whose encoder could not keep up."""
+    """Lose the last fifth of the images, as with an encoder that is too slow."""
     path = video_file(root, number)
     with av.open(str(path)) as source, av.open(str(path.with_suffix(".tmp.mp4")), "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])
@@ -77,7 +77,7 @@ def camera_info(values: dict[str, Any]) -> FileFault:
 
 
 def episode_row(change: Callable[[dict[str, Any], dict[str, Any]], object]) -> FileFault:
-    """Change what the table of episodes says of one of them; `change` also gets the next one's row."""
+    """Change a row in the table of episodes; `change` also gets the next row."""
 
     def spoil(root: Path, base: DatasetBase, number: int) -> None:
         if base.version == "v2.1":

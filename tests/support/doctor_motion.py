@@ -1,7 +1,7 @@
-"""Demonstrations as a person teleoperates them: reaches with corrections and rests, and an arm that follows late.
+"""Teleoperated demonstrations: a person's reaches with corrections and rests, and an arm that follows late.
 
 The operator moves along minimum-jerk curves, corrects at the end of a reach, rests and trembles. The arm has a delay, a
-lag, a dead band, gravity sag and encoders; its gripper stops at what it holds. Nothing here comes from demorec.
+lag, a dead band, gravity sag and encoders; its gripper stops at the object. Nothing here comes from demorec.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True)
 class ArmModel:
-    """An arm whose last element is its gripper, in the units of its dataset.
+    """An arm and its gripper, which is the last element, in the units of the dataset.
 
     Attributes:
         names: Element names.
@@ -58,7 +58,7 @@ class ArmModel:
         return found
 
     def readings(self, values: Array) -> Array:
-        """What the encoders give for (T, D) true values."""
+        """Encoder readings of (T, D) true values."""
         ticks = np.array([self.tick[0]] * (len(self.home) - 1) + [self.tick[1]])
         whole = np.where(ticks > 0, np.round(values / np.maximum(ticks, 1e-12)) * ticks, values)
         return np.clip(whole, *self.limits)
@@ -80,8 +80,8 @@ class Motion:
     """One demonstration.
 
     Attributes:
-        command: (T, D) values that the operator asks for, as the leader's encoders read them.
-        state: (T, D) values that the arm's encoders read.
+        command: (T, D) readings of the leader.
+        state: (T, D) readings of the arm.
         true: (T, D) values of the arm without encoders and noise.
         thing: (T, 3) place of the object.
     """
@@ -247,7 +247,7 @@ def _tremor(rng: np.random.Generator, length: int, width: int, fps: int) -> Arra
 
 
 def _follow(command: Array, held: NDArray[np.bool_], arm: ArmModel, fps: int) -> Array:
-    """(T, D) motion of the servos; the gripper stops at what it holds."""
+    """(T, D) motion of the servos; the gripper stops at the object."""
     delay = max(1, round(arm.delay_s * fps))
     gain = 1 - np.exp(-1 / (fps * arm.lag_s))
     width = command.shape[1]
@@ -270,7 +270,7 @@ def _follow(command: Array, held: NDArray[np.bool_], arm: ArmModel, fps: int) ->
 
 
 def _thing(true: Array, held: NDArray[np.bool_], reaches: list[Reach], arm: ArmModel) -> Array:
-    """(T, 3) place of the object: where it was, then in the hand, then where it was let go."""
+    """(T, 3) place of the object: at rest, then in the hand, then below the place of release."""
     hand, found = arm.place(true[:, :-1]), np.empty((len(true), 3))
     now = next((reach.place for reach in reaches if reach.name == "at"), reaches[-1].place)
     for frame in range(len(true)):

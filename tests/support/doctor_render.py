@@ -17,7 +17,7 @@ _ROWS, _COLUMNS = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
 
 @dataclass(frozen=True, kw_only=True)
 class Shot:
-    """What the cameras see: a motion on the table with the number `table`; `seed` is that of the sensor noise."""
+    """A motion on the table with number `table`, and the seed of the sensor noise."""
 
     motion: Motion
     arm: ArmModel
