@@ -58,22 +58,22 @@ OPENS = "open file read damag parquet final footer missing whole complete count 
 COUNTS = "count index indices meta rows length total info episode table open file"
 VIDEO = "video decode image open file crc frame count length rows short missing"
 TIME = "time stamp gap drop clock rate fps sampl doubl monoton regular interval"
-JUMPS = "jump step speed spike gap skip drop outlier discontinu teleport veloc slip smooth"
-RANGE = "limit range beyond outlier unit scale jump extreme bound spike speed"
-UNITS = "unit scale range degree limit outlier beyond"
+JUMPS = "jump step speed spike gap skip drop outlier unusual discontinu teleport veloc slip smooth"
+RANGE = "limit range beyond outlier unusual unit scale jump extreme bound spike speed"
+UNITS = "unit scale range degree limit outlier unusual beyond"
 STALE = "old stale held hold repeat frozen sampl stuck dead rate duplic still constant"
 ALIGNED = "align late lag early shift offset delay sync follow action track lead"
 COMMANDS = "equal same copy action exchang swap permut order channel element follow align match track mix"
 GRIPPER = "gripper hand grip invert follow align"
 DEAD = "dead constant frozen stuck still element channel follow zero align"
 IMAGES = "image frozen blank camera black dark cover occlu contrast freeze repeat still duplic video"
-CAMERAS = "camera exchang swap doubl duplic same image view turn rotat flip other take outlier match"
+CAMERAS = "camera exchang swap doubl duplic same image view turn rotat flip other take outlier unusual match"
 SYNC = "image video camera sync offset late shift lag align take other match"
 COPIES = "cop duplic same shared overlap repeat"
-IDLE = "idle pause rest still static stop wait length outlier hesit score"
-OUTLIER = "outlier length long path jerk slow score unusual smooth speed end cut idle pause incomplete truncat unfinish"
+IDLE = "idle pause rest still static stop wait length outlier unusual hesit score"
+OUTLIER = "outlier unusual length long path jerk slow score smooth speed end cut idle pause incomplete truncat unfinish"
 LANGUAGE = "instruct task language text empty contradict meta label"
-POSES = "pose kinematic quaternion unit range scale jump norm orientation flip outlier limit forward"
+POSES = "pose kinematic quaternion unit range scale jump norm orientation flip outlier unusual limit forward"
 VELOCITIES = "veloc differ deriv unit scale speed"
 STATISTICS = "stat"
 
@@ -244,10 +244,10 @@ _SET = {
     ),
     "empty instruction": _set(LANGUAGE, rows.task("")),
     "instruction of another task": _files(
-        LANGUAGE, files.data_column("task_index", files.another_task), family="set", is_whole=False
+        LANGUAGE + " count index", files.data_column("task_index", files.another_task), family="set", is_whole=False
     ),
     "no such task": _files(
-        LANGUAGE + " index", files.data_column("task_index", files.no_such_task), family="set", is_whole=False
+        LANGUAGE + " count index", files.data_column("task_index", files.no_such_task), family="set", is_whole=False
     ),
 }
 

@@ -1,0 +1,45 @@
+"""Checks of third-party datasets find planted faults in a dataset that demorec did not make, and pass it without them.
+
+All bases and faults: `benchmarks/doctor_faults.py`.
+"""
+
+from __future__ import annotations
+
+import pytest
+from support.doctor_bases import BASES
+from support.doctor_faults import FAULTS
+from support.doctor_judge import Bench, bench, check, episodes_of, findings_of, is_found
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> Bench:
+    """Quantised teleoperation at 10 fps under openpi's names."""
+    return bench(BASES["openpi"], tmp_path_factory.mktemp("doctor") / "openpi")
+
+
+def test_a_sound_dataset_is_good(arm: Bench) -> None:
+    answer = check(arm.folder / "sound")
+    assert (answer["verdict"], findings_of(answer)) == ("good", [])
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "length of an episode",
+        "gap",
+        "stuck state",
+        "NaN",
+        "unit of an episode",
+        "dead joint",
+        "maximum of the state",
+        "action late",
+        "unfollowed gripper",
+        "copy",
+        "cut off",
+        "empty instruction",
+    ],
+)
+def test_a_planted_fault_is_found(arm: Bench, name: str) -> None:
+    for second in ("", "bad", "nan"):
+        answer = check(arm.plant(name, second))
+        assert is_found(FAULTS[name], answer, episodes_of(name)), (second, answer)
