@@ -7,7 +7,7 @@
     python benchmarks/doctor_faults.py --scores 3                   AUC of the episodes' scores, three datasets a format
 
 A fault is found if the verdict is not "good", and a check with one of the fault's words in its name reports a faulty
-episode (any episode if all are faulty). Datasets are written to a temporary folder by tests/support.
+episode (any episode if all are faulty) and did not do so before. Datasets are written to a temporary folder by tests/support.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ def planted(bases: Sequence[str], faults: Sequence[str], second: Sequence[str], 
                     base=base_name,
                     fault=name,
                     second=other,
-                    is_found=is_found(fault, answer, episodes),
+                    is_found=is_found(fault, answer, episodes, made.alarms),
                     said=", ".join(told) or str(answer.get("verdict")),
                 )
                 print(base_name, name, other, "found" if row.is_found else f"missed ({row.said})", flush=True)

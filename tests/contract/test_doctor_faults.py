@@ -42,4 +42,4 @@ def test_a_sound_dataset_is_good(arm: Bench) -> None:
 def test_a_planted_fault_is_found(arm: Bench, name: str) -> None:
     for second in ("", "bad", "nan"):
         answer = check(arm.plant(name, second))
-        assert is_found(FAULTS[name], answer, episodes_of(name)), (second, answer)
+        assert is_found(FAULTS[name], answer, episodes_of(name), arm.alarms), (second, answer)

@@ -182,13 +182,21 @@ def equal_to_state(*, whole: bool) -> RowFault:
     return spoil
 
 
+def _fastest(state: Array, length: int) -> NDArray[np.int64]:
+    """Rows of the given number in which the arm moves farthest."""
+    moved = np.abs(state[length:, :-1] - state[:-length, :-1]) / np.maximum(np.ptp(state[:, :-1], axis=0), 1e-6)
+    return int(np.argmax(moved.max(1))) + np.arange(length)
+
+
 def dropped_rows(*, regular: bool) -> RowFault:
-    """Lose half a second of motion at one place, or single rows at many."""
+    """Lose the fastest 0.6 s of motion, or single rows at many places."""
 
     def spoil(dataset: DemoDataset, number: int) -> None:
         episode = dataset.episodes[number]
         rows = np.arange(len(episode.time_s))
-        lost = rows[len(rows) * 5 // 20 :][: round(0.6 * dataset.base.fps)] if regular else rows[10:-10:9]
+        lost = (
+            _fastest(episode.columns[dataset.base.state], round(0.6 * dataset.base.fps)) if regular else rows[10:-10:9]
+        )
         _kept(episode, np.setdiff1d(rows, lost))
         if regular:
             _regular(dataset, episode)

@@ -75,7 +75,7 @@ OUTLIER = "outlier unusual length long path jerk slow score smooth speed end cut
 LANGUAGE = "instruct task language text empty contradict meta label"
 POSES = "pose kinematic quaternion unit range scale jump norm orientation flip outlier unusual limit forward"
 VELOCITIES = "veloc differ deriv unit scale speed"
-STATISTICS = "stat"
+STATISTICS = "statistic"
 
 
 def _rows(family: str, words: str, spoil: RowFault, **more: object) -> PlantedFault:

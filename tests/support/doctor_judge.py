@@ -19,6 +19,8 @@ from support.doctor_damage import copied, on, other_unit, put
 from support.doctor_faults import FAULTS, PlantedFault
 from support.doctor_writer import VideoStore, write_dataset
 
+Alarms = frozenset[tuple[str, int | None]]
+
 EPISODES = 8
 PLANTED = 3
 BAD, WITH_NAN = 6, 7
@@ -59,12 +61,19 @@ def findings_of(answer: dict[str, Any]) -> list[dict[str, Any]]:
     return found
 
 
-def is_found(fault: PlantedFault, answer: dict[str, Any], episodes: Iterable[int]) -> bool:
-    """Whether an answer has the fault of these episodes."""
+def alarms_of(answer: dict[str, Any]) -> Alarms:
+    """Check and episode of every finding."""
+    return frozenset((finding["check"], finding["episode"]) for finding in findings_of(answer))
+
+
+def is_found(fault: PlantedFault, answer: dict[str, Any], episodes: Iterable[int], alarms: Alarms) -> bool:
+    """Whether an answer has the fault of these episodes; `alarms` are those of the sound dataset."""
     if answer.get("verdict") == "good":
         return False
     words = fault.words.split()
     for finding in findings_of(answer):
+        if (finding["check"], finding["episode"]) in alarms:
+            continue
         names_episode = fault.is_whole or finding["episode"] in set(episodes)
         if names_episode and any(word in finding["check"].lower() for word in words):
             return True
@@ -73,13 +82,14 @@ def is_found(fault: PlantedFault, answer: dict[str, Any], episodes: Iterable[int
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """A base's sound dataset, and those with a fault, in a folder."""
+    """A base's sound dataset, and those with a fault, in a folder; `alarms` are those of the sound one."""
 
     base: DatasetBase
     folder: Path
     store: VideoStore
     sound: DemoDataset
     sound_digest: str
+    alarms: Alarms
 
     def plant(self, name: str, second: str = "") -> Path:
         """Write the dataset with a fault; raises if nothing changed."""
@@ -107,7 +117,9 @@ def bench(base: DatasetBase, folder: Path) -> Bench:
     store = VideoStore(folder / "videos")
     sound = record(base, SEED, EPISODES)
     root = write_dataset(sound, folder / "sound", store)
-    return Bench(base=base, folder=folder, store=store, sound=sound, sound_digest=digest(root))
+    return Bench(
+        base=base, folder=folder, store=store, sound=sound, sound_digest=digest(root), alarms=alarms_of(check(root))
+    )
 
 
 LEAKAGE = PlantedFault(family="set", words="leak cop duplic shared overlap same", is_whole=True)
