@@ -7,7 +7,8 @@
     python benchmarks/doctor_faults.py --scores 3                   AUC of the episodes' scores, three datasets a format
 
 A fault is found if the verdict is not "good", and a check with one of the fault's words in its name reports a faulty
-episode (any episode if all are faulty) and did not do so before. Datasets are written to a temporary folder by tests/support.
+episode (any episode if all are faulty) and did not do so before. tests/support writes the datasets to a temporary
+folder.
 """
 
 from __future__ import annotations
