@@ -171,7 +171,7 @@ def panda_poses(joints: Array) -> Array:
 
 
 _SO101 = ("shoulder_pan.pos", "shoulder_lift.pos", "elbow_flex.pos", "wrist_flex.pos", "wrist_roll.pos", "gripper.pos")
-_SO101_REACH = np.array([[-22, 10, 4, 3, 6], [4, 45, -30, 12, 4], [2, -35, 10, -14, 2]], float)
+_SO101_REACH = np.array([[-22, 10, 4, 5, 14], [4, 45, -30, 24, 9], [2, -35, 10, -22, 3]], float)
 _TICK_DEG = 360 / 4096
 _VIPERX = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 _TICK_RAD = 2 * np.pi / 4096
