@@ -117,18 +117,19 @@ def report_sound(bases: Sequence[str], count: int, seed: int, folder: Path) -> N
 
 
 def report_scores(bases: Sequence[str], count: int, seed: int, folder: Path) -> None:
-    """Print the AUC of the scores between sound and spoilt episodes, 3 in 10, overall and by kind."""
+    """Print the AUC of the scores between sound and spoilt episodes, 3 in 10 of all sizes, overall and by kind."""
     for base in bases:
         scores: dict[str, list[float]] = defaultdict(list)
         for number in range(count):
             rng = np.random.default_rng((seed, number))
             kinds = rng.permutation(list(SPOILERS) * 2)
-            spoilt = dict(zip(rng.choice(54, 16, replace=False).tolist(), map(str, kinds), strict=True))
+            numbers = rng.choice(54, 16, replace=False).tolist()
+            spoilt = {i: (str(kind), rng.uniform(0.2, 1)) for i, kind in zip(numbers, kinds, strict=True)}
             with tempfile.TemporaryDirectory(dir=folder) as place:
                 dataset = record(BASES[base], int(rng.integers(2**31)), 54, spoilt=spoilt, cameras=False)
                 answer = check(write_dataset(dataset, Path(place) / "scored", VideoStore(Path(place))))
             for row in answer.get("episodes", []):
-                scores[spoilt.get(row["episode"], "")].append(row["score"])
+                scores[spoilt.get(row["episode"], ("", 0))[0]].append(row["score"])
         bad = {kind: scores[kind] for kind in SPOILERS}
         whole = auc(scores[""], [value for values in bad.values() for value in values])
         print(f"{base}: AUC {whole:.3f}; " + ", ".join(f"{k} {auc(scores[''], v):.3f}" for k, v in bad.items()))

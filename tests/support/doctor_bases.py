@@ -77,15 +77,21 @@ class DemoDataset:
 
 
 def record(
-    base: DatasetBase, seed: int, episodes: int, *, spoilt: Mapping[int, str] | None = None, cameras: bool = True
+    base: DatasetBase,
+    seed: int,
+    episodes: int,
+    *,
+    spoilt: Mapping[int, tuple[str, float]] | None = None,
+    cameras: bool = True,
 ) -> DemoDataset:
-    """Record a dataset; `spoilt` is the kind of those episodes that are not sound, which changes no other episode."""
+    """Record a dataset; `spoilt` has kind and size of those episodes that are not sound; others stay as they are."""
     shared = np.random.default_rng((seed, len(base.name)))
     pace, table = base.pace * shared.uniform(0.85, 1.2), int(shared.integers(2**31))
     found = []
     for number in range(episodes):
         rng = np.random.default_rng((seed, len(base.name), number))
-        motions = [demonstrate(rng, base.arms[0], base.fps, pace, (spoilt or {}).get(number, ""))]
+        kind, size = (spoilt or {}).get(number, ("", 1.0))
+        motions = [demonstrate(rng, base.arms[0], base.fps, pace, spoilt=kind, size=size)]
         motions += [_resting(rng, arm, len(motions[0].state)) for arm in base.arms[1:]]
         shot = Shot(motion=motions[0], arm=base.arms[0], table=table, seed=int(rng.integers(2**31)))
         images = {camera: _drawn(camera, shot) for camera in (base.cameras if cameras else ())}

@@ -233,7 +233,7 @@ def _noisy(images: Pixels) -> Pixels:
 def spoilt(kind: str) -> RowFault:
     def spoil(dataset: DemoDataset, number: int) -> None:
         has_cameras = bool(dataset.episodes[number].images)
-        made = record(dataset.base, dataset.seed, number + 1, spoilt={number: kind}, cameras=has_cameras)
+        made = record(dataset.base, dataset.seed, number + 1, spoilt={number: (kind, 1.0)}, cameras=has_cameras)
         dataset.episodes[number] = made.episodes[number]
 
     return spoil
