@@ -216,6 +216,7 @@ def test_files_in_other_folders_than_info_json_says_are_found(tmp_path: Path) ->
     before = pq.read_table(source / "data/chunk-000/episode_000001.parquet")
     assert exit_code("dataset", "select", source, "--episodes", "1", "--out", tmp_path / "new") == 0
     assert rows(tmp_path / "new")["action"].to_pylist() == before["action"].to_pylist()
+    assert not (tmp_path / "new/video").exists()  # its images are in videos/
 
 
 def test_a_camera_without_videos_is_named_with_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -150,7 +150,7 @@ def _columns(drawn: DrawnDataset, random: np.random.Generator, seed: int) -> tup
         features[f"extra_{place}"] = {"dtype": plain, **scalar}
     for name, values in numbers.items():
         columns[name] = pa.array(values)
-        features[name] = {"dtype": "float32" if name == "timestamp" else str(values.dtype), **scalar}
+        features[name] = {"dtype": drawn.claimed if name == "timestamp" else str(values.dtype), **scalar}
     if drawn.has_unlisted:
         columns["is_pad"] = pa.array(np.zeros(total, bool))
     if drawn.camera in ("image", "binary"):

@@ -108,7 +108,7 @@ class Edit:
         if self.dry_run and len(plan.sources) == 1 and numbers != list(range(len(lengths))):
             say(f"episodes {_listed(numbers)}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
-        if unknown := unknown_files(plan.sources[0].root) if len(plan.sources) == 1 else ():
+        if unknown := unknown_files(plan.sources[0]) if len(plan.sources) == 1 else ():
             more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
             say(f"Copied, but not understood: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still hold.")
 

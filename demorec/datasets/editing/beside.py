@@ -210,12 +210,21 @@ def copied_files(plan: Plan) -> tuple[str, ...]:
         return ()
     root = plan.sources[0].root
     known = [name for name in _ABOUT_THE_WHOLE if (root / name).is_file()]
-    return (*known, *unknown_files(root))
+    return (*known, *unknown_files(plan.sources[0]))
 
 
-def unknown_files(root: Path) -> tuple[str, ...]:
-    """List the files of a dataset's folder, links aside, whose names do not say what they are."""
-    return tuple(name for name in _files_below(root) if not is_dataset_file(name) and not (root / name).is_symlink())
+def unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
+    """List the files, links aside, that a dataset does not use and whose names do not say what they are."""
+    root, used = source.root, _used_files(source)
+    strange = [name for name in _files_below(root) if not is_dataset_file(name) and root / name not in used]
+    return tuple(name for name in strange if not (root / name).is_symlink())
+
+
+def _used_files(source: LeRobotFolder) -> set[Path]:
+    """Find the files of rows and videos."""
+    return {place.data for place in source.places} | {
+        path for place in source.places for path, _ in place.videos.values()
+    }
 
 
 def _files_below(root: Path) -> list[str]:
@@ -230,16 +239,15 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
                 yield name, f"{INFO_PATH} does not list this column of the data files"
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
-    places = plan.sources[number].places
-    used = {place.data for place in places} | {path for place in places for path, _ in place.videos.values()}
+    used = _used_files(plan.sources[number])
     copied = copied_files(plan)
     for name in _files_below(root):
         path = root / name
-        if name in copied:
+        if name in copied or path in used:
             continue
         if not is_dataset_file(name):
             yield name, "of a kind that demorec does not know: copy it if it still holds"
-        elif name.startswith(("data/", "videos/")) and path not in used:
+        elif name.startswith(("data/", "videos/")):
             yield name, "no episode of the dataset is in this file"
         elif name in _ABOUT_THE_WHOLE and len(plan.sources) > 1:
             yield name, "each of the datasets may have its own"

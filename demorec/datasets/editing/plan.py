@@ -128,8 +128,9 @@ class Plan:
         types = mistyped_features(source)
         own |= {name: replace(own[name], dtype=types[name]) for name in types if name in own}
         automatic = dict(AUTOMATIC_FEATURES)
-        if "timestamp" in types:
-            automatic["timestamp"] = replace(automatic["timestamp"], dtype=types["timestamp"])
+        time_type = types.get("timestamp", source.info.features["timestamp"].dtype)
+        if time_type in ("float32", "float64"):
+            automatic["timestamp"] = replace(automatic["timestamp"], dtype=time_type)
         spoken = {name: feature for name, feature in own.items() if feature.dtype == "language"}
         features = {**{k: v for k, v in own.items() if k not in spoken}, **automatic, **spoken}
         info = replace(
