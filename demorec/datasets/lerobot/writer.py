@@ -207,15 +207,12 @@ class DatasetWriter(Closing):
             **{name: episode.facts.get(name) for name in self._facts},
         }
         values = {name: values_of(column) for name, column in columns.items() if name not in self._cameras}
-        statistics = vector_statistics({name: values[name] for name in self._numeric if name not in self._arrays})
-        for name, width in self._arrays.items():
-            vectors = vector_statistics({name: values[name].reshape(-1, width)})[name]
-            statistics[name] = replace(vectors, count=frames)
         digests = {}
         for key in self._info.video_keys:
             row.update(self._add_video(key, episode.videos[key], frames))
             digests[key] = episode.videos[key].digest
             self._video_info[key] = merged_video_info(self._video_info[key] or {}, dict(episode.video_info[key]))
+        statistics = self._number_statistics(values, frames)
         statistics |= {key: self._count(key, episode.pixels[key]) for key in self._cameras}
         row |= {f"stats/{key}/{name}": found.nested(name) for key, found in statistics.items() for name in NAMES}
         self._episodes.add_row(row)
@@ -246,6 +243,14 @@ class DatasetWriter(Closing):
                     f"({describe_error(error)})."
                 ) from error
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
+
+    def _number_statistics(self, values: Mapping[str, NDArray[Any]], frames: int) -> dict[str, Statistics]:
+        """Return the statistics of all numeric features; those of arrays are over their last dimension."""
+        statistics = vector_statistics({name: values[name] for name in self._numeric if name not in self._arrays})
+        for name, width in self._arrays.items():
+            vectors = vector_statistics({name: values[name].reshape(-1, width)})[name]
+            statistics[name] = replace(vectors, count=frames)
+        return statistics
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
         """The statistics of a camera in an episode, which those of all episodes take in."""
