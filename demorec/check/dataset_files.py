@@ -43,6 +43,8 @@ def dataset_readable(dataset: CheckedDataset) -> Measurement:
 def dataset_counts(dataset: CheckedDataset) -> Measurement:
     """Compare totals with the tables; indices count up without a gap, timestamps are frame_index / fps."""
     info, tasks, wrong = dataset.info, dataset.folder.tasks, []
+    if dataset.folder.is_found_by_rows:
+        wrong.append("the table of episodes")
     totals = {
         "total_episodes": (info.total_episodes, len(dataset.folder.listed)),
         "total_frames": (info.total_frames, sum(place.length for place in dataset.folder.listed)),
@@ -65,7 +67,7 @@ def dataset_counts(dataset: CheckedDataset) -> Measurement:
             "timestamp": (count / info.fps).astype(np.float32),
         }
         for name, values in expected.items():
-            if name not in rows or not np.array_equal(rows[name].reshape(-1), values):
+            if name in rows and not np.array_equal(rows[name].reshape(-1), values):
                 wrong.append(f"{name} of episode {number}")
         used = {int(index) for index in rows["task_index"].reshape(-1)}
         names = {tasks[index] if 0 <= index < len(tasks) else "" for index in used}
@@ -155,7 +157,7 @@ def dataset_sidecar(dataset: CheckedDataset) -> Measurement | NotMeasured:
             continue
         if number in infos and dataset.folder.listed[number].tasks != (infos[number].instruction,):
             wrong.append(f"episode {number} has another instruction")
-        elif SUCCESS in rows and bool(rows[SUCCESS][-1, 0]) != row["success"]:
+        elif SUCCESS in rows and bool(rows[SUCCESS][-1, 0]) != bool(row["success"]):
             wrong.append(f"episode {number} has another outcome")
         elif digests[number] != row["content_digest"]:
             wrong.append(f"episode {number} has changed since it was exported")
@@ -181,7 +183,8 @@ def _columns(dataset: CheckedDataset) -> Iterator[str]:
     for path in tables_in(dataset.path, "data"):
         schema = open_table(path).schema_arrow
         columns = set(schema.names)
-        yield from (f"{path.name} has no column {name}" for name in features if name not in columns)
+        needed = [name for name in features if name not in dataset.info.unlisted]
+        yield from (f"{path.name} has no column {name}" for name in needed if name not in columns)
         yield from (f"{path.name} has a column {name}, which is no feature" for name in columns if name not in features)
         for name in features:
             if name in columns and not _fits(schema.field(name).type, features[name]):

@@ -169,9 +169,10 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
 
 
 def _notes(subject: CheckedEpisode | CheckedDataset) -> tuple[str, ...]:
-    """What has no role; nothing of what cannot be read, which the checks report."""
+    """What has no role or was read by the rows; nothing of what cannot be read, which the checks report."""
+    read_by_rows = subject.folder.notes if isinstance(subject, CheckedDataset) else ()
     try:
-        return tuple(subject.roles.notes())
+        return (*read_by_rows, *subject.roles.notes())
     except (RecordingError, ExportError):
         return ()
 

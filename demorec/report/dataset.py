@@ -50,7 +50,7 @@ def dataset_report(
     info, roles = folder.info, folder.roles
     rows = {row["episode_index"]: row for row in folder.sidecar(_EPISODE_COLUMNS)}
     left_out = folder.attempts.failures
-    missing = list(_missing(info, roles, has_sidecar=bool(rows)))
+    missing = [*folder.notes, *_missing(info, roles, has_sidecar=bool(rows))]
     key = _camera_key(info, camera, root)
     wanted = dict.fromkeys((*roles.state, *roles.action))
     if _SUCCESS in info.features and info.features[_SUCCESS].column.elements:

@@ -91,6 +91,7 @@ def import_lerobot(
         cameras=fates,
         left_out=left_out,
         skipped={f"episode {index}": reason for index, reason in skipped.items()},
+        notes=dataset.notes,
     )
 
 

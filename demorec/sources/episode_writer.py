@@ -30,6 +30,7 @@ class FramesImport:
         cameras: Camera -> what became of its images, in words.
         left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
         skipped: Episode that cannot be read -> why.
+        notes: Sentences on how the source was read.
     """
 
     num_episodes: int
@@ -38,9 +39,11 @@ class FramesImport:
     cameras: Mapping[str, str]
     left_out: Mapping[str, str]
     skipped: Mapping[str, str] = field(default_factory=dict)
+    notes: tuple[str, ...] = ()
 
     def left_out_lines(self) -> Iterator[str]:
-        """Describe what the run does not have."""
+        """Describe how the source was read and what the run does not have."""
+        yield from self.notes
         yield from (f"{name} is left out: {reason}." for name, reason in self.left_out.items() if reason)
         if unnamed := [name for name, reason in self.left_out.items() if not reason]:
             yield f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}."

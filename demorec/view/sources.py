@@ -62,8 +62,10 @@ def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[Play
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
         dataset = LeRobotFolder(path, named=named)
+        if not dataset.places:
+            raise ConfigError(f"The dataset has no episodes to show: {path}")
         missing = dataset.leave_out_missing_cameras()
-        notes = tuple(f"No episode has a video of {key}, which is not shown: {path}" for key in missing)
+        notes = (*dataset.notes, *(f"No episode has a video of {key}, which is not shown: {path}" for key in missing))
         return [
             PlaybackSource(
                 name=f"{path}: episode {place.episode_index}",

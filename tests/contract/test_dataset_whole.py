@@ -9,7 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
+from conformance.test_import_v21 import write_v21
 from support.check import change_table, checked, edit_json, edit_parquet
 from support.commands import exit_code, words_of
 from support.export import content_of, export, make_run, recordings
@@ -26,6 +28,7 @@ READERS = {
     "drop": "dataset drop PATH --episodes 0 --out NEW",
     "trim": "dataset trim PATH --head 1 --out NEW",
     "trim-idle": "dataset trim PATH --idle --out NEW",
+    "cut": "dataset cut PATH --at 1=3 --out NEW",
     "split": "dataset split PATH --shares a=0.5 b=0.5 --out NEW",
     "merge": "dataset merge PATH PATH --out NEW",
     "rename": "dataset rename PATH action=command --out NEW",
@@ -93,7 +96,6 @@ def rows_of_one_episode_exchanged(root: Path) -> None:
 
 
 FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
-    "no table of episodes": (without_table, ("is not whole", "total_episodes is 4, found 0")),
     "an episode less in the table": (short_table, ("is not whole", "total_episodes is 4, found 3")),
     "an episode less in table and info": (short_table_and_info, ("has 32 rows",)),
     "an episode that is longer": (longer_episode, ("is not whole", "total_frames is 32, found 33")),
@@ -101,6 +103,76 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "rows exchanged in an episode": (rows_of_one_episode_exchanged, ("not its own",)),
 }
 """Fault -> what makes it, and the words of which one names it."""
+
+
+def wrong_files(root: Path) -> None:
+    """The table puts the rows of all episodes into the first data file, as converters did (lerobot#2401)."""
+    change_table(root, "meta/episodes", lambda table: _with_column(table, "data/file_index", [0] * NUM_EPISODES))
+
+
+def _with_column(table: pa.Table, name: str, values: list[int]) -> pa.Table:
+    return table.set_column(table.schema.get_field_index(name), name, pa.array(values, pa.int64()))
+
+
+@pytest.mark.parametrize("spoil", [without_table, wrong_files])
+@pytest.mark.parametrize("command", READERS)
+def test_what_the_table_lacks_is_found_by_the_rows(
+    command: str, spoil: Callable[[Path], None], apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(apart, tmp_path / "d"))
+    spoil(root)
+    before = content_of(root)
+    assert exit_code(*words_of(READERS[command], root, tmp_path / "new")) == (1 if command == "check" else 0)
+    captured = capsys.readouterr()
+    told = "the table of episodes" if command == "check" else "found by the episode_index"
+    assert (captured.out + captured.err).count(told) == (2 if command in ("diff", "merge") else 1)
+    assert content_of(root) == before
+    assert exit_code(*words_of(READERS[command], apart, tmp_path / "whole")) == 0
+    for path in (tmp_path / "whole").rglob("*"):
+        if path.suffix in (".mp4", ".mcap") or path.match("data/*/*.parquet"):
+            assert (tmp_path / "new" / path.relative_to(tmp_path / "whole")).read_bytes() == path.read_bytes()
+
+
+def test_an_old_dataset_without_its_table_is_found_by_the_rows(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    roots = [write_v21(tmp_path / name) for name in ("whole", "spoilt")]
+    (roots[1] / "meta/episodes.jsonl").unlink()
+    for root in roots:
+        assert exit_code("view", root, "--save", tmp_path / f"{root.name}.rrd") == 0
+        assert exit_code("dataset", "select", root, "--episodes", "0,1", "--out", tmp_path / f"{root.name}-new") == 0
+    assert "found by the episode_index" in capsys.readouterr().err
+    tables = [pq.read_table(tmp_path / f"{root.name}-new" / "data") for root in roots]
+    assert tables[0].equals(tables[1])
+
+
+def test_rows_that_do_not_say_enough_are_refused(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An image less than rows: which episode lacks it, no file knows (AgiBot-World#149)."""
+    root = Path(shutil.copytree(exported, tmp_path / "d"))
+    without_table(root)
+    change_table(root, "data", lambda table: pa.concat_tables([table, table.slice(len(table) - 1)]))
+    assert exit_code("view", root, "--save", tmp_path / "new.rrd") == 1
+    assert "32 images for 33 rows" in capsys.readouterr().err
+
+
+def test_a_dataset_without_episodes_shows_nothing_and_says_so(exported: Path, tmp_path: Path) -> None:
+    root = Path(shutil.copytree(exported, tmp_path / "d"))
+    for place in ("meta/episodes", "data"):
+        change_table(root, place, lambda table: table.slice(0, 0))
+    edit_json(root / "meta/info.json", lambda info: info.update(total_episodes=0, total_frames=0))
+    assert exit_code("view", root, "--save", tmp_path / "new.rrd") == 2
+
+
+def test_rows_without_frame_index_are_no_fault(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(exported, tmp_path / "d"))
+    change_table(root, "data", lambda table: table.drop_columns("frame_index"))
+    edit_json(root / "meta/info.json", lambda info: info["features"].pop("frame_index"))
+    assert exit_code(*words_of(READERS["check"], root, tmp_path / "new")) == 0
+    assert "no frame_index" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("fault", FAULTS)

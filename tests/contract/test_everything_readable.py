@@ -77,6 +77,8 @@ OF_IMPORTED: dict[str, tuple[int, str]] = {
     "replay DATASET": (2, EXTERNAL),
     "render RECORDING --out NEW": (1, EXTERNAL),
     "dataset select DATASET --episodes 0 --out NEW": (0, "1 of 1 episode, 24 of 24 frames"),
+    "dataset repair DATASET --out NEW": (0, "Nothing to repair, so nothing is written"),
+    "dataset cut DATASET --at 0=7 --out NEW": (0, "2 parts of 1 episode, 24 of 24 frames"),
     "evaluate --policy RUN": (2, "No policy"),
     "correct --policy RUN": (2, "No policy"),
     "generate --config RUN --out NEW": (2, EXTERNAL),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -163,6 +164,8 @@ ROWS = {
     "drop": _edit("drop SOURCES/dataset --episodes 0"),
     "trim": _edit("trim SOURCES/dataset --head 1"),
     "merge": _edit("merge SOURCES/dataset SOURCES/other"),
+    "repair": _edit("repair SOURCES/unfinalized"),
+    "cut": _edit("cut SOURCES/dataset --at 0=2 1=3"),
     "rename": _edit("rename SOURCES/dataset action=command"),
     "drop-features": _edit("drop-features SOURCES/dataset next.reward"),
     "set-task": _edit("set-task SOURCES/dataset --task push"),
@@ -246,6 +249,8 @@ def make_base(folder: Path) -> None:
     make_run(folder / "reversed", (6, 4, 5), cameras=("front",))
     export(folder / "run", folder / "dataset")
     export(folder / "reversed", folder / "other")
+    shutil.copytree(folder / "dataset", folder / "unfinalized")
+    shutil.rmtree(folder / "unfinalized/meta/episodes")
 
 
 def _simulated(folder: Path) -> None:

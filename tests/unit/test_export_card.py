@@ -6,11 +6,15 @@ import json
 from pathlib import Path
 
 import pyarrow.parquet as pq
+import pytest
+from support import bag_mappings, bags
 from support.export import export, make_run
+from support.external import TOP, make_external, write_external
 from support.mcap import rewritten
 from support.recording import write_episode
 
 from demorec.mcap import Recording
+from demorec.sources import import_run
 
 
 def test_a_card_names_the_command_that_makes_the_dataset_again(tmp_path: Path) -> None:
@@ -50,3 +54,30 @@ def test_nothing_foreign_acts_in_a_card(tmp_path: Path) -> None:
         assert acting not in card
     assert r"- \# &lt;script&gt;alert(1)&lt;/script&gt;" in card
     assert pq.read_table(tmp_path / "d/meta/tasks.parquet").column("task").to_pylist() == [hostile]
+
+
+@pytest.mark.parametrize("kind", ["bag", "recorder"])
+def test_a_card_claims_nothing_of_imported_data(kind: str, tmp_path: Path) -> None:
+    if kind == "bag":
+        bag = bags.write_mcap(bags.in_order(bags.so101(1.6)), tmp_path / "stack.mcap")
+        derived = bag_mappings.SO101.replace(
+            'topic = "/leader/joint_states"\nfield = "position"', 'next = "observation.state"'
+        )
+        mapping = bag_mappings.write_mapping(derived, tmp_path / "m.toml")
+        import_run.import_bags([bag], mapping, tmp_path / "run")
+    else:
+        write_external(tmp_path / "run.mcap", make_external(cameras=(TOP,)))
+    (source,) = tmp_path.glob("run*")
+    export(source, tmp_path / "d")
+    card = (tmp_path / "d" / "README.md").read_text()
+    for claim in (
+        "license:",
+        "ecorded and exported by demorec",
+        "as it was recorded",
+        "as it came",
+        "that was recorded",
+    ):
+        assert claim not in card
+    assert kind == "recorder" or "| `action` | float32 | [6] | observation.state of the next frame |" in card
+    export(source, tmp_path / "licensed", license="cc-by-4.0")
+    assert "license: cc-by-4.0" in (tmp_path / "licensed" / "README.md").read_text()

@@ -17,7 +17,7 @@ from demorec.core.targets import OptionalTarget
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
-    from demorec.datasets.editing.plan import Plan
+    from demorec.datasets.editing.plan import EpisodeSlice, Plan
     from demorec.datasets.lerobot.folder import LeRobotFolder
 
 MAX_SHOWN = 20
@@ -50,6 +50,10 @@ class Edit:
         """The new dataset."""
         raise NotImplementedError
 
+    def has_work(self, sources: Sequence[LeRobotFolder]) -> bool:
+        """Whether there is anything to write; says so otherwise."""
+        return True
+
     def part_names(self) -> Sequence[str]:
         """Names of the new datasets within --out; "" for --out itself."""
         return [""]
@@ -67,6 +71,9 @@ class Edit:
         if self.out is None and not self.dry_run:
             raise ConfigError("Name the folder of the new dataset (--out NEW), or ask what it would be (--dry-run).")
         sources = self.sources()
+        say(*(note for source in sources for note in source.notes))
+        if not self.has_work(sources):
+            return 0
         outs = [self.out / name for name in self.part_names()] if self.out is not None else []
         refuse_inside(outs)
         if outs and not self.dry_run:
@@ -102,10 +109,14 @@ class Edit:
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)
-        text = f"{begin}{len(plan.cuts)} of {counted(len(lengths), 'episode')}, {frames} of {sum(lengths)} frames"
-        place = str(self.out / name) if self.out is not None else name
         numbers = [cut.episode for cut in plan.cuts]
-        if self.dry_run and len(plan.sources) == 1 and numbers != list(range(len(lengths))):
+        is_in_parts = len(plan.sources) == 1 and len(set(numbers)) < len(numbers)
+        count = f"{len(plan.cuts)} of {counted(len(lengths), 'episode')}"
+        if is_in_parts:
+            count = f"{len(plan.cuts)} parts of {counted(len(lengths), 'episode')}"
+        text = f"{begin}{count}, {frames} of {sum(lengths)} frames"
+        place = str(self.out / name) if self.out is not None else name
+        if self.dry_run and len(plan.sources) == 1 and not is_in_parts and numbers != list(range(len(lengths))):
             say(f"episodes {_listed(numbers)}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
         if unknown := unknown_files(plan.sources[0]) if len(plan.sources) == 1 else ():
@@ -139,9 +150,15 @@ def _changes(plan: Plan) -> list[str]:
             )
     if new := sum(bool(cut.task) for cut in plan.cuts):
         lines.append(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
+    parts: dict[tuple[int, int], list[EpisodeSlice]] = {}
     for cut in plan.cuts:
-        length = plan.sources[cut.source].places[cut.episode].length
-        if (cut.first, cut.last) != (0, length):
+        parts.setdefault((cut.source, cut.episode), []).append(cut)
+    for (number, episode), cuts in parts.items():
+        length, cut = plan.sources[number].places[episode].length, cuts[0]
+        if not cut.has_end:
+            shown = [f"{part.first}:{part.last}" for part in cuts[:MAX_SHOWN]] + ["..."] * (len(cuts) > MAX_SHOWN)
+            lines.append(f"episode {episode}: {len(cuts)} parts of {length} frames, {', '.join(shown)}")
+        elif (cut.first, cut.last) != (0, length):
             head = counted(cut.first, "frame")
             lines.append(f"episode {cut.episode}: {head} cut at the beginning, {length - cut.last} at the end")
     return list(dict.fromkeys(lines))

@@ -47,7 +47,7 @@ class Score:
 
         leave_pandas_out()
         folder = LeRobotFolder(dataset_at(self.dataset), named=self.roles.named)
-        tell(*folder.roles.notes())
+        tell(*folder.notes, *folder.roles.notes())
         found = score_dataset(folder) if self.out is None else self._written(folder, self.out)
         if self.json:
             say_json(to_json(found))

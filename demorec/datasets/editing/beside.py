@@ -20,7 +20,7 @@ from demorec.core.plain import parse_json, to_json
 from demorec.datasets.editing.plan import EpisodeSlice, Plan
 from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
-from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, tables_in
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.rows import IndexedRows
@@ -116,6 +116,7 @@ class SidecarReader:
         self._poses = IndexedRows(tables, rows=_ROWS_AT_ONCE)
         found = {name: self._source.boxes(mapping.feature) for name, mapping in plan.mappings[number].items()}
         self._boxes = {name: boxes for name, boxes in found.items() if boxes is not None}
+        self._begun: set[int] = set()
 
     def boxes(self, cut: EpisodeSlice) -> dict[str, SeenByCamera]:
         """Return camera feature -> visible objects of an episode."""
@@ -135,10 +136,16 @@ class SidecarReader:
             row["phases"] = _cut_phases(row, cut)
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
+        attempt = source.attempts.own.get(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
+        if not cut.has_end:  # a part of which nobody said whether it succeeded
+            row["success"] = None
+            attempt = {**attempt, "success": None}
+        failed = () if index in self._begun else source.attempts.failed.get(index, ())
+        self._begun.add(index)
         return EpisodeRecord(
             row=row,
-            attempt=source.attempts.own.get(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names},
-            failed=source.attempts.failed.get(index, ()),
+            attempt=attempt,
+            failed=failed,
             moving_cameras=self._camera_poses(cut, index),
             robot=None if robot is None else source.robot(str(robot)),
         )
@@ -214,10 +221,17 @@ def copied_files(plan: Plan) -> tuple[str, ...]:
 
 
 def unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
-    """List the files, links aside, that a dataset does not use and whose names do not say what they are."""
+    """List the files, links aside, that a dataset does not use and whose names do not say what they are.
+
+    Tables among those of rows and episodes are left out: LeRobot would read a copy as part of the dataset.
+    """
     root, used = source.root, _used_files(source)
     strange = [name for name in _files_below(root) if not is_dataset_file(name) and root / name not in used]
-    return tuple(name for name in strange if not (root / name).is_symlink())
+    return tuple(name for name in strange if not (root / name).is_symlink() and not _is_stray_table(name))
+
+
+def _is_stray_table(name: str) -> bool:
+    return name.startswith(("data/", "meta/episodes/")) and name.endswith(".parquet")
 
 
 def _used_files(source: LeRobotFolder) -> set[Path]:
@@ -233,7 +247,7 @@ def _files_below(root: Path) -> list[str]:
 
 
 def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
-    for path in tables_in(root, "data"):
+    for path in plan.sources[number].data_tables:
         for name in open_table(path).schema_arrow.names:
             if name not in plan.sources[number].info.features:
                 yield name, f"{INFO_PATH} does not list this column of the data files"
@@ -270,7 +284,8 @@ def _scenes(plan: Plan) -> Iterator[str]:
     lost = 0
     for number, source in enumerate(plan.sources if changed else ()):
         scenes = {row["episode_index"] for row in source.sidecar(["root_seed"]) if row["root_seed"] is not None}
-        lost += sum(source.places[cut.episode].episode_index in scenes for cut in changed if cut.source == number)
+        indices = {source.places[cut.episode].episode_index for cut in changed if cut.source == number}
+        lost += len(indices & scenes)
     if lost:
         yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
 

@@ -104,7 +104,8 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
     found += [*statistics_differences(sources, shared, found, is_reordered=result.is_reordered),
               *episode_statistics_differences(sources, shared, found, pairs)]  # fmt: skip
     found.sort(key=lambda item: LEVELS.index(item.level))
-    return replace(result, differences=tuple(found), notes=tuple(_notes(sources, result, found)))
+    read = [f"{side}: {note}" for side, source in zip("AB", sources, strict=True) for note in source.notes]
+    return replace(result, differences=tuple(found), notes=(*read, *_notes(sources, result, found)))
 
 
 def _contents(

@@ -6,7 +6,8 @@ from collections.abc import Iterator, Mapping, Sequence
 from itertools import chain
 from typing import Any
 
-from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches, tables_in
+from demorec.datasets.lerobot.episode_table import has_episode_table
+from demorec.datasets.lerobot.files import open_table, read_json_lines, table_batches
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH
 from demorec.datasets.lerobot.stats import NAMES
@@ -29,7 +30,9 @@ def episode_columns(folder: LeRobotFolder) -> list[dict[str, Any]]:
         }
         for place in folder.places
     ]
-    more = read_json_lines(folder.root / OLD_EPISODES_PATH) if folder.info.is_old else episode_facts(folder)
+    more = episode_facts(folder)
+    if folder.info.is_old and has_episode_table(folder.root, folder.info):
+        more = read_json_lines(folder.root / OLD_EPISODES_PATH)
     sidecar = {row["episode_index"]: row for row in folder.sidecar(_SIDECAR)}
     for row, facts in zip(found, more, strict=True):
         known = {**sidecar.get(row["episode_index"], {}), **facts}
@@ -39,10 +42,10 @@ def episode_columns(folder: LeRobotFolder) -> list[dict[str, Any]]:
 
 def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
     """Read the columns of the episodes' table beyond LeRobot's own, for each episode in order."""
-    if folder.info.is_old:
+    if folder.info.is_old or not has_episode_table(folder.root, folder.info):
         return [{} for _ in folder.places]
     found: list[dict[str, Any]] = []
-    for path in tables_in(folder.root, "meta/episodes"):
+    for path in folder.episode_tables:
         there = open_table(path).schema_arrow.names
         for batch in table_batches(path, ["episode_index", *(name for name in folder.fact_types if name in there)]):
             found += batch.to_pylist()
@@ -58,7 +61,7 @@ def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterat
             if isinstance(stats, dict) and isinstance(number, int):
                 yield from ((number, name, stats[name]) for name in features if isinstance(stats.get(name), dict))
         return
-    for path in tables_in(folder.root, "meta/episodes"):
+    for path in folder.episode_tables:
         there = set(open_table(path).schema_arrow.names)
         columns = {name: [f"stats/{name}/{key}" for key in NAMES] for name in features}
         complete = {name: wanted for name, wanted in columns.items() if there.issuperset(wanted)}

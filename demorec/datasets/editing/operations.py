@@ -12,8 +12,8 @@ import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
 from demorec.core.registry import check_choice, nearest_match
+from demorec.datasets.editing.cut import WatchedNumbers
 from demorec.datasets.editing.plan import FeatureMapping, Plan
-from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 
@@ -116,27 +116,15 @@ def trim_idle(source: LeRobotFolder, features: Sequence[str], threshold: float, 
         threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
         margin: Frames that stay at either end.
     """
-    numeric = [name for name in _own(source) if source.info.features[name].is_numeric]
-    for feature in features:
-        check_choice("feature of numbers", feature, numeric)
+    watched = WatchedNumbers(source, features)
     if not 0 < threshold <= 1:
         raise OptionError("idle_threshold", f"is {threshold}, allowed are shares above 0 and up to 1.")
     check_option("idle_margin", margin, 0, 2**63 - 1, "frames")
     plan = Plan.whole(source)
-    rows = source.rows(features)
-
-    def numbers() -> Any:
-        for cut in plan.cuts:
-            table = rows.read(source.places[cut.episode])
-            columns = [column_numbers(table.column(feature).combine_chunks()) for feature in features]
-            yield cut, np.hstack(columns).astype(np.float64)
-
-    low, high = np.inf, -np.inf
-    for _, values in numbers():
-        low, high = np.minimum(low, values.min(axis=0)), np.maximum(high, values.max(axis=0))
-    least = threshold * np.asarray(high - low)
+    least = threshold * watched.ranges()
     cuts = []
-    for cut, values in numbers():
+    for cut in plan.cuts:
+        values = watched.episode(cut.episode)
         # Where it came to, against where it began and ends: slow motion counts as well.
         away_from_start = np.flatnonzero((np.abs(values - values[0]) > least).any(axis=1))
         away_from_end = np.flatnonzero((np.abs(values - values[-1]) > least).any(axis=1))

@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.files import open_table, tables_in
+from demorec.datasets.lerobot.files import open_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
@@ -36,7 +36,7 @@ def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
     """
     numeric = {name: feature for name, feature in source.info.features.items() if feature.is_numeric}
     stored: dict[str, set[str]] = {}
-    for path in tables_in(source.root, "data"):
+    for path in source.data_tables:
         schema = open_table(path).schema_arrow
         for name in numeric:
             if name in schema.names:
@@ -96,6 +96,7 @@ class EpisodeSlice:
         source: Number of the dataset.
         episode: Number of the episode in it.
         task: Instruction instead of its own; "" for its own.
+        has_end: Whether it ends as the episode did; other parts of the episode do not.
     """
 
     source: int
@@ -103,6 +104,7 @@ class EpisodeSlice:
     first: int
     last: int
     task: str = ""
+    has_end: bool = True
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -31,7 +31,7 @@ from demorec.datasets.editing.plan import EpisodeSlice, FeatureMapping, Plan
 from demorec.datasets.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
 from demorec.datasets.lerobot.episode_table import EpisodePlace, are_on_grid
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
-from demorec.datasets.lerobot.files import column_numbers, tables_in
+from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
@@ -138,9 +138,9 @@ class _Reader:
         self._references = reference_columns(info)
         self._task_numbers = new_task_numbers(plan, number) if self._references else np.zeros(0, np.int64)
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
-        tables = tables_in(self.source.root, "meta/episodes") if self.source.fact_types else ()
+        tables = self.source.episode_tables if self.source.fact_types else ()
         self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
-        self._known = {} if decode else _kept_statistics(self.source)
+        self._known = {} if decode or not self.source.keeps_statistics else _kept_statistics(self.source)
         self._sidecar = SidecarReader(plan, number)
         self._has_sidecar = any(source.sidecar_tables("episodes") for source in plan.sources)
 
@@ -172,7 +172,7 @@ class _Reader:
                 video_info[name] = feature.info or stored.file.stream_info()
             else:
                 columns[name] = self._column(rows, mapping, feature)
-                if mapping.feature in _OF_THE_END and cut.last != place.length:
+                if mapping.feature in _OF_THE_END and cut.has_end and cut.last != place.length:
                     columns[name] = _with_end(columns[name], self._column(all_rows, mapping, feature))
             if feature.is_camera:
                 known = self._kept(place, mapping.feature) if whole else None
@@ -200,6 +200,8 @@ class _Reader:
         Those of a cut that begins with its episode stay to the bit. Of a later one, whose timestamps were measured, the
         first is subtracted in float64, and the result is rounded once.
         """
+        if not self.source.keeps_timestamps:
+            return None
         stored: NDArray[Any] = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
         if not cut.first:
             return stored
@@ -240,6 +242,8 @@ class _Reader:
 
     def _tasks(self, rows: pa.Table) -> list[str]:
         tasks, found = self.source.tasks, rows.column("task_index").to_numpy()
+        if found.dtype.kind == "f" and (found % 1 == 0).all():
+            found = found.astype(np.int64)
         if found.dtype.kind != "i" or found.min() < 0 or found.max() >= len(tasks):
             raise ExportError(f"A row names a task that is not in the table of tasks: {self.source.root}")
         first = tasks[found[0]]
@@ -271,6 +275,8 @@ class _Reader:
         facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
         if "duration_s" in facts:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
+        if "success" in facts and not cut.has_end:
+            facts["success"] = None
         if (cut.first, cut.last) != (0, place.length):
             facts |= _clipped_stages(facts, cut)
         return facts

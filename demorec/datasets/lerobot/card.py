@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -34,6 +35,8 @@ from demorec.episode.features import (
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""
+_OWN_LICENCE = "apache-2.0"
+"""Licence of what demorec simulated, unless the user names another one."""
 _MEANING = {
     **dict.fromkeys(AUTOMATIC_FEATURES, "filled in by LeRobot's rules"),
     "timestamp": "seconds since the episode's start",
@@ -71,8 +74,9 @@ _SIMULATED_ROWS = (
     "wall clock."
 )
 _RECORDED_ROWS = (
-    "Row t holds what was recorded at frame t, as it came. LeRobot's timestamps are multiples of the nominal "
-    "period; the frames' own stamps, and how old each sample was, are in the recordings."
+    "Row t holds what the recordings have at frame t; the table above says where each feature comes from. LeRobot's "
+    "timestamps are multiples of the nominal period; the frames' own stamps, and how old each sample was, are in the "
+    "recordings."
 )
 _SIMULATED_SIDECAR = (
     f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
@@ -84,24 +88,27 @@ _RECORDED_SIDECAR = (
 )
 
 
-def write_card(
-    root: Path,
-    info: DatasetInfo,
-    options: ExportOptions,
-    *,
-    meanings: Mapping[str, str],
-    is_transcoded: bool,
-) -> None:
-    """Write the card of a finished dataset folder.
+@dataclass(frozen=True, kw_only=True)
+class CardContent:
+    """What a card says beyond what the tables of the dataset hold.
 
-    Args:
+    Attributes:
+        options: Of the export.
         meanings: Feature -> its description in the recordings.
         is_transcoded: Whether any images were transcoded.
     """
+
+    options: ExportOptions
+    meanings: Mapping[str, str]
+    is_transcoded: bool
+
+
+def write_card(root: Path, info: DatasetInfo, content: CardContent) -> None:
+    """Write the card of a finished dataset folder."""
     there = root / CARD_PATH
     path = root / SECOND_CARD_PATH if has_own_card(root) else there
     path.unlink(missing_ok=True)
-    write_text(path, _marked("\n".join(_card(root, info, options, meanings, is_transcoded)) + "\n"))
+    write_text(path, _marked("\n".join(_card(root, info, content)) + "\n"))
 
 
 def has_own_card(root: Path) -> bool:
@@ -119,32 +126,21 @@ def _marked(text: str) -> str:
     return text + _MARK.format(digest=hashlib.sha256(text.encode()).hexdigest()[:16])
 
 
-def _card(
-    root: Path,
-    info: DatasetInfo,
-    options: ExportOptions,
-    meanings: Mapping[str, str],
-    is_transcoded: bool,
-) -> Iterable[str]:
+def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
     configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
-    sensed = {name: markdown(source) for name, source in meanings.items() if source}
-    meaning = {**_MEANING, **({**sensed, **_simulated_meaning(options)} if configs else {})}
+    options = content.options
+    is_simulated = bool(configs) and _all_simulated(root)
+    sensed = {name: markdown(source) for name, source in content.meanings.items() if source}
+    meaning = {**_MEANING, **sensed, **(_simulated_meaning(options) if is_simulated else {})}
     tasks = read_tasks(root)
-    minutes = info.total_frames / info.fps / 60
-    pictures = "some pictures were coded anew" if is_transcoded else "every video packet is the one that was recorded"
-    yield from ("---", f"license: {options.license}", "task_categories:", "- robotics")
-    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if configs else []))
+    licence = options.license or (_OWN_LICENCE if is_simulated else None)
+    yield "---"
+    if licence is not None:
+        yield f"license: {licence}"
+    yield from ("task_categories:", "- robotics")
+    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if is_simulated else []))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
-    yield from (f"# {options.repo_id}", "")
-    robot, plural = markdown(str(info.robot_type)), "" if info.total_episodes == 1 else "s"
-    kind = f"demonstration{plural} of {robot}"
-    if configs:
-        kind = f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
-    yield (
-        f"{info.total_episodes} {kind}, "
-        f"{info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the LeRobot v3.0 format. Recorded "
-        f"and exported by demorec; {pictures}."
-    )
+    yield from (f"# {options.repo_id}", "", _summary(info, content, is_simulated=is_simulated))
     yield from ("", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:20]))
     if len(tasks) > 20:
         yield f"- and {len(tasks) - 20} more"
@@ -156,13 +152,35 @@ def _card(
         name = f"`{key}`" if markdown(key) == key else markdown(key)
         yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_feature_meaning(key, item, meaning)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
-    yield from (_SIMULATED_ROWS if configs else _RECORDED_ROWS, "")
+    yield from (_SIMULATED_ROWS if is_simulated else _RECORDED_ROWS, "")
     yield from _success_section(root)
-    yield from ("## What stands beside", "", _SIMULATED_SIDECAR if configs else _RECORDED_SIDECAR)
+    yield from ("## What stands beside", "", _SIMULATED_SIDECAR if is_simulated else _RECORDED_SIDECAR)
     yield from _robot_section(root)
     yield ""
     if configs:
         yield from _origin_section(root, configs, options)
+
+
+def _all_simulated(root: Path) -> bool:
+    """Whether the sidecar has a seed of every episode, which those of other robots and programs lack."""
+    return all(row["root_seed"] is not None for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"]))
+
+
+def _summary(info: DatasetInfo, content: CardContent, *, is_simulated: bool) -> str:
+    """Say in one paragraph what the dataset holds and where it comes from."""
+    robot, plural = markdown(str(info.robot_type)), "" if info.total_episodes == 1 else "s"
+    minutes = info.total_frames / info.fps / 60
+    kind, origin = f"demonstration{plural} of {robot}", "Exported by demorec"
+    if is_simulated:
+        kind = f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
+        origin = "Recorded and exported by demorec"
+    pictures = "some images were encoded again"
+    if not content.is_transcoded:
+        pictures = f"every video packet is the one that {'was recorded' if is_simulated else 'the recordings hold'}"
+    return (
+        f"{info.total_episodes} {kind}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the "
+        f"LeRobot v3.0 format. {origin}; {pictures}."
+    )
 
 
 def _robot_section(root: Path) -> Iterable[str]:
@@ -190,7 +208,7 @@ def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str])
         return "distance along the optical axis, 12-bit logarithmic codes of 0.01 to 10 m; 0.01 m: nothing was hit"
     if key.startswith(IMAGE_PREFIX):
         return f"camera {markdown(key.removeprefix(IMAGE_PREFIX))}, RGB"
-    return meaning.get(key, "as it was recorded")
+    return meaning.get(key, "as in the recordings")
 
 
 def _origin_section(root: Path, configs: Mapping[str, Any], options: ExportOptions) -> Iterable[str]:

@@ -62,6 +62,11 @@ class EpisodePlace:
     videos: dict[str, tuple[Path, int]]
 
 
+def has_episode_table(root: Path, info: DatasetInfo) -> bool:
+    """Whether the dataset has a table of episodes, which recordings that were never finalized lack."""
+    return (root / OLD_EPISODES_PATH).exists() if info.is_old else bool(tables_in(root, "meta/episodes"))
+
+
 def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     """Read the place of every episode in order. Raises ExportError if a table cannot be read."""
     columns = ["episode_index", "length", "tasks", "data/chunk_index", "data/file_index", "dataset_from_index"]
@@ -78,7 +83,7 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
     @cache  # many episodes share a file
     def file(template: str, key: str, chunk: int, number: int) -> Path:
         path = root / FilePosition(chunk=chunk, file=number).path(template, key)
-        return path if path.exists() else _elsewhere(root, path, key) or path
+        return path if path.exists() else elsewhere(root, path, key) or path
 
     for path, row in rows:
         _check_row(row, path)
@@ -100,7 +105,7 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
         )
 
 
-def _elsewhere(root: Path, path: Path, key: str) -> Path | None:
+def elsewhere(root: Path, path: Path, key: str) -> Path | None:
     """Find the only file of this name, and of a camera in a folder of its name, where info.json names other folders."""
     found = [other for other in root.rglob(path.name) if not key or key in other.relative_to(root).parts]
     if len(found) > 1:

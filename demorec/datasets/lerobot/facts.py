@@ -27,7 +27,7 @@ import pyarrow.parquet as pq
 
 from demorec.annotate.progress import StageRun, dense_stages, progress, proportions
 from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
+from demorec.datasets.lerobot.files import open_table, rows_in
 
 if TYPE_CHECKING:
     from demorec.episode.episode import SuccessCheck
@@ -112,13 +112,12 @@ def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
     return {name: _TYPES.get(name, pa.float64()) for name in names}
 
 
-def fact_columns(root: Path) -> dict[str, pa.DataType]:
-    """Return column of the table of episodes beyond LeRobot's own -> type; empty before v3.0.
+def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
+    """Return column of the table of episodes, in these files, beyond LeRobot's own -> type.
 
     Raises:
         ExportError: The table is damaged.
     """
-    tables = tables_in(root, "meta/episodes")
     schema = open_table(tables[0]).schema_arrow if tables else ()
     return {item.name: item.type for item in schema if not _LEROBOT_COLUMN.match(item.name)}
 

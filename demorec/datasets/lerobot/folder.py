@@ -12,6 +12,7 @@ Files are opened when something of them is asked for, so that a missing or damag
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, lru_cache
 from pathlib import Path
@@ -20,12 +21,13 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.datasets.lerobot.episode_table import EpisodePlace, read_episode_table, read_tasks
+from demorec.datasets.lerobot.episode_table import EpisodePlace, has_episode_table, read_episode_table, read_tasks
 from demorec.datasets.lerobot.files import open_table, read_json, table_batches, tables_in
 from demorec.datasets.lerobot.language import COLUMNS
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.rows import DataRows, IndexedRows
+from demorec.datasets.lerobot.row_episodes import REPAIR, places_by_rows, relocated
+from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, IndexedRows
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
 # What reads videos, images, robots and the sidecar takes longer to load than to read the numbers of most datasets.
@@ -42,6 +44,7 @@ _MAX_LISTED = 50
 """Episodes that a sentence names."""
 _MAX_OPEN_VIDEOS = 16
 """Video files of which the index is kept: that of 15 minutes takes one MB."""
+_BY_ROWS = f"they were found by the episode_index of the rows ({REPAIR} writes the table again)."
 _KNOWN = ("source", "success", "failure_reason", "root_seed", "cameras", "robot_digest")
 """Columns of the sidecar that recordings of other robots can hold; the rest is of simulated episodes alone."""
 
@@ -53,19 +56,33 @@ class LeRobotFolder:
         root: Its folder.
         motors: The servos whose values its state and actions are, if the user says so.
         named: Features whose role the user names.
+        info: What meta/info.json should say, instead of what it says.
 
     Attributes:
         root, motors: As given.
         info: The content of meta/info.json.
+        own_counters: Columns that prove whose rows are read, where the files have them.
+        keeps_timestamps: Whether edits keep the timestamps that are not multiples of 1/fps.
+        keeps_statistics: Whether edits keep the stored statistics of images.
 
     Raises:
         ConfigError: The dataset has no state of these servos.
         ExportError: info.json is missing or damaged. Methods and properties raise it where other files are.
     """
 
-    def __init__(self, root: Path, motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
+    def __init__(
+        self,
+        root: Path,
+        motors: Motors | None = None,
+        named: NamedRoles = NO_NAMES,
+        *,
+        info: DatasetInfo | None = None,
+    ) -> None:
         self.root, self.motors, self._named = root, motors, named
-        self.info = DatasetInfo.load(root)
+        self.info = DatasetInfo.load(root) if info is None else info
+        self.own_counters: tuple[str, ...] = OWN_COUNTERS
+        self.keeps_timestamps = True
+        self.keeps_statistics = True
         if motors is not None and self.roles.elements(self.roles.state) != motors.names:
             raise ConfigError(
                 f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
@@ -89,8 +106,35 @@ class LeRobotFolder:
 
     @cached_property
     def listed(self) -> tuple[EpisodePlace, ...]:
-        """The episodes of the episodes' table, in order."""
-        return tuple(read_episode_table(self.root, self.info))
+        """The episodes of the episodes' table, or found by the rows where it is missing or names other files."""
+        return self._listed_and_problem[0]
+
+    @property
+    def is_found_by_rows(self) -> bool:
+        """Whether the table of episodes is missing or wrong, and the episodes were found by their rows."""
+        return self._listed_and_problem[1] != ""
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what the dataset lacks and was found by the rows; none if they cannot be read."""
+        problem = ""
+        with suppress(ExportError):
+            problem = self._listed_and_problem[1]
+        absent = ", ".join(self.info.unlisted)
+        missing = f"The rows have no {absent}, and are taken in their order ({REPAIR} adds it)." if absent else ""
+        return tuple(note for note in (problem, missing) if note)
+
+    @cached_property
+    def _listed_and_problem(self) -> tuple[tuple[EpisodePlace, ...], str]:
+        if has_episode_table(self.root, self.info):
+            listed = tuple(read_episode_table(self.root, self.info))
+            with suppress(ExportError):  # a file that cannot be read is an error of its own episodes
+                if not self.info.is_old and (found := relocated(self.root, listed)) is not None:
+                    moved = sum(a.data != b.data for a, b in zip(listed, found, strict=True))
+                    return found, f"The table of episodes names wrong data files for {moved} of them: {_BY_ROWS}"
+            return listed, ""
+        found = places_by_rows(self.root, self.info, self.tasks) if tables_in(self.root, "data") else ()
+        return found, f"The dataset has no table of episodes: {_BY_ROWS}" if found else ""
 
     @property
     def missing(self) -> str:
@@ -101,7 +145,8 @@ class LeRobotFolder:
             return ""
         return (
             f"The dataset is not whole: {INFO_PATH} counts {counted[0]} episodes of {counted[1]} frames, its table of "
-            f"episodes has {listed[0]} of {listed[1]}. Complete the recording or the download: {self.root}"
+            f"episodes has {listed[0]} of {listed[1]}. Complete the recording or the download, or let {REPAIR} keep "
+            f"what is whole: {self.root}"
         )
 
     @cached_property
@@ -138,7 +183,14 @@ class LeRobotFolder:
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
-        return DataRows(self.info.features, self.num_rows, names, fps=self.info.fps, task_number=self._only_task_number)
+        return DataRows(
+            self.info.features,
+            self.num_rows,
+            names,
+            fps=self.info.fps,
+            task_number=self._only_task_number,
+            own=self.own_counters,
+        )
 
     def _only_task_number(self, place: EpisodePlace) -> int:
         """Number of the only task of an episode whose rows do not name one."""
@@ -148,6 +200,16 @@ class LeRobotFolder:
                 f"the table of episodes: {place.data}"
             )
         return self.tasks.index(place.tasks[0])
+
+    @cached_property
+    def data_tables(self) -> list[Path]:
+        """The data files, in order."""
+        return tables_in(self.root, "data")
+
+    @cached_property
+    def episode_tables(self) -> list[Path]:
+        """The files of the table of episodes, in order; none before v3.0."""
+        return [] if self.info.is_old else tables_in(self.root, "meta/episodes")
 
     @property
     def columns(self) -> list[str]:
@@ -227,7 +289,7 @@ class LeRobotFolder:
         """Columns of the episodes' table beyond LeRobot's own -> their types; empty before v3.0."""
         from demorec.datasets.lerobot.facts import fact_columns
 
-        return fact_columns(self.root)
+        return fact_columns(self.episode_tables)
 
     @cached_property
     def known(self) -> Mapping[int, dict[str, Any]]:

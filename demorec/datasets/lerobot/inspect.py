@@ -47,6 +47,7 @@ def dataset_problems(folder: LeRobotFolder) -> list[str]:
     places: Sequence[EpisodePlace] = ()
     with noted(problems, folder.root):
         places = folder.places
+        problems += folder.notes
     for file, listed in folder.num_rows.items() if places else ():
         with noted(problems, folder.root):
             if (there := open_table(file).metadata.num_rows) != listed:

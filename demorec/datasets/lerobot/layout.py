@@ -211,6 +211,7 @@ class DatasetInfo:
         other: Other entries of the file.
         version: Format of the dataset.
         unlisted: The features that were added.
+        splits: Splits to write; None for one of all episodes.
     """
 
     fps: int
@@ -227,6 +228,7 @@ class DatasetInfo:
     other: dict[str, Any] = field(default_factory=dict)
     version: str = CODEBASE_VERSION
     unlisted: tuple[str, ...] = ()
+    splits: Mapping[str, str] | None = None
 
     @property
     def is_old(self) -> bool:
@@ -247,7 +249,7 @@ class DatasetInfo:
             **{name: getattr(self, name) for name in _PLAIN_FIELDS},
             "video_path": self.video_path if self.video_keys else None,
             "robot_type": self.robot_type,
-            "splits": {"train": f"0:{self.total_episodes}"},
+            "splits": self.splits or {"train": f"0:{self.total_episodes}"},
             **self.other,
         }
         return json.dumps(data, indent=4, ensure_ascii=False) + "\n"
@@ -259,9 +261,17 @@ class DatasetInfo:
         Raises:
             ExportError: No info.json, or of another version of the format.
         """
-        path = root / INFO_PATH
         try:
-            data = read_json(path)
+            return cls.from_json(read_json(root / INFO_PATH), root)
+        except OSError as error:
+            raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
+        except ValueError as error:
+            raise ExportError(f"{INFO_PATH} of the dataset is damaged ({describe_error(error)}): {root}") from error
+
+    @classmethod
+    def from_json(cls, data: Any, root: Path) -> DatasetInfo:
+        """Take the content of the file apart, which is changed; errors as of `load`."""
+        try:
             version = data.pop("codebase_version")
             if version not in (CODEBASE_VERSION, *OLD_VERSIONS):
                 found = f"The dataset has format {reprlib.repr(version).strip("'")}"
@@ -277,8 +287,6 @@ class DatasetInfo:
                 known |= {name: _as_new(known[name]) for name in ("data_path", "video_path") if known.get(name)}
             info = cls(features=features, other=data, version=version, unlisted=unlisted, **known)
             info._check()
-        except OSError as error:
-            raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
         except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise ExportError(f"{INFO_PATH} of the dataset is damaged ({describe_error(error)}): {root}") from error
         return info

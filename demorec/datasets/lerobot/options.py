@@ -56,8 +56,8 @@ class ExportOptions(CommonOptions):
     """Upload the dataset to the Hugging Face Hub as --repo-id."""
     public: bool = False
     """Make an uploaded dataset public."""
-    license: str = "apache-2.0"
-    """Licence that the dataset card names."""
+    license: str | None = None
+    """Licence that the dataset card names (auto: apache-2.0 for simulated episodes, none for others)."""
     data_files_mb: float = 100
     """Size in MiB above which a new parquet file is begun."""
     video_files_mb: float = 200

@@ -21,7 +21,7 @@ from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
 
 _NUMBERS = ("float32", "float64", "int64", "bool")
-_OWN = ("episode_index", "frame_index")
+OWN_COUNTERS = ("episode_index", "frame_index")
 """Columns that prove whose rows these are."""
 _INDEX_ROWS = 4096
 
@@ -38,6 +38,7 @@ class DataRows:
         names: Columns to read.
         fps: Frames per second.
         task_number: Gives the number of an episode's task.
+        own: Columns that prove whose rows are read, where a file has them.
 
     Attributes:
         names: Columns to read.
@@ -53,17 +54,18 @@ class DataRows:
         *,
         fps: float,
         task_number: Callable[[EpisodePlace], int],
+        own: Sequence[str] = OWN_COUNTERS,
     ) -> None:
         if missing := [name for name in names if name not in features]:
             raise ExportError(f"The dataset has no {', '.join(missing)}, by {INFO_PATH}")
         self.names = list(names)
         self._features = {name: features[name] for name in names}
-        self._num_rows, self._fps, self._task_number = num_rows, fps, task_number
+        self._num_rows, self._fps, self._task_number, self._own = num_rows, fps, task_number, own
         kinds = {feature.dtype for feature in self._features.values()}
         max_rows = 16 if "image" in kinds else 64 if kinds & {"string", "language"} else 4096
         self._automatic = [name for name in names if name in AUTOMATIC_FEATURES]
         stored = [name for name in names if name not in AUTOMATIC_FEATURES]
-        self._tables = TableReader(stored, optional=[*self._automatic, *_OWN], rows=max_rows)
+        self._tables = TableReader(stored, optional=[*self._automatic, *own], rows=max_rows)
 
     def batches(self, place: EpisodePlace) -> Iterator[pa.RecordBatch]:
         """Yield the rows of an episode."""
@@ -75,7 +77,7 @@ class DataRows:
                 f"complete: {place.data}"
             )
         for batch in self._tables.read(place.data, place.first_row, place.length) if place.length else ():
-            _check_own(batch, place, found)
+            _check_own(batch, place, found, self._own)
             yield self._completed(batch, place, found)
             found += len(batch)
         if found < place.length:
@@ -148,11 +150,11 @@ def _implied(
     return first + frames * (name != "episode_index")
 
 
-def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int) -> None:
+def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequence[str]) -> None:
     """Raise ExportError unless a batch, the first row of which is the frame `begin`, has rows of this episode."""
     expected = {"episode_index": place.episode_index, "frame_index": np.arange(begin, begin + len(batch))}
     for name, numbers in expected.items():
-        if name not in batch.schema.names:
+        if name not in own or name not in batch.schema.names:
             continue
         with _column_errors(name, place):
             found = column_values(batch.column(name))[:, 0]

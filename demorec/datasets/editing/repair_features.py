@@ -1,0 +1,198 @@
+"""Features, rate and cameras in info.json, corrected by the columns of the rows and by the videos."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from demorec.core.errors import ExportError
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, table_batches
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
+from demorec.datasets.lerobot.mp4_index import mp4_index
+from demorec.datasets.lerobot.paths import INFO_PATH
+
+_COUNTS: dict[str, int] = {
+    "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1000, "data_files_size_in_mb": 100,
+    "video_files_size_in_mb": 200,
+}  # fmt: skip
+"""Counts of info.json, and the values used where one is impossible."""
+_MAX_COUNT = 1e9
+_TYPES = {"double": "float64", "float": "float32", "large_string": "string"}
+"""Arrow's name of a type -> LeRobot's, where they differ."""
+_DTYPES = frozenset(
+    ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool", "string")
+)
+_MAX_RATE_ERROR = 0.1
+"""Share by which the step of timestamps may differ from 1/fps; jitter of measured ones leaves the median within it."""
+_MAX_VIDEO_ERROR = 0.01
+_CODING = ("video.codec", "video.pix_fmt", "video.height", "video.width", "video.fps")
+
+Repaired = tuple[DatasetInfo, list[str]]
+"""Repaired info, and a sentence for each change."""
+
+
+def stated_info(root: Path) -> Mapping[str, Any]:
+    """Read info.json; ExportError if it is missing or damaged."""
+    try:
+        found = read_json(root / INFO_PATH)
+    except (OSError, ValueError):
+        found = None
+    if not isinstance(found, dict):
+        raise ExportError(f"{INFO_PATH} cannot be read, without which rate and names are not known: {root}")
+    return found
+
+
+def usable_info(stated: Mapping[str, Any], root: Path) -> DatasetInfo:
+    """Take info.json apart, with impossible counts and splits left out; ExportError if more of it is damaged."""
+    data = dict(stated)
+    for name, default in _COUNTS.items():
+        if not _is_possible(name, data.get(name)):
+            data[name] = default
+    return DatasetInfo.from_json(data, root)
+
+
+def _is_possible(name: str, value: object) -> bool:
+    """Whether a count of info.json can be true; sizes of files may be parts of a MB."""
+    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _MAX_COUNT:
+        return False
+    if name.endswith("_in_mb"):
+        return value > 0
+    return value == int(value) and (value > 0 or name.startswith("total"))
+
+
+def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequence[Path]) -> Repaired:
+    """Let the features be those of columns and videos. Raises ExportError if data files differ in a feature's type."""
+    schemas = [open_table(path).schema_arrow for path in tables]
+    features = dict(info.features)
+    changes: list[str] = []
+    for name in dict.fromkeys(name for schema in schemas for name in schema.names):
+        found = _described(tables, schemas, name)
+        if (feature := features.get(name)) is not None and (not feature.is_numeric and feature.dtype != "string"):
+            continue
+        if found is None:
+            changes.append(f"The column {name} is left out: {schemas[0].field(name).type}, which no feature describes.")
+            continue
+        if name in AUTOMATIC_FEATURES:
+            if found.dtype != AUTOMATIC_FEATURES[name].dtype and not _is_precise(name, found):
+                features.pop(name, None)
+            continue
+        if feature is None:
+            changes.append(f"{name} becomes a feature: the rows have it as {found.dtype} of shape {found.shape}.")
+            features[name] = found
+        elif (feature.dtype, math.prod(feature.shape)) != (found.dtype, math.prod(found.shape)):
+            changes.append(
+                f"{name} is {found.dtype} of shape {found.shape} in the rows; info.json says {feature.dtype} of shape "
+                f"{feature.shape}."
+            )
+            names = feature.names if feature.names and (len(feature.names),) == found.shape else None
+            features[name] = replace(feature, dtype=found.dtype, shape=found.shape, names=names, written_names=names)
+        if found.shape == (1,) and pa.types.is_nested(schemas[0].field(name).type):
+            changes.append(f"{name} is a list of one value in the rows, and becomes that value.")
+    shown = {path.parent.name for path in videos} | {path.parent.parent.name for path in videos}
+    for name, feature in list(features.items()):
+        if feature.is_video and name not in shown and shown & set(info.video_keys):
+            changes.append(f"{name} is left out: the dataset has no video of it.")
+            del features[name]
+        elif name not in AUTOMATIC_FEATURES and not feature.is_video and any(name not in s.names for s in schemas):
+            changes.append(f"{name} is left out: no row has it.")
+            del features[name]
+        elif feature.names is None and feature.written_names:
+            changes.append(f"The names of {name} are left out: they are not those of {feature.shape[0]} elements.")
+            features[name] = replace(feature, written_names=None)
+    for name, fixed in AUTOMATIC_FEATURES.items():
+        own, there = features.get(name), all(name in schema.names for schema in schemas)
+        is_right = own is not None and own.shape == fixed.shape and (own.dtype == fixed.dtype or _is_precise(name, own))
+        if name in info.unlisted or not there or not is_right:
+            changes.append(f"{name} is {fixed.dtype} of shape {fixed.shape}, in each row.")
+        features[name] = fixed
+    return replace(info, features=features), changes
+
+
+def _is_precise(name: str, feature: DatasetFeature) -> bool:
+    """Whether a feature holds timestamps as float64, which LeRobot reads and edits keep."""
+    return name == "timestamp" and feature.dtype == "float64"
+
+
+def _described(tables: Sequence[Path], schemas: Sequence[pa.Schema], name: str) -> DatasetFeature | None:
+    """Describe a column as a feature; None if it holds neither numbers nor text."""
+    kinds = set()
+    for schema in schemas:
+        if name in schema.names:
+            kind = schema.field(name).type
+            while pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind):
+                kind = kind.value_type
+            kinds.add(_TYPES.get(str(kind), str(kind)))
+    if len(kinds) > 1:
+        raise ExportError(
+            f"The data files have {name} as {' and as '.join(sorted(kinds))}: leave it out first (demorec dataset "
+            f"drop-features): {tables[0].parent.parent}"
+        )
+    (dtype,) = kinds
+    path = next(path for path, schema in zip(tables, schemas, strict=True) if name in schema.names)
+    first = next(table_batches(path, [name], rows=1), None)
+    if dtype not in _DTYPES or first is None:
+        return None
+    shape = np.shape(first.column(0)[0].as_py()) or (1,)
+    return DatasetFeature(dtype=dtype, shape=shape)  # type: ignore[arg-type]
+
+
+def repaired_rate(info: DatasetInfo, table: Path, videos: Sequence[Path]) -> Repaired:
+    """Let fps be the rate of timestamps and videos, if these agree; ExportError if all three differ."""
+    if "timestamp" not in open_table(table).schema_arrow.names:
+        return info, []
+    seconds = np.concatenate([column_numbers(batch.column(0))[:, 0] for batch in table_batches(table, ["timestamp"])])
+    steps = np.diff(seconds.astype(np.float64))
+    steps = steps[np.isfinite(steps) & (steps > 0)]
+    step = float(np.median(steps)) if len(steps) else 1 / info.fps
+    rate = round(1 / step)
+    if abs(step * info.fps - 1) <= _MAX_RATE_ERROR or rate < 1:
+        return info, []
+    shown = _video_rate(videos)
+    if shown is not None and abs(shown / info.fps - 1) <= _MAX_VIDEO_ERROR:
+        return info, []  # then the timestamps are wrong
+    if shown is not None and abs(shown * step - 1) > _MAX_RATE_ERROR:
+        raise ExportError(
+            f"The rate is not known: info.json says {info.fps} frames per second, the timestamps {1 / step:.4g}, the "
+            f"videos {shown:.4g}. Correct fps in meta/info.json: {table}"
+        )
+    return replace(info, fps=rate), [f"fps is {rate}, as the timestamps have it; info.json says {info.fps}."]
+
+
+def _video_rate(videos: Sequence[Path]) -> float | None:
+    """Images per second of the first video that can be read; None without any."""
+    for path in videos:
+        with suppress(ExportError):
+            times = np.sort(mp4_index(path)[3])
+            if len(times) > 1 and times[-1] > times[0]:
+                return float((len(times) - 1) / (times[-1] - times[0]))
+    return None
+
+
+def repaired_cameras(folder: LeRobotFolder, images: Mapping[str, Sequence[tuple[Path, int]]]) -> Repaired:
+    """Let size and encoding of each camera be those of its first video."""
+    features = dict(folder.info.features)
+    changes: list[str] = []
+    for key in folder.info.video_keys:
+        file, feature = folder.open_video(images[key][0][0]), features[key]
+        size = (file.size[1], file.size[0])
+        shape = feature.shape
+        if size not in (shape[:2], shape[1:]):
+            shape = (*size, 1 if feature.is_depth else 3)
+            changes.append(f"{key} has images of {size[1]}x{size[0]} pixels; info.json says the shape {feature.shape}.")
+        info = dict(feature.info or {})
+        with suppress(ExportError):  # of a codec that recordings do not hold, nothing more is known
+            told = file.stream_info()
+            wrong = [name for name in _CODING if info.get(name) not in (None, told[name])]
+            for name in wrong:
+                changes.append(f"{name} of {key} is {told[name]}; info.json says {info[name]}.")
+                info[name] = told[name]
+        features[key] = replace(feature, shape=shape, info=info or None)
+    return replace(folder.info, features=features), changes

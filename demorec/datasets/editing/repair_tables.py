@@ -1,0 +1,189 @@
+"""Differences of tables, counts and statistics from the rows of a dataset."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from demorec.core.errors import ExportError, without_path
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.episode_table import EpisodePlace, read_tasks
+from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, FilePosition
+from demorec.datasets.lerobot.stats import NAMES, QUANTILES, Statistics, data_statistics
+
+if TYPE_CHECKING:
+    from demorec.datasets.editing.repair import RepairedDataset
+
+_MAX_ERROR = 0.05
+"""Standard deviations by which a stored statistic may be off, as `demorec check` allows."""
+_MIN_DEVIATION = 1e-4
+
+
+def table_changes(folder: RepairedDataset, stored: Mapping[int, EpisodePlace]) -> Iterator[str]:
+    """Yield a sentence for each kind of difference.
+
+    Args:
+        folder: The dataset as it should be.
+        stored: Episode index -> where the table of episodes says that it is; empty if it is written from the rows.
+    """
+    if stored:
+        yield from _places(folder, stored)
+        yield from _ends(folder)
+    yield from _paths(folder)
+    yield from _tasks(folder)
+    yield from _totals(folder)
+    yield from _strays(folder)
+    if not folder.info.is_old:
+        yield from _statistics(folder)
+
+
+def _places(folder: RepairedDataset, stored: Mapping[int, EpisodePlace]) -> Iterator[str]:
+    wrong: dict[str, int] = {}
+    for place in folder.listed:
+        told = stored.get(place.episode_index)
+        if told is None:
+            found = {"an entry": True}
+        else:
+            found = {
+                "length": told.length != place.length,
+                "the data file": (told.data, told.first_row) != (place.data, place.first_row),
+                "dataset_from_index": told.from_index != place.from_index,
+                "tasks": set(told.tasks) != set(place.tasks) and bool(place.tasks),
+                **{f"the images of {key}": told.videos[key] != place.videos[key] for key in place.videos},
+            }
+        for name in (name for name, is_wrong in found.items() if is_wrong):
+            wrong[name] = wrong.get(name, 0) + 1
+    for name, count in wrong.items():
+        yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
+    if gone := sorted(set(stored) - {place.episode_index for place in folder.listed}):
+        yield f"The table of episodes loses {len(gone)} episodes that have no rows, such as episode {gone[0]}."
+
+
+def _ends(folder: RepairedDataset) -> Iterator[str]:
+    """Compare the ends of rows and images in the table of episodes with their beginnings and the lengths."""
+    wrong: dict[str, int] = {}
+    for path in folder.episode_tables:
+        there = open_table(path).schema_arrow.names
+        ends = ["dataset_to_index", *(f"videos/{key}/to_timestamp" for key in folder.info.video_keys)]
+        for end in ends:
+            if end not in there:
+                wrong[end] = len(folder.listed)
+                continue
+            begin = end.replace("to_", "from_")
+            for row in read_table(path, ["length", begin, end]).to_pylist():
+                unit = 1 if end == "dataset_to_index" else folder.info.fps
+                is_right = row[end] is not None and abs((row[end] - row[begin]) * unit - row["length"]) < 0.5
+                wrong[end] = wrong.get(end, 0) + (not is_right)
+    for name, count in wrong.items():
+        if count:
+            yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
+
+
+def _paths(folder: RepairedDataset) -> Iterator[str]:
+    """Find paths of info.json that lead to no file; before v3.0, since others have the usual ones afterwards."""
+    last, info = folder.listed[-1], folder.info
+    position = FilePosition(chunk=last.episode_index // int(info.chunks_size), file=last.episode_index)
+    paths = {folder.root / position.path(info.data_path): last.data}
+    paths |= {folder.root / position.path(info.video_path or "", key): path for key, (path, _) in last.videos.items()}
+    if info.is_old and any(path != found for path, found in paths.items()):
+        yield "info.json names files that are not there: the paths are those of v3.0."
+
+
+def _tasks(folder: RepairedDataset) -> Iterator[str]:
+    try:
+        tasks = read_tasks(folder.root)
+        numbers = list(range(len(tasks)))
+        if not folder.info.is_old:
+            numbers = read_table(folder.root / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
+    except ExportError:
+        return  # a change already
+    if numbers != list(range(len(numbers))):
+        yield "The table of tasks is numbered from 0 on, in order."
+    elif not folder.info.is_old:
+        pandas = (open_table(folder.root / TASKS_PATH).schema_arrow.metadata or {}).get(b"pandas", b"{}")
+        if not json.loads(pandas).get("index_columns"):
+            yield "The table of tasks has the text as its index, where LeRobot looks for it."
+    total = folder.stated.get("total_tasks")
+    if total != len(numbers):
+        yield f"info.json says total_tasks {total}; the table of tasks has {len(numbers)}."
+
+
+def _totals(folder: RepairedDataset) -> Iterator[str]:
+    found = {
+        "total_episodes": len(folder.listed),
+        "total_frames": sum(place.length for place in folder.listed),
+    }
+    for name, count in found.items():
+        if folder.stated.get(name) != count:
+            yield f"info.json says {name} {folder.stated.get(name)}; the rows have {count}."
+    for name in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
+        usual = getattr(folder.info, name)
+        if not folder.info.is_old and folder.stated.get(name) != usual:
+            yield f"info.json says {name} {folder.stated.get(name)}; it is {usual} now."
+    if not has_possible_splits(folder.stated.get("splits"), len(folder.listed)):
+        yield f"splits of info.json are one, train, of all {len(folder.listed)} episodes."
+
+
+def has_possible_splits(splits: Any, episodes: int) -> bool:
+    """Whether splits are ranges of the episodes that do not overlap."""
+    if not isinstance(splits, dict) or not splits:
+        return False
+    try:
+        ranges = sorted(tuple(int(end) for end in text.split(":")) for text in splits.values())
+    except (ValueError, AttributeError):
+        return False
+    ends = [0, *(end for each in ranges for end in each)]
+    return all(len(each) == 2 for each in ranges) and ends == sorted(ends) and ends[-1] <= episodes
+
+
+def _strays(folder: RepairedDataset) -> Iterator[str]:
+    used = {path for place in folder.listed for path, _ in place.videos.values()}
+    for path in sorted(set((folder.root / "videos").rglob("*.mp4")) - used):
+        yield f"{path.relative_to(folder.root).as_posix()} is left out: no episode has images in it."
+
+
+def _statistics(folder: RepairedDataset) -> Iterator[str]:
+    """Compare the statistics with those of the rows."""
+    try:
+        stored = folder.statistics
+    except ExportError as error:
+        yield f"{STATS_PATH} is written from the rows: {without_path(error, folder.root)}"
+        return
+    features = {
+        name: feature for name, feature in folder.info.features.items()
+        if feature.is_numeric and name not in AUTOMATIC_FEATURES
+    }  # fmt: skip
+    found = data_statistics(folder.data_tables, features)
+    wrong = [name for name in features if not _is_close(stored.get(name), found[name])]
+    wrong += [name for name, feature in folder.info.features.items() if feature.is_camera and name not in stored]
+    if wrong:
+        yield f"{STATS_PATH} gets the statistics of {', '.join(wrong)} from the rows and images."
+
+
+def _is_close(stored: Mapping[str, Any] | None, found: Statistics) -> bool:
+    """Whether stored statistics are those of the rows; LeRobot's estimated quantiles lie between the extremes."""
+    try:
+        told = Statistics.from_json(stored or {})
+    except (ValueError, TypeError):
+        return False
+    if told is None or told.count != found.count:
+        return False
+    if any(told.values[name].shape != found.values[name].shape for name in NAMES if name != "count"):
+        return False
+    unknown = np.isnan(found.values["mean"])  # rows with a NaN have no true statistics
+    margin: Array = _MAX_ERROR * np.maximum(found.values["std"], _MIN_DEVIATION)
+    low, high = found.values["min"] - margin, found.values["max"] + margin
+    is_right = [(told.values[name] >= low) & (told.values[name] <= high) for name in QUANTILES]
+    is_right += [np.abs(told.values[name] - found.values[name]) <= margin for name in ("min", "max", "mean", "std")]
+    return all(bool((each | unknown).all()) for each in is_right)
+
+
+def stated_splits(folder: RepairedDataset) -> Mapping[str, str] | None:
+    """The splits that info.json says, if they are possible and the episodes keep their numbers."""
+    splits = folder.stated.get("splits")
+    is_kept = [place.episode_index for place in folder.listed] == list(range(len(folder.listed)))
+    return splits if is_kept and has_possible_splits(splits, len(folder.listed)) else None
