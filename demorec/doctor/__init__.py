@@ -1,0 +1,1 @@
+"""The doctor: what to know about a dataset before training on it, whoever recorded it."""

@@ -1,0 +1,477 @@
+"""Checks of numbers: missing ones, other units, jumps, sensors that stand still, velocities, quaternions."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.evidence import EpisodeEvidence, Evidence, joined, number_in_words, quaternion_places
+from demorec.doctor.robust import runs, without_gaps
+from demorec.doctor.units import MIN_UNIT_RATIO
+from demorec.episode.element_names import joint_of
+
+MIN_OTHERS = 3
+"""Episodes, at least, that one is compared with."""
+UNIT_FACTORS: Mapping[str, float] = {
+    "degrees instead of radians": math.degrees(1.0),
+    "millimetres instead of metres": 1000.0,
+    "per cent instead of shares": 100.0,
+    "encoder ticks instead of radians": 4096 / (2 * math.pi),
+    "encoder ticks instead of degrees": 4096 / 360,
+}
+"""Confusion of units -> factor of the values."""
+MIN_JUMP_RANGE = 0.15
+"""Share of an element's usual range, at least, that a jump covers."""
+MIN_JUMP_STEPS = 6.0
+"""Times the largest usual step, and the steps before and after it, that a jump is: motors accelerate over frames."""
+MIN_FROZEN_S = 0.4
+MIN_FROZEN_RANGE = 0.3
+"""Share of the usual range that the action covers while an element of the state stays the same to the last bit: dead
+bands and loads of hobby servos hold it back by less."""
+MIN_SAME_STATE = 5
+"""Frames, at least, of a frozen state."""
+VELOCITY_WINDOW_S = 0.3
+"""Time over which velocities are integrated: filters of drivers are 20 to 100 ms late, which cancels over longer."""
+MAX_VELOCITY_ERROR = 0.3
+"""Distance from one of the ratio of displacement and integrated velocity: filters and rounding change it by a tenth, the
+nearest wrong unit or rate by a half."""
+MAX_NORM_ERROR = 0.02
+"""Distance of a quaternion's length from one: float16 rounds to 0.001, interpolation between frames loses a hundredth."""
+
+
+@check(
+    family="numbers",
+    needs="numbers",
+    measures="numbers that are NaN or infinite",
+    unit="numbers",
+    why="One NaN makes the loss, and with it all weights, NaN; statistics of its column are lost.",
+    do=DROP,
+)
+def missing_numbers(evidence: Evidence) -> Iterator[Fault]:
+    """Count NaN and infinite numbers in every column of every frame.
+
+    They spoil these frames alone: all other checks go on with the numbers before them.
+    """
+    for episode in evidence.episodes:
+        counts: dict[str, int] = {}
+        frames: list[int] = []
+        for name, values in episode.columns.items():
+            if values.dtype.kind != "f":
+                continue
+            bad = ~np.isfinite(values)
+            if bad.any():
+                counts[name] = int(bad.sum())
+                frames += np.flatnonzero(bad.reshape(len(values), -1).any(axis=1)).tolist()
+        if counts:
+            yield Fault(
+                severity="broken",
+                episode=episode.number,
+                frames=(min(frames), max(frames)),
+                value=f"{sum(counts.values())} numbers",
+                message=f"NaN or infinite numbers in {', '.join(counts)}",
+            )
+
+
+@check(
+    family="numbers",
+    needs="state or action",
+    measures="episodes or columns in another unit",
+    unit="ratio",
+    why="Normalisation by the whole set squeezes all other episodes to nothing; targets of another unit are dangerous.",
+    do="convert the episode in the program that recorded it, or drop it: " + DROP,
+)
+def unit_mismatch(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the size of the numbers of each episode with that of the others, and of the state with its action.
+
+    Sizes are those of values and of ranges. Most elements must agree on a factor of at least seven.
+    """
+    evidence.need_state()
+    for number, ratios in evidence.other_units.items():
+        ratio = next(iter(ratios.values()))
+        yield Fault(
+            severity="broken",
+            episode=number,
+            value=f"{ratio:.3g} times",
+            message=f"its {' and '.join(ratios)} is {_in_words(ratio)} the size of the others' ({_confusion(ratio)})",
+        )
+    yield from _action_units(evidence)
+
+
+def _in_words(ratio: float) -> str:
+    return f"{ratio:.3g} times" if ratio >= 1 else f"1/{1 / ratio:.3g} of"
+
+
+def _confusion(ratio: float) -> str:
+    """The confusion of units whose factor is nearest, as words."""
+    size = max(ratio, 1 / ratio)
+    name, factor = min(UNIT_FACTORS.items(), key=lambda item: abs(math.log(item[1] / size)))
+    if abs(math.log(factor / size)) > math.log(1.6):
+        return "another unit or scale?"
+    if ratio < 1:
+        one, _, two = name.partition(" instead of ")
+        name = f"{two} instead of {one}"
+    return f"{name}?"
+
+
+def _action_units(evidence: Evidence) -> Iterator[Fault]:
+    """Whether targets have another unit than the state that follows them."""
+    try:
+        relation = evidence.relation
+    except NotMeasuredError:
+        return
+    if relation.kind != "target":
+        return
+    ratios = []
+    for number in relation.episodes:
+        episode = evidence.by_number[number]
+        assert episode.state is not None
+        assert episode.action is not None
+        state, action = episode.state[:, relation.elements], episode.action[:, relation.columns]
+        moved = np.ptp(state, axis=0) > 0
+        ratios.append(np.where(moved, action.std(axis=0) / np.maximum(state.std(axis=0), 1e-12), np.nan))
+    ratio = float(np.nanmedian(np.stack(ratios)))
+    if not 1 / MIN_UNIT_RATIO < ratio < MIN_UNIT_RATIO:
+        yield Fault(
+            severity="broken",
+            value=f"{ratio:.3g} times",
+            message=f"the action is {_in_words(ratio)} the size of the state that follows it ({_confusion(ratio)})",
+            do="convert one of the two in the program that recorded them",
+        )
+
+
+@check(
+    family="numbers",
+    needs="state",
+    measures="jumps of the state within one frame",
+    unit="% of the range",
+    why="No arm jumps: frames are missing, a reading failed, or two episodes were written as one.",
+    do="look at it: demorec view {path} --episodes {episode}; then cut or drop it: " + DROP,
+)
+def state_jumps(evidence: Evidence) -> Iterator[Fault]:
+    """Find steps several times as large as the largest usual one and as the steps before and after them.
+
+    Grippers are left out: they snap. A reading that jumps away and back counts too.
+    """
+    episodes = evidence.need_state(8)
+    arm = ~evidence.is_gripper
+    largest = [np.abs(np.diff(state, axis=0)).max(axis=0) for _, state in episodes]
+    typical = [np.quantile(np.abs(np.diff(state, axis=0)), 0.98, axis=0) for _, state in episodes]
+    limit = np.maximum(MIN_JUMP_STEPS * np.median(typical, axis=0), MIN_JUMP_RANGE * evidence.ranges)
+    if len(episodes) > MIN_OTHERS:
+        limit = np.maximum(limit, 2 * np.median(largest, axis=0))
+    for episode, state in episodes:
+        sizes = np.abs(np.diff(state, axis=0))
+        before = np.vstack([np.zeros_like(sizes[:1]), sizes[:-1]])
+        after = np.vstack([sizes[1:], np.zeros_like(sizes[:1])])
+        own = np.maximum(MIN_JUMP_STEPS * np.quantile(sizes, 0.98, axis=0), MIN_JUMP_RANGE * np.ptp(state, axis=0))
+        smaller, other = np.minimum(before, after), np.maximum(before, after)
+        spike = (other > 0.5 * sizes) & (smaller * MIN_JUMP_STEPS < sizes)
+        alone = other * MIN_JUMP_STEPS / 2 < sizes
+        jumps = (sizes > np.maximum(limit, own)) & (spike | alone) & arm & (evidence.ranges > 0)
+        if not jumps.any():
+            continue
+        frames = np.flatnonzero(jumps.any(axis=1))
+        places = np.unravel_index(int(np.argmax(np.where(jumps, sizes / np.maximum(limit, 1e-12), 0))), sizes.shape)
+        frame, element = int(places[0]), int(places[1])
+        share = sizes[frame, element] / max(evidence.ranges[element], 1e-12)
+        count = f" and {len(frames) - 1} more" if len(frames) > 1 else ""
+        yield Fault(
+            severity="broken" if len(frames) > 1 or share > 0.5 else "look",
+            episode=episode.number,
+            frames=(int(frames[0]) + 1, int(frames[-1]) + 1),
+            value=f"{share:.0%} of its range",
+            message=f"{_element(evidence, element)} jumps from {number_in_words(state[frame, element])} to "
+            f"{number_in_words(state[frame + 1, element])} within one frame (frame {frame + 1}{count})",
+        )
+
+
+def _element(evidence: Evidence, element: int) -> str:
+    name = evidence.elements[element]
+    return f"element {name} of the state" if name.isdigit() else name
+
+
+@check(
+    family="numbers",
+    needs="state",
+    measures="readings of the state that stop changing",
+    unit="s",
+    why="The policy sees a robot that does not move while it acts.",
+    do=DROP,
+)
+def frozen_state(evidence: Evidence) -> Iterator[Fault]:
+    """Find elements that keep their value to the last bit while their action moves on, and whole states that do.
+
+    Without an action, a whole state counts as frozen where it continues with a jump. An element that never changes in
+    any episode while its action does is a fault of the whole set.
+    """
+    episodes = evidence.need_state(8)
+    yield from _never_moving(evidence, episodes)
+    needed = max(MIN_SAME_STATE, round(MIN_FROZEN_S * evidence.fps))
+    for episode, state in episodes:
+        same = state[1:] == state[:-1]
+        fault = _frozen_element(evidence, episode, same, needed) or _frozen_whole(
+            evidence, episode, state, same, needed
+        )
+        if fault is not None:
+            yield fault
+
+
+def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:
+    for element, column in enumerate(evidence.action_of):
+        if column is None or evidence.is_gripper[element] or any(np.ptp(state[:, element]) for _, state in episodes):
+            continue
+        moved = [np.ptp(each.action[:, column]) for each, _ in episodes if each.action is not None]
+        others = [np.ptp(e.action[:, c]) for e, _ in episodes if e.action is not None for c in evidence.action_of if c]
+        if moved and np.median(moved) > 0.1 * np.median(others or [0.0]) > 0:
+            yield Fault(
+                severity="broken",
+                value="0",
+                message=f"{_element(evidence, element)} never changes although its action does",
+                do="record the joint's own position",
+            )
+
+
+def _frozen_element(evidence: Evidence, episode: EpisodeEvidence, same: NDArray[np.bool_], needed: int) -> Fault | None:
+    """The longest rest of an element of the arm in which its action covers much of the usual range."""
+    if episode.action is None:
+        return None
+    try:
+        kind = evidence.relation.kind
+    except NotMeasuredError:
+        return None
+    worst: Fault | None = None
+    longest = 0
+    lag = max(round(evidence.relation.usual_lag), 0)
+    for element, column in enumerate(evidence.action_of):
+        if column is None or evidence.is_gripper[element] or not evidence.ranges[element]:
+            continue
+        target = episode.action[:, column]
+        if kind == "increment":
+            gain = evidence.ranges[element] / max(_usual_sum(evidence, column), 1e-12)
+            target = np.cumsum(target) * gain
+        for first, end in runs(same[:, element]):
+            moved = float(np.ptp(target[max(first - lag, 0) : max(end + 1 - lag, 1)]))
+            if end - first >= max(needed, longest) and moved > MIN_FROZEN_RANGE * evidence.ranges[element]:
+                longest = end - first
+                worst = Fault(
+                    severity="broken",
+                    episode=episode.number,
+                    frames=(first, end),
+                    value=f"{evidence.seconds(end - first):.1f} s",
+                    message=f"{_element(evidence, element)} keeps one value for {evidence.seconds(end - first):.1f} s "
+                    "while its action moves",
+                )
+    return worst
+
+
+def _usual_sum(evidence: Evidence, column: int) -> float:
+    spans = [np.ptp(np.cumsum(e.action[:, column])) for e in evidence.episodes if e.action is not None and e.length]
+    return float(np.median(spans))
+
+
+def _frozen_whole(
+    evidence: Evidence, episode: EpisodeEvidence, state: Array, same: NDArray[np.bool_], needed: int
+) -> Fault | None:
+    """A rest of the whole state that ends with a jump, or in which the whole action moves."""
+    rests = [(first, end) for first, end in runs(same.all(axis=1)) if end - first >= needed]
+    alive = evidence.ranges > 0
+    for first, end in rests:
+        if end >= len(state) - 1:
+            continue
+        steps = np.abs(np.diff(state[:, alive], axis=0))
+        jump = steps[end] > np.maximum(4 * np.quantile(steps, 0.95, axis=0), 0.1 * evidence.ranges[alive])
+        if jump.mean() >= 0.5:
+            return Fault(
+                severity="broken",
+                episode=episode.number,
+                frames=(first, end),
+                value=f"{evidence.seconds(end - first):.1f} s",
+                message=f"the whole state keeps its values for {evidence.seconds(end - first):.1f} s, then jumps",
+            )
+    return None
+
+
+@check(
+    family="numbers",
+    needs="state",
+    measures="elements that are exactly zero throughout",
+    why="A converter that lacks a joint writes zeros: the policy learns nothing of it, and commands zero.",
+    do="compare the order of the joints in the recorder with the names in info.json",
+)
+def zero_elements(evidence: Evidence) -> Iterator[Fault]:
+    """Find elements of state and action that are exactly zero in all rows, beside others of the same arm that move.
+
+    An arm that rests as a whole is left out, and so are elements that rest at another value.
+    """
+    episodes = evidence.need_state()
+    zero = np.all([~state.any(axis=0) for _, state in episodes], axis=0)
+    groups = [_group(name) for name in evidence.elements]
+    acting = [e.action for e, _ in episodes if e.action is not None]
+    found = []
+    for element in np.flatnonzero(zero).tolist():
+        column = evidence.action_of[element]
+        if column is not None and any(action[:, column].any() for action in acting):
+            continue
+        peers = [k for k, group in enumerate(groups) if group == groups[element]]
+        if np.mean([evidence.ranges[k] > 0 for k in peers]) >= 0.5:
+            found.append(evidence.elements[element])
+    if found:
+        yield Fault(
+            severity="look",
+            value=f"{len(found)} of {len(evidence.elements)} elements",
+            message=f"state and action of {', '.join(found)} are exactly zero in all frames, and other joints move",
+        )
+
+
+def _group(name: str) -> str:
+    """The arm that an element belongs to: "left" or "right" if its name says so."""
+    words = joint_of(name).lower().replace(".", "_").replace("/", "_").split("_")
+    return next((word for word in words if word in ("left", "right", "l", "r")), "")
+
+
+@check(
+    family="numbers",
+    needs="state, velocity",
+    measures="velocities that are not those of the state",
+    unit="ratio",
+    why="A policy that sees both learns a contradiction; a wrong ratio shows a wrong rate or unit.",
+    do="compare units and rate of the two in the recorder",
+)
+def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
+    """Compare displacements with integrated velocities over 0.3 s, for each episode, by the median element.
+
+    Elements that hardly move are left out, and grippers, which start and stop within a few frames.
+    """
+    parts = evidence.roles.having("velocity")
+    columns = evidence.roles.in_state(parts) if parts and evidence.roles.state else []
+    known = [(k, c) for k, c in enumerate(columns) if c is not None and not evidence.is_gripper[k]]
+    if not known:
+        raise NotMeasuredError("no column has velocities of the state's elements")
+    window = max(2, round(VELOCITY_WINDOW_S * evidence.fps))
+    elements, places = (list(part) for part in zip(*known, strict=True))
+    ratios: dict[int, float] = {}
+    for episode, state in evidence.need_state(2 * window):
+        velocity = joined(parts, episode.columns)
+        if velocity is None:
+            continue
+        ratio = _velocity_ratio(state[:, elements], velocity[:, places] / evidence.fps, window)
+        if ratio is not None:
+            ratios[episode.number] = ratio
+    if not ratios:
+        raise NotMeasuredError("nothing moves long enough to compare it with its velocity")
+    overall = float(np.median(list(ratios.values())))
+    if abs(overall - 1) > MAX_VELOCITY_ERROR:
+        yield Fault(
+            severity="broken",
+            value=f"{overall:.2f} times",
+            message=f"the state moves {overall:.2f} times as far as its velocities say",
+        )
+        return
+    for number, ratio in ratios.items():
+        if abs(ratio - 1) > MAX_VELOCITY_ERROR:
+            yield Fault(
+                severity="broken",
+                episode=number,
+                value=f"{ratio:.2f} times",
+                message=f"its state moves {ratio:.2f} times as far as its velocities say",
+                do=DROP,
+            )
+
+
+def _velocity_ratio(state: Array, steps: Array, window: int) -> float | None:
+    """The median ratio over elements of displacement to integrated steps (T, K), None where nothing moves."""
+    course = np.cumsum((steps[1:] + steps[:-1]) / 2, axis=0)
+    integrated = course[window:] - course[:-window]
+    moved = state[1 + window :] - state[1:-window]
+    squares, total = (integrated**2).sum(axis=0), (moved**2).sum(axis=0)
+    alive = total > 0.05 * total.max(initial=0.0)
+    if not alive.any() or not total.max():
+        return None
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratios = np.where(squares > 0, (moved * integrated).sum(axis=0) / squares, 0.0)
+        explained = (moved * integrated).sum(axis=0) ** 2 / (squares * total)
+    if np.nanmedian(explained[alive]) < 0.5 and np.median(squares[alive]) > 0:
+        return 0.0
+    return float(np.median(ratios[alive]))
+
+
+@check(
+    family="numbers",
+    needs="quaternions",
+    measures="quaternions that are not of unit length",
+    unit="length",
+    why="It is not a rotation: the order of the elements is wrong, or one of them is missing.",
+    do="compare the order of the elements in the recorder with their names",
+)
+def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
+    """Measure the length of each four elements that are named x, y, z and w of one rotation."""
+    places = [
+        (name, place)
+        for name, column in evidence.roles.columns.items()
+        if column.is_vector
+        for place in quaternion_places(column.elements)
+    ]
+    if not places:
+        raise NotMeasuredError("no elements have the names of a quaternion")
+    for name, place in places:
+        worst: dict[int, float] = {}
+        for episode in evidence.episodes:
+            if name in episode.columns and evidence.roles.of[name] not in ("command", "action"):
+                four = without_gaps(episode.columns[name])[:, place : place + 4]
+                error = np.abs(np.linalg.norm(four, axis=1) - 1)
+                worst[episode.number] = float(np.median(error))
+        bad = {number: error for number, error in worst.items() if error > MAX_NORM_ERROR}
+        if len(bad) > len(worst) / 2:
+            number, error = max(bad.items(), key=lambda item: item[1])
+            yield Fault(
+                severity="broken",
+                value=f"{error:.2f} off 1",
+                message=f"the quaternion in {name} is not of unit length in {len(bad)} of {len(worst)} episodes",
+            )
+            continue
+        for number, error in bad.items():
+            yield Fault(
+                severity="broken",
+                episode=number,
+                value=f"{error:.2f} off 1",
+                message=f"its quaternion in {name} is not of unit length",
+                do=DROP,
+            )
+
+
+@check(
+    family="numbers",
+    needs="state, the robot's URDF",
+    measures="positions beyond the joints' limits",
+    unit="rad, m",
+    why="The numbers are not those of this robot: another unit, order of joints, or zero.",
+    do="compare units and zero positions with the URDF; name servos by --motor-units",
+)
+def joint_limits(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the state with the limits of the robot's URDF.
+
+    The robot is that of the recording or the sidecar, the one named by --urdf or --motor-units, or a known one whose
+    joints have the names of the state's elements. Up to 0.1 rad or m beyond is calibration.
+    """
+    arm = evidence.arm
+    known = np.flatnonzero(np.isfinite(arm.lower) | np.isfinite(arm.upper))
+    if not len(known):
+        raise NotMeasuredError("the URDF has no limits of the state's joints")
+    for episode, state in evidence.need_state():
+        beyond = np.maximum(np.maximum(arm.lower - state, state - arm.upper), 0.0)[:, known]
+        frame, place = np.unravel_index(int(beyond.argmax()), beyond.shape)
+        worst = float(beyond[frame, place])
+        if worst > 0.1:
+            frames = np.flatnonzero((beyond > 0.1).any(axis=1))
+            yield Fault(
+                severity="broken" if worst > 0.5 else "look",
+                episode=episode.number,
+                frames=(int(frames[0]), int(frames[-1])),
+                value=f"{worst:.2f} rad",
+                message=f"{evidence.elements[known[place]]} is {worst:.2f} rad or m beyond its limit",
+            )

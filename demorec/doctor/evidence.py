@@ -1,0 +1,242 @@
+"""What the checks look at: every episode read once, its numbers by role, its images as small grey thumbnails."""
+
+from __future__ import annotations
+
+import math
+import shlex
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array, signs_of_course
+from demorec.doctor.base import NotMeasuredError
+from demorec.doctor.robust import without_gaps
+from demorec.episode.roles import Roles
+
+if TYPE_CHECKING:
+    from demorec.datasets.lerobot.folder import LeRobotFolder
+    from demorec.doctor.arm import Arm
+    from demorec.doctor.relation import ActionRelation
+    from demorec.doctor.thumbnails import CameraImages
+    from demorec.doctor.view_fit import ViewFit
+    from demorec.doctor.visible_motion import VisibleMotion
+
+Flags = NDArray[np.bool_]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeEvidence:
+    """The numbers of one episode of T frames.
+
+    Attributes:
+        number: Its `episode_index`.
+        instruction: Its task; several are joined.
+        columns: Feature -> (T, D) as recorded.
+        state: (T, D) elements of the state without gaps, quaternions without changes of sign; None without a state.
+        action: (T, K) elements of the action, likewise; None without an action.
+        time_s: (T,) measured timestamps of the frames; None where they are not known.
+        image_ages_s: Camera or feature -> (T,) how much older than its frame each image or sample is.
+        drops: What was lost while recording, in words.
+        source: Name of its file, "" in a dataset.
+    """
+
+    number: int
+    instruction: str
+    columns: Mapping[str, NDArray[Any]]
+    state: Array | None
+    action: Array | None
+    time_s: Array | None = None
+    image_ages_s: Mapping[str, Array] = field(default_factory=dict)
+    drops: str = ""
+    source: str = ""
+
+    @property
+    def length(self) -> int:
+        """T."""
+        return len(next(iter(self.columns.values()), ()))
+
+    @cached_property
+    def speed(self) -> Array:
+        """(T - 1,) speed of the state, each element in units of its usual step; zeros without a state."""
+        if self.state is None or len(self.state) < 2:
+            return np.zeros(max(self.length - 1, 0))
+        steps = np.diff(self.state, axis=0)
+        scale = np.sqrt((steps**2).mean(axis=0))
+        return np.asarray(np.linalg.norm(steps[:, scale > 0] / scale[scale > 0], axis=1))
+
+
+@dataclass(kw_only=True, eq=False)
+class Evidence:
+    """A set of episodes, read.
+
+    Attributes:
+        path: As the user named it.
+        fps: Frames per second.
+        roles: Of its features.
+        episodes: Those that can be read, in order.
+        unreadable: Number of an episode -> why it cannot be read.
+        folder: The open LeRobot dataset; None for recordings.
+        cameras: Camera -> its images; empty where they are not looked at.
+        images_missing: Why no image is looked at, "" if they are.
+        urdf: Text of the robot's description, "" where it is not known.
+        arm_joints: Joint of the URDF for each element of the state, "" for others.
+        opens_lerobot: Whether the installed LeRobot opens the dataset too.
+        earlier: The sets that the user named before this one.
+    """
+
+    path: Path
+    fps: float
+    roles: Roles
+    episodes: Sequence[EpisodeEvidence]
+    unreadable: Mapping[int, str] = field(default_factory=dict)
+    folder: LeRobotFolder | None = None
+    cameras: Mapping[str, CameraImages] = field(default_factory=dict)
+    images_missing: str = ""
+    urdf: str = ""
+    arm_joints: tuple[str, ...] = ()
+    opens_lerobot: bool = False
+    earlier: Sequence[Evidence] = ()
+    _visible: dict[int, VisibleMotion | None] = field(default_factory=dict)
+
+    @property
+    def quoted_path(self) -> str:
+        """The path for a shell, with braces doubled for `str.format`."""
+        return shlex.quote(str(self.path))
+
+    @cached_property
+    def elements(self) -> tuple[str, ...]:
+        """Names of the D elements of the state."""
+        return self.roles.elements(self.roles.state) if self.roles.state else ()
+
+    @cached_property
+    def action_elements(self) -> tuple[str, ...]:
+        """Names of the K elements of the action."""
+        return self.roles.elements(self.roles.action) if self.roles.action else ()
+
+    @cached_property
+    def is_gripper(self) -> Flags:
+        """(D,) which elements of the state are grippers or their fingers."""
+        return self.roles.grippers() if self.roles.state else np.zeros(0, dtype=np.bool_)
+
+    @cached_property
+    def action_of(self) -> list[int | None]:
+        """For each element of the state its place in the action; None where it has none."""
+        if not (self.roles.state and self.roles.action):
+            return [None] * len(self.elements)
+        return self.roles.in_state(self.roles.action)
+
+    @cached_property
+    def by_number(self) -> Mapping[int, EpisodeEvidence]:
+        """Episode number -> its evidence."""
+        return {episode.number: episode for episode in self.episodes}
+
+    @cached_property
+    def ranges(self) -> Array:
+        """(D,) usual range of each element of the state within an episode: the median of the episodes'."""
+        if not self.with_state():
+            return np.zeros(0)
+        spans = [np.ptp(state, axis=0) for _, state in self.with_state()]
+        return np.asarray(np.median(spans, axis=0))
+
+    def with_state(self, min_frames: int = 2) -> list[tuple[EpisodeEvidence, Array]]:
+        """Return the episodes that have a state, with it."""
+        return [
+            (each, each.state) for each in self.episodes if each.state is not None and len(each.state) >= min_frames
+        ]
+
+    def need_state(self, min_frames: int = 2) -> list[tuple[EpisodeEvidence, Array]]:
+        """As `with_state`. Raises NotMeasuredError if there are none."""
+        if not self.roles.state:
+            raise NotMeasuredError("no column is known to be the state (name it: --state COLUMN)")
+        if not (found := self.with_state(min_frames)):
+            raise NotMeasuredError(f"no readable episode has {min_frames} frames")
+        return found
+
+    def need_images(self) -> Mapping[str, CameraImages]:
+        """Return the cameras. Raises NotMeasuredError if there are none."""
+        if self.images_missing:
+            raise NotMeasuredError(self.images_missing)
+        if not self.cameras:
+            raise NotMeasuredError("there are no cameras")
+        return self.cameras
+
+    @cached_property
+    def relation(self) -> ActionRelation:
+        """How the state follows the action. Raises NotMeasuredError where it does not."""
+        from demorec.doctor.relation import relation_of
+
+        return relation_of(self)
+
+    @cached_property
+    def arm(self) -> Arm:
+        """The joint tree of the robot. Raises NotMeasuredError if it is not known."""
+        from demorec.doctor.arm import arm_of
+
+        return arm_of(self)
+
+    def visible_motion(self, camera: CameraImages) -> VisibleMotion | None:
+        """Give how much the motion of each joint changes the images of a camera; None where nothing can be learned."""
+        from demorec.doctor.visible_motion import visible_motion
+
+        if id(camera) not in self._visible:
+            self._visible[id(camera)] = visible_motion(self, camera)
+        return self._visible[id(camera)]
+
+    @cached_property
+    def other_units(self) -> Mapping[int, Mapping[str, float]]:
+        """Episode -> "state" or "action" -> ratio of its size to the others', where it has another unit."""
+        from demorec.doctor.units import other_units
+
+        return other_units(self)
+
+    @cached_property
+    def view_fits(self) -> Mapping[str, Mapping[int, ViewFit]]:
+        """Camera -> episode -> how well the state explains its images."""
+        from demorec.doctor.view_fit import view_fits
+
+        return {camera: view_fits(self, images) for camera, images in self.cameras.items()}
+
+    def seconds(self, frames: float) -> float:
+        """Duration of frames."""
+        return frames / self.fps
+
+    def taken(self) -> Iterator[tuple[str, str | None]]:
+        """Yield (column, role) of every feature but counters."""
+        yield from self.roles.of.items()
+
+
+def joined(parts: Sequence[str], columns: Mapping[str, NDArray[Any]]) -> Array | None:
+    """Return (T, D) of features one behind the other, without gaps; None if there are none or one is missing."""
+    if not parts or any(part not in columns for part in parts):
+        return None
+    values = np.hstack([columns[part].reshape(len(columns[part]), -1) for part in parts])
+    return without_gaps(values) if len(values) else values.astype(np.float64)
+
+
+def quaternion_places(names: Sequence[str]) -> list[int]:
+    """Return the first of each four adjacent elements that are x, y, z and w of one rotation, in either order."""
+    fours = [(start, names[start : start + 4]) for start in range(len(names) - 3)]
+    return [
+        start
+        for start, four in fours
+        if "".join(each[-1:] for each in four) in ("xyzw", "wxyz") and len({each[:-1] for each in four}) == 1
+    ]
+
+
+def continuous(values: Array | None, names: Sequence[str]) -> Array | None:
+    """Return (T, D) values whose quaternions keep their sign: both signs mean the same rotation."""
+    if values is None or not len(values):
+        return values
+    for place in quaternion_places(names):
+        values[:, place : place + 4] *= signs_of_course(values[:, place : place + 4])[:, None]
+    return values
+
+
+def number_in_words(value: float) -> str:
+    """Return three digits of a number, for people."""
+    return f"{value:.3g}" if math.isfinite(value) else str(value)

@@ -1,0 +1,114 @@
+"""Images of a camera, decoded once and kept as grey thumbnails with the change from each to the next."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import cast
+
+import av
+import numpy as np
+from av.video.reformatter import VideoReformatter
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+
+SIDE = 16
+"""Pixels along each side of a thumbnail."""
+_MAX_SAMPLES = 96
+"""Pixels along each side, at most, that are compared from one image to the next."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Images:
+    """The N images of one camera in one episode.
+
+    Attributes:
+        thumbnails: (N, 16, 16) grey, 0 to 255.
+        change: (N,) mean difference of each image's pixels from the one before, of 255; 0 for the first.
+        detail: (N,) mean difference of adjacent pixels, of 255.
+        colour: (3,) mean red, green and blue, 0 to 1.
+        frames: (N,) frame that each image belongs to.
+    """
+
+    thumbnails: NDArray[np.uint8]
+    change: NDArray[np.float32]
+    detail: NDArray[np.float32]
+    colour: Array
+    frames: NDArray[np.intp]
+
+    @property
+    def steps(self) -> Array:
+        """(N - 1,) mean difference of each thumbnail from the one before, of 255."""
+        later, earlier = self.thumbnails[1:].astype(np.int16), self.thumbnails[:-1].astype(np.int16)
+        return np.asarray(np.abs(later - earlier).mean(axis=(1, 2), dtype=np.float64))
+
+    @property
+    def mean(self) -> Array:
+        """(16, 16) mean thumbnail."""
+        return np.asarray(self.thumbnails.mean(axis=0, dtype=np.float64))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class CameraImages:
+    """The images of one camera.
+
+    Attributes:
+        episodes: Number of an episode -> its images, of those that decode.
+        errors: Number of an episode -> why its images do not decode.
+    """
+
+    episodes: Mapping[int, Images] = field(default_factory=dict)
+    errors: Mapping[int, str] = field(default_factory=dict)
+
+
+class Shrinker:
+    """Shrinks the images of one camera; a frame's own converter would be set up again for each."""
+
+    def __init__(self) -> None:
+        self._reformatter = VideoReformatter()
+        self._colours = VideoReformatter()
+
+    def shrink(self, images: Iterable[av.VideoFrame], frames: NDArray[np.intp] | None = None) -> Images:
+        """Read all images of an episode; `frames` are those that they belong to, by default one after the other."""
+        thumbnails: list[NDArray[np.uint8]] = []
+        changes: list[float] = []
+        details: list[float] = []
+        colours: list[Array] = []
+        before: NDArray[np.int16] | None = None
+        for number, image in enumerate(images):
+            small = self._reformatter.reformat(image, SIDE, SIDE, "gray", interpolation="AREA")
+            thumbnails.append(cast("NDArray[np.uint8]", small.to_ndarray()))
+            sampled = _sampled(image)
+            changes.append(0.0 if before is None else float(np.abs(sampled - before).mean()))
+            details.append(float(np.abs(np.diff(sampled, axis=1)).mean()))
+            before = sampled
+            if number % 8 == 0:
+                tiny = self._colours.reformat(image, SIDE, SIDE, "rgb24", interpolation="AREA")
+                colours.append(tiny.to_ndarray().mean(axis=(0, 1)) / 255)
+        count = len(thumbnails)
+        return Images(
+            thumbnails=np.stack(thumbnails) if count else np.zeros((0, SIDE, SIDE), dtype=np.uint8),
+            change=np.array(changes, dtype=np.float32),
+            detail=np.array(details, dtype=np.float32),
+            colour=np.mean(colours, axis=0) if colours else np.zeros(3),
+            frames=np.arange(count) if frames is None else frames,
+        )
+
+
+def _sampled(image: av.VideoFrame) -> NDArray[np.int16]:
+    """Every n-th pixel of the brightness of an image."""
+    if image.format.name == "rgb24":
+        pixels = image.to_ndarray()[:, :, 1]
+    else:
+        plane = image.planes[0]
+        width = plane.line_size
+        pixels = np.frombuffer(plane, np.uint8).reshape(-1, width)[: image.height, : image.width]
+    stride = max(1, -(-max(pixels.shape) // _MAX_SAMPLES))
+    return pixels[::stride, ::stride].astype(np.int16)
+
+
+def frames_of(arrays: Iterable[NDArray[np.uint8]]) -> Iterator[av.VideoFrame]:
+    """Yield (H, W, 3) arrays as frames."""
+    for array in arrays:
+        yield av.VideoFrame.from_ndarray(np.ascontiguousarray(array), "rgb24")

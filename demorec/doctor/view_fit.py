@@ -1,0 +1,115 @@
+"""How well the state explains the images: the thumbnails, predicted by ridge regression on the other episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.doctor.robust import finest
+from demorec.doctor.thumbnails import CameraImages, Images
+
+MIN_EPISODES = 5
+"""Episodes, at least: each is predicted from the others."""
+MIN_FRAMES = 20
+MAX_LAG_S = 1.0
+_COMPONENTS = 8
+_MAX_PAIRED = 8
+"""Elements of the state up to which products of two are features too."""
+_RIDGE = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewFit:
+    """How well the state explains a camera's images in one episode.
+
+    Attributes:
+        lags: (L,) frames by which the images come later than the state.
+        explained: (L,) share of the images' variance that the state explains at each lag.
+    """
+
+    lags: NDArray[np.intp]
+    explained: Array
+
+    @property
+    def lag(self) -> float:
+        """The lag at which it explains most."""
+        return finest(self.lags.tolist(), -self.explained)
+
+
+def view_fits(evidence: Evidence, images: CameraImages) -> Mapping[int, ViewFit]:
+    """Fit the images of a camera in every episode from the other episodes."""
+    known = _known(evidence, images)
+    known = {number: both for number, both in known.items() if len(both[1].frames) >= MIN_FRAMES}
+    if len(known) < MIN_EPISODES:
+        return {}
+    inputs = _inputs(evidence, {number: episode for number, (episode, _) in known.items()})
+    outputs = _outputs({number: images for number, (_, images) in known.items()})
+    products = {n: (x.T @ x, x.T @ outputs[n]) for n, x in inputs.items()}
+    squares, crossed = (sum(pair[k] for pair in products.values()) for k in (0, 1))
+    found: dict[int, ViewFit] = {}
+    reach = max(3, round(MAX_LAG_S * evidence.fps))
+    for number, x in inputs.items():
+        own_squares, own_crossed = products[number]
+        left = squares - own_squares
+        ridge = _RIDGE * np.trace(left) / len(left) * np.eye(len(left))
+        predicted = x @ np.linalg.solve(left + ridge, crossed - own_crossed)
+        own_reach = min(reach, len(x) // 4)
+        lags = np.arange(-own_reach, own_reach + 1)
+        found[number] = ViewFit(lags=lags, explained=_explained(predicted, outputs[number], lags))
+    return found
+
+
+def _inputs(evidence: Evidence, episodes: Mapping[int, EpisodeEvidence]) -> dict[int, Array]:
+    """Episode -> (T, F) elements of the state in units of their range, their squares and products."""
+    states = {number: episode.state for number, episode in episodes.items() if episode.state is not None}
+    alive = evidence.ranges > 0
+    middle = np.median(np.stack([np.median(state, axis=0) for state in states.values()]), axis=0)[alive]
+    found = {}
+    for number, state in states.items():
+        z = np.clip((state[:, alive] - middle) / evidence.ranges[alive], -3, 3)
+        parts = [np.ones((len(z), 1)), z, z**2]
+        if z.shape[1] <= _MAX_PAIRED:
+            first, second = np.triu_indices(z.shape[1], 1)
+            parts.append(z[:, first] * z[:, second])
+        found[number] = np.hstack(parts)
+    return found
+
+
+def _outputs(images: Mapping[int, Images]) -> dict[int, Array]:
+    """Episode -> (T, 8) principal components of the thumbnails, each episode around its own mean."""
+    flat = {n: each.thumbnails.reshape(len(each.thumbnails), -1).astype(np.float32) for n, each in images.items()}
+    centred = {number: each - each.mean(axis=0) for number, each in flat.items()}
+    covariance = sum((each.T @ each) / max(float((each**2).sum()), 1e-9) for each in centred.values())
+    _, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
+    return {number: each @ vectors[:, -_COMPONENTS:] for number, each in centred.items()}
+
+
+def _explained(predicted: Array, shown: Array, lags: NDArray[np.intp]) -> Array:
+    """(L,) share of the variance of what is shown that the prediction explains when it is that many frames earlier."""
+    reach = int(lags[-1])
+    core = predicted[reach : len(predicted) - reach]
+    core = core - core.mean(axis=0)
+    shares = []
+    for lag in lags:
+        part = shown[reach + lag : len(shown) - reach + lag]
+        part = part - part.mean(axis=0)
+        total = float((part**2).sum())
+        shares.append(1 - float(((part - core) ** 2).sum()) / total if total > 0 else 0.0)
+    return np.array(shares)
+
+
+def _known(evidence: Evidence, camera: CameraImages) -> Mapping[int, tuple[EpisodeEvidence, Images]]:
+    """Episodes that have both numbers and images of every frame."""
+    return {
+        number: (episode, images)
+        for number, images in camera.episodes.items()
+        if (episode := evidence.by_number.get(number)) is not None
+        and episode.state is not None
+        and number not in evidence.other_units
+        and len(images.frames) == len(episode.state)
+    }
