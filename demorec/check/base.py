@@ -6,9 +6,10 @@ what was found and what is allowed, and `demorec list checks` prints the limits 
 
 from __future__ import annotations
 
+import inspect
 import logging
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial, wraps
 from typing import Any, Literal
@@ -21,7 +22,16 @@ from demorec.core.geometry import Array
 Level = Literal["pass", "warn", "fail", "skip"]
 Form = Literal["simulated", "external", "run", "external run", "dataset"]
 """What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
-Group = Literal["file", "time", "physics", "alignment", "images", "run", "dataset"]
+Group = Literal["file", "time", "alignment", "images", "run", "dataset"]
+ADVICE: Mapping[Group, tuple[str, str]] = {
+    "file": ("The recording is damaged or incomplete.", "demorec recover {path}, or record it again"),
+    "time": ("Streams are not where their frames are.", "record it again: the file was changed, or written wrongly"),
+    "alignment": ("A frame holds what was measured at another moment.", "record it again at a lower rate"),
+    "images": ("Images are missing or damaged.", "record it again, or leave it out"),
+    "run": ("The run is not what its run.json states.", "run the command that began it again, or restore the files"),
+    "dataset": ("The dataset is not what was exported.", "export it again"),
+}
+"""Group -> why a fault matters, and what to do."""
 
 BLOCKED = "it needs what is damaged"
 NOTHING = "nothing to measure"
@@ -88,6 +98,21 @@ class Check:
     measure: Callable[[Any], Found]
 
     @property
+    def why(self) -> str:
+        """Why a fault matters."""
+        return ADVICE[self.group][0]
+
+    @property
+    def do(self) -> str:
+        """What to do; `{path}` stands for the file."""
+        return ADVICE[self.group][1]
+
+    @property
+    def page(self) -> str:
+        """Its explanation, for people."""
+        return f"{inspect.cleandoc(self.measure.__doc__ or '')}\n\n{self.summary}."
+
+    @property
     def summary(self) -> str:
         """One line for `demorec list checks`."""
         unit = f" {self.unit}" if self.unit else ""
@@ -136,6 +161,8 @@ class Check:
             fail=self.fail,
             frame=found.frame,
             detail=found.detail,
+            why=self.why,
+            do=self.do,
         )
 
 
@@ -148,6 +175,7 @@ class Result:
         level: "skip" where there was nothing to measure.
         value: What was found; None when nothing could be measured, or it is beyond all numbers.
         frame, detail: As in `Measurement`.
+        why, do: Why it matters, and what to do; `{path}` stands for the file.
     """
 
     check: str
@@ -159,6 +187,8 @@ class Result:
     fail: float
     frame: int | None
     detail: str
+    why: str
+    do: str
 
     @property
     def allowed(self) -> float:

@@ -2,26 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Form
-from demorec.check.episode import CheckedEpisode
-from demorec.check.evidence import Motion, motion_vector, motions_of_dataset
-from demorec.check.films import CameraFilms, films_of_dataset
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.core.geometry import Array
 from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import DatasetInfo
-from demorec.datasets.lerobot.robots import DatasetRobot, robot_of_motors
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
@@ -53,16 +47,14 @@ class CheckedDataset:
 
     Args:
         path: Its folder.
-        urdf: Text of its robot's description that the user names, "" for none.
         motors: The servos whose values its state and actions are, if the user says so.
         named: Features whose role the user names.
     """
 
     form: ClassVar[Form] = "dataset"
 
-    def __init__(self, path: Path, urdf: str = "", motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
+    def __init__(self, path: Path, motors: Motors | None = None, named: NamedRoles = NO_NAMES) -> None:
         self.path = path
-        self.urdf = urdf
         self.motors = motors
         self.named = named
 
@@ -113,42 +105,9 @@ class CheckedDataset:
         return rows
 
     @cached_property
-    def motions(self) -> list[Motion]:
-        """The motions of its episodes."""
-        return list(motions_of_dataset(self.info, self.roles, self.rows, self._arms, self.urdf))
-
-    @property
-    def _arms(self) -> dict[int, DatasetRobot]:
-        """Episode -> its arm, where the sidecar has it or the user has named its servos."""
-        if self.motors is not None and self.roles.elements(self.roles.state) == self.motors.names:
-            return dict.fromkeys(range(len(self.folder.listed)), robot_of_motors(self.motors))
-        named = {row["episode_index"]: row["robot_digest"] for row in self.sidecar if row["robot_digest"]}
-        return {number: self.folder.robot(digest) for number, digest in named.items()}
-
-    def numbers(self) -> Iterator[tuple[str, NDArray[Any]]]:
-        """(name, (T, D) table) of all floating-point numbers."""
-        for number, rows in self.rows.items():
-            yield from ((f"{name}, episode {number}", table) for name, table in rows.items() if table.dtype.kind == "f")
-
-    @cached_property
-    def films(self) -> dict[str, CameraFilms]:
-        """Camera feature -> its images."""
-        return {key: films_of_dataset(self.folder, key) for key in self.info.video_keys}
-
-    def undecoded(self) -> Iterator[tuple[str, str]]:
-        """(camera, problem) of every camera whose images do not all decode."""
-        yield from ((key, films.error) for key, films in self.films.items() if films.error)
-
-    @cached_property
     def sidecar(self) -> list[dict[str, Any]]:
         """The rows that demorec keeps of each episode; empty for a dataset of another writer."""
         return self.folder.sidecar([name for name in EPISODE_SCHEMA.names if name != "episode_index"])
-
-    def courses(self) -> dict[str, Array]:
-        """Name of each episode -> its motion."""
-        state = self.roles.state
-        rows = self.rows if state else {}
-        return {f"episode {n}": motion_vector(np.hstack([each[part] for part in state])) for n, each in rows.items()}
 
     def check_simulated(self) -> None:
         """Raise ConfigError for a dataset of external episodes, which no simulator can make or replay."""
@@ -172,7 +131,3 @@ class CheckedDataset:
                 ) from error
             found.append(DescribedEpisode(number=number, rows=self.rows[number], kept=row, info=info))
         return sorted(found, key=lambda episode: episode.number)
-
-
-Episodes = CheckedEpisode | CheckedDataset
-"""One episode or several, with motions and images, whoever recorded them."""

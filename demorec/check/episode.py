@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,15 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Form
-from demorec.check.evidence import Motion, motion_of_features, motion_of_simulated
-from demorec.check.films import CameraFilms, film_of_recording
 from demorec.core.errors import RecordingError
-from demorec.episode.episode import Table, Trajectory
-from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.mcap import Recording
 from demorec.mcap.container import Container
 from demorec.mcap.streams import frame_times
-from demorec.robots.urdf import Urdf
 
 _STAMP_FIRST = {
     "sensor_msgs/msg/JointState",
@@ -60,16 +55,13 @@ class CheckedEpisode(ExitStack):
 
     Args:
         path: The recording.
-        named_urdf: Text of the robot's description that the user names, for a recording that is not simulated; "" for
-            none.
-        named: Features whose role the user names, in a recording that is not simulated.
+        colours: Whether colour images are decoded by the check of images.
     """
 
-    def __init__(self, path: Path, named_urdf: str = "", named: NamedRoles = NO_NAMES) -> None:
+    def __init__(self, path: Path, *, colours: bool = True) -> None:
         super().__init__()
         self.path = path
-        self._named_urdf = named_urdf
-        self._named = named
+        self._colours = colours
 
     def __exit__(self, *error: Any) -> bool | None:
         """Free everything: parts that refer to the whole would keep its images until the next garbage collection."""
@@ -90,11 +82,6 @@ class CheckedEpisode(ExitStack):
         return "simulated"
 
     @cached_property
-    def roles(self) -> Roles:
-        """The roles of its features."""
-        return roles_of_recording(self.recording.info, self._named)
-
-    @cached_property
     def frame_times(self) -> NDArray[np.int64]:
         """(T,) ns: when each frame ought to be."""
         return frame_times(self.recording.num_frames, self.recording.info.fps)
@@ -109,49 +96,25 @@ class CheckedEpisode(ExitStack):
         """The file's messages and metadata as they are."""
         return self.enter_context(closing(Container(self.path)))
 
-    @cached_property
-    def motions(self) -> list[Motion]:
-        """The one of its robot, if it has a state."""
-        info = self.recording.info
-        if self.form == "external":
-            table, urdf = self.recording.table(), self._named_urdf or info.urdf
-            motion = motion_of_features(table.features, info.features, info.fps, urdf, table.time_ns, named=self._named)
-            return [] if motion is None else [motion]
-        if not self.recording.num_frames:
-            return []
-        return [motion_of_simulated(info, self.recording.trajectory(), Urdf.parse(self.recording.description()))]
-
-    def numbers(self) -> Iterator[tuple[str, NDArray[Any]]]:
-        """(name, (T, ...) table) of all floating-point numbers."""
-        numbers: Table | Trajectory
-        numbers = self.recording.table() if self.form == "external" else self.recording.trajectory()
-        for name, column in vars(numbers).items():
-            tables = column.items() if isinstance(column, Mapping) else [(name, column)]
-            for key, table in tables:
-                if isinstance(table, np.ndarray) and table.dtype.kind == "f":
-                    yield key, table
-
-    @cached_property
-    def films(self) -> dict[str, CameraFilms]:
-        """Camera -> its colour images."""
-        colours = [camera for camera in self.recording.cameras if camera in self.recording.table().images]
-        return {camera: film_of_recording(self.recording, self.recording.table(), camera) for camera in colours}
-
-    def undecoded(self) -> Iterator[tuple[str, str]]:
-        """(camera, problem) of every camera whose images do not all decode: colours, distances, labels."""
-        yield from ((camera, films.error) for camera, films in self.films.items() if films.error)
+    def undecoded(self) -> tuple[int, list[tuple[str, str]]]:
+        """How many streams of images were decoded, and (camera, problem) of each that does not decode to its end."""
         recording = self.recording
-        others: list[tuple[str, Callable[[str], Iterator[Any]]]]
-        others = [(camera, recording.distances) for camera in recording.depth_cameras]
-        others += [
+        streams: list[tuple[str, Callable[[str], Iterator[Any]]]] = []
+        if self._colours:
+            shown = recording.table().images
+            streams += [(camera, recording.images) for camera in recording.cameras if camera in shown]
+        streams += [(camera, recording.distances) for camera in recording.depth_cameras]
+        streams += [
             (camera, recording.segmentation) for camera in recording.cameras if recording.has_segmentation(camera)
         ]
-        for camera, read in others:
+        wrong: list[tuple[str, str]] = []
+        for camera, read in streams:
             try:
                 for _ in read(camera):
                     pass
             except RecordingError as error:
-                yield camera, str(error)
+                wrong.append((camera, str(error)))
+        return len(streams), wrong
 
 
 def _scan_topics(container: Container) -> dict[str, TopicScan]:

@@ -29,7 +29,7 @@ _NANOSECONDS = 1_000_000_000
 
 
 @file_check(
-    measures="recordings that cannot be opened (index, metadata, format version)",
+    measures="recordings that cannot be opened",
 )
 def opens(episode: CheckedEpisode) -> Measurement:
     """Verify the checksums of index and metadata, and the format version."""
@@ -37,7 +37,7 @@ def opens(episode: CheckedEpisode) -> Measurement:
 
 
 @file_check(
-    measures="topics whose message count differs from the index; every chunk passes its CRC",
+    measures="damaged chunks, and messages unlike the index",
 )
 def checksums(episode: CheckedEpisode) -> Measurement:
     """Verify the checksum of every chunk and attachment, and the counts of the index."""
@@ -52,7 +52,7 @@ def checksums(episode: CheckedEpisode) -> Measurement:
 
 @check(
     group="file",
-    measures="topics that are missing, of another type or not one message a frame",
+    measures="topics that are missing or of another type",
 )
 def topics(episode: CheckedEpisode) -> Measurement:
     """Find the streams that the metadata lists: each of its type, with one message for each frame."""
@@ -105,7 +105,7 @@ def readable(episode: CheckedEpisode) -> Measurement:
 
 
 @file_check(
-    measures="recordings that a crash cut off (recovered, without an outcome)",
+    measures="recordings that a crash cut off",
     fail=1,
 )
 def complete(episode: CheckedEpisode) -> Measurement:
@@ -115,7 +115,7 @@ def complete(episode: CheckedEpisode) -> Measurement:
 
 
 @time_check(
-    measures="largest distance of a message from its frame's time",
+    measures="messages that are not at their frame's time",
     unit="ms",
 )
 def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
@@ -130,7 +130,7 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @time_check(
-    measures="largest difference between a message's own stamp and its time",
+    measures="messages whose own stamp differs from their time",
     unit="ms",
 )
 def stamps(episode: CheckedEpisode) -> Iterator[Found]:
@@ -145,7 +145,7 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @time_check(
-    measures="images missing, surplus, off their frame's time, or too far from a keyframe",
+    measures="images that are missing or far from a keyframe",
 )
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     """Count the encoded images of each camera: one a frame, at the frame's time, with a keyframe in every GOP."""
@@ -173,7 +173,7 @@ def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
 
 @external_check(
     group="time",
-    measures="frames and images that were dropped while recording",
+    measures="frames and images dropped while recording",
     fail=math.inf,
 )
 def drops(subject: CheckedEpisode) -> Found:
@@ -187,7 +187,7 @@ def drops(subject: CheckedEpisode) -> Found:
 
 @external_check(
     group="time",
-    measures="difference of the frames' mean rate from the nominal one, as a share of it",
+    measures="another mean rate than the nominal one (share)",
     warn=0.05,
     fail=0.5,
 )
@@ -202,7 +202,7 @@ def rate(subject: CheckedEpisode) -> Found:
 
 @external_check(
     group="time",
-    measures="longest time between two frames, in nominal periods",
+    measures="time between two frames, in nominal periods",
     warn=2.5,
     fail=30,
 )
@@ -219,7 +219,7 @@ def gaps(subject: CheckedEpisode) -> Found:
 @external_check(
     group="alignment",
     unit="s",
-    measures="largest distance between the timestamps of a frame and of a sample or an image in it",
+    measures="samples and images older than their frame",
     warn=0.2,
     fail=1.0,
 )
@@ -236,7 +236,7 @@ def sample_age(subject: CheckedEpisode) -> Iterator[Found]:
 
 @external_check(
     group="images",
-    measures="share of frames that have no image of a camera",
+    measures="frames without an image of a camera (share)",
     fail=0.5,
 )
 def missing_images(subject: CheckedEpisode) -> Iterator[Found]:

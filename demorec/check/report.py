@@ -12,18 +12,14 @@ from demorec.check.base import BLOCKED, Check, Form, Level, Result
 from demorec.check.dataset import CheckedDataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
-from demorec.core.errors import ExportError, RecordingError, check_option
+from demorec.core.errors import check_option
 from demorec.core.processes import process_pool
 from demorec.core.tables import CHECKS
-from demorec.episode.roles import NO_NAMES, NamedRoles
-from demorec.robots.motors import Motors
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
 _WORTH_PROCESSES = {"with images": 4, "without": 50}
 """Recordings from which on several processes check faster than one: each takes seconds to start."""
-OPENS_IN_LEROBOT = "dataset_opens"
-"""The check that starts LeRobot, which takes seconds: by request, or where another check failed."""
 SubjectKind = Literal["recording", "run", "dataset"]
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
@@ -34,21 +30,15 @@ class CheckOptions:
 
     Attributes:
         images: Whether images are decoded.
+        colours: Whether colour images are among them: the doctor decodes them, too.
         only: Names of checks; empty for all.
         workers: Processes; 1 works in this one.
-        lerobot: Whether LeRobot opens each dataset; otherwise only those in which another check failed.
-        urdf: Text of the description of the robot, for recordings and datasets that do not have one; "" for none.
-        motors: The servos whose values LeRobot recorded in datasets with elements of their names.
-        named: Features whose role the user names, in what demorec did not simulate.
     """
 
     images: bool = True
+    colours: bool = True
     only: tuple[str, ...] = ()
     workers: int = 1
-    lerobot: bool = False
-    urdf: str = ""
-    motors: Motors | None = None
-    named: NamedRoles = NO_NAMES
 
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
@@ -88,11 +78,9 @@ class SubjectReport(Subject):
 
     Attributes:
         results: In the order of the table.
-        notes: Sentences about features without a role, which no check looked at.
     """
 
     results: tuple[Result, ...]
-    notes: tuple[str, ...] = ()
 
     @property
     def level(self) -> Level:
@@ -152,29 +140,16 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
-    """All checks of one recording, run or dataset; ConfigError where it lacks a feature that the user names."""
+    """All checks of one recording, run or dataset."""
     if subject.kind == "recording":
-        with CheckedEpisode(subject.path, options.urdf, options.named) as episode:
-            notes = _notes(episode)
+        with CheckedEpisode(subject.path, colours=options.colours) as episode:
             found = _run(options, episode)
     elif subject.kind == "run":
-        notes = ()
-        found = _run(options, CheckedRun(subject.path, options.named))
+        found = _run(options, CheckedRun(subject.path))
     else:
-        dataset = CheckedDataset(subject.path, options.urdf, options.motors, options.named)
-        notes = _notes(dataset)
-        found = _run(options, dataset)
+        found = _run(options, CheckedDataset(subject.path))
     results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
-    return SubjectReport(**vars(subject), results=results, notes=notes)
-
-
-def _notes(subject: CheckedEpisode | CheckedDataset) -> tuple[str, ...]:
-    """What has no role or was read by the rows; nothing of what cannot be read, which the checks report."""
-    read_by_rows = subject.folder.notes if isinstance(subject, CheckedDataset) else ()
-    try:
-        return (*read_by_rows, *subject.roles.notes())
-    except (RecordingError, ExportError):
-        return ()
+    return SubjectReport(**vars(subject), results=results)
 
 
 Checked = CheckedEpisode | CheckedDataset | CheckedRun
@@ -191,10 +166,6 @@ def _run(options: CheckOptions, subject: Checked) -> list[Result]:
     results: list[Result] = []
     unreadable: set[str] = set()
     for check in checks:
-        if check.name == OPENS_IN_LEROBOT and not (
-            options.lerobot or check.name in options.only or any(result.level == "fail" for result in results)
-        ):
-            continue
         result = check.run(subject)
         if result.level == "fail" and result.value is None:
             if result.detail in unreadable:

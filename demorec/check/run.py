@@ -6,24 +6,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import asdict
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from demorec.check.base import Form, Found, Measurement, NotMeasured, check, counted, run_check
-from demorec.check.dataset import CheckedDataset
-from demorec.check.evidence import motion_vector
-from demorec.core.errors import DemorecError, RecordingError, resource_error
+from demorec.check.base import Form, Found, Measurement, counted, run_check
+from demorec.core.errors import DemorecError, resource_error
 from demorec.core.files import sha256_of
-from demorec.core.geometry import Array
 from demorec.core.plain import to_plain
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
-from demorec.mcap import open_recording
 from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
 
@@ -34,8 +27,6 @@ _MAX_LISTED = 5
 _ANY_RUN: tuple[Form, ...] = ("run", "external run")
 _NOT_RECORDED = ("file", "seconds")
 """What run.json has of an attempt that is not in its recording."""
-MAX_DISTANCE = 1e-4
-"""Root mean square difference of two motions, rad or m, up to which one is a copy: float32 rounds to less."""
 
 
 class CheckedRun:
@@ -43,12 +34,10 @@ class CheckedRun:
 
     Args:
         path: The folder with run.json.
-        named: Features whose role the user names, in recordings that are not simulated.
     """
 
-    def __init__(self, path: Path, named: NamedRoles = NO_NAMES) -> None:
+    def __init__(self, path: Path) -> None:
         self.path = path
-        self._named = named
 
     @cached_property
     def form(self) -> Form:
@@ -78,22 +67,8 @@ class CheckedRun:
 
         return load_import_file(self.path)
 
-    def courses(self) -> dict[str, Array]:
-        """Name of each recording in episodes/ that can be read and has a state -> its motion."""
-        found: dict[str, Array] = {}
-        for path in sorted((self.path / EPISODES).glob("*.mcap")):
-            try:
-                with open_recording(path) as recording:
-                    features = recording.table().features
-                    state = roles_of_recording(recording.info, self._named).state
-                    if state:
-                        found[path.name] = motion_vector(np.hstack([features[part] for part in state]))
-            except (RecordingError, OSError):
-                continue  # reported by the checks of that recording
-        return found
 
-
-@run_check(measures="files missing, changed since they were made, or not in run.json", on=_ANY_RUN, needs="a run")
+@run_check(measures="files missing, changed, or not in run.json", on=_ANY_RUN, needs="a run")
 def run_files(run: CheckedRun) -> Measurement:
     """Compare the recordings with those that run.json lists, and their SHA-256."""
     listed = {attempt.file: attempt.sha256 for attempt in run.attempts}
@@ -113,7 +88,7 @@ def run_files(run: CheckedRun) -> Measurement:
 
 
 @run_check(
-    measures="episodes or files that were asked for and are not in the run yet",
+    measures="episodes that were asked for and are missing",
     on=_ANY_RUN,
     needs="a run",
     fail=math.inf,
@@ -123,7 +98,7 @@ def run_complete(run: CheckedRun) -> Measurement:
     return Measurement(value=run.run.num_missing, detail=run.run.unfinished)
 
 
-@run_check(measures="recordings that differ from their line in run.json, or from the run", on=_ANY_RUN, needs="a run")
+@run_check(measures="recordings that differ from run.json", on=_ANY_RUN, needs="a run")
 def run_agrees(run: CheckedRun) -> Measurement:
     """Compare each recording with its line: number, attempt, seed, outcome, digest; and its config and versions."""
     wrong = [text for attempt in run.attempts for text in _contradictions(run, attempt)]
@@ -160,7 +135,7 @@ def _other_config(run: RunFile, info: EpisodeInfo) -> Iterator[str]:
 import_check = partial(run_check, on=("external run",), needs="a run that was imported", fail=math.inf)
 
 
-@import_check(measures="findings about clocks, losses, images and numbers in the imported files")
+@import_check(measures="findings of the import about clocks and losses")
 def import_findings(run: CheckedRun) -> Found:
     """List the findings of the import."""
     if (found := run.import_file) is None:
@@ -173,7 +148,7 @@ def import_findings(run: CheckedRun) -> Found:
     return Measurement(value=len(words), detail="; ".join(words[:_MAX_LISTED]))
 
 
-@import_check(measures="episodes that an import dropped, since something was missing or too old, and skipped files")
+@import_check(measures="episodes that an import dropped, skipped files")
 def import_dropped(run: CheckedRun) -> Found:
     """List the episodes of the imported files that are not in the run, except those that a marker discards."""
     if (found := run.import_file) is None:
@@ -181,41 +156,3 @@ def import_dropped(run: CheckedRun) -> Found:
     rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
     dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
     return Measurement(value=len(dropped), detail="; ".join(dropped[:_MAX_LISTED]))
-
-
-@check(
-    group="run",
-    on=("run", "external run", "dataset"),
-    measures="episodes that have the motion of an earlier one",
-    needs="two episodes",
-)
-def duplicates(subject: CheckedRun | CheckedDataset) -> Found:
-    """Compare the states of all episodes at 32 moments each."""
-    motions = subject.courses()
-    if len(motions) < 2:
-        return NotMeasured(why="it needs two episodes")
-    if isinstance(subject, CheckedRun) and subject.form == "run" and subject.run.config.fixed:
-        return NotMeasured(why="--fixed asks for one layout, every episode of which starts alike")
-    copies = _copies(list(motions.values()))
-    detail = f"{len(motions)} different motions"
-    if copies:
-        names = list(motions)
-        later, earlier = min(copies.items())
-        detail = f"{names[later]} is like {names[earlier]}"
-    return Measurement(value=len(copies), detail=detail)
-
-
-def _copies(motions: Sequence[Array]) -> dict[int, int]:
-    """Episode -> the first one that it is a copy of."""
-    found: dict[int, int] = {}
-    # The means of copies differ by less than their distance: only neighbours in that order are compared.
-    order = sorted((float(motion.mean()), number) for number, motion in enumerate(motions) if np.isfinite(motion).all())
-    for place, (mean, number) in enumerate(order):
-        for other_mean, other in order[place + 1 :]:
-            if other_mean - mean > MAX_DISTANCE:
-                break
-            one, two = motions[number], motions[other]
-            if len(one) == len(two) and np.linalg.norm(one - two) <= MAX_DISTANCE * math.sqrt(len(one)):
-                later, earlier = max(number, other), min(number, other)
-                found[later] = min(earlier, found.get(later, earlier))
-    return found

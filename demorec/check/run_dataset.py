@@ -25,7 +25,7 @@ _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """What the sidecar keeps that is not of the recording."""
 
 
-@run_check(measures="episodes of the run's dataset that are missing, surplus, or not what was recorded")
+@run_check(measures="episodes of its dataset unlike the recordings")
 def run_dataset(run: CheckedRun) -> Measurement | None:
     """Compare every number and encoded image of each episode with its recording, exported with the same options."""
     path = run.path / DATASET

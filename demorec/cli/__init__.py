@@ -50,6 +50,7 @@ COMMANDS: Registry[type[Command]] = Registry(
         "correct": "demorec.cli.evaluate:Correct",
         "recover": "demorec.cli.recover:Recover",
         "list": "demorec.cli.list_rows:ListRows",
+        "explain": "demorec.cli.explain:Explain",
     },
 )
 

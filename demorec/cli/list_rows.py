@@ -34,9 +34,14 @@ class ListRows:
         """Print one line each."""
         from demorec.core import tables
 
-        registry: Registry[Any] = getattr(tables, self.what.upper())
-        describe = _DESCRIBED.get(self.what, lambda row: str(row.summary))
-        rows = [(name, describe(registry.load(name))) for name in registry.names()]
+        if self.what == "checks":
+            from demorec.cli.explain import check_rows
+
+            rows = list(check_rows())
+        else:
+            registry: Registry[Any] = getattr(tables, self.what.upper())
+            describe = _DESCRIBED.get(self.what, lambda row: str(row.summary))
+            rows = [(name, describe(registry.load(name))) for name in registry.names()]
         if self.json:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
         else:

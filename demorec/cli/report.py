@@ -62,15 +62,24 @@ class ReportCommand:
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
         refuse_inside([self.out])
         from demorec.check.report import CheckOptions
+        from demorec.cli.shared.diagnoses import results_of
+        from demorec.doctor.from_dataset import ReadOptions
         from demorec.report.gather import gather
         from demorec.report.page import write_page
 
         named = self.roles.named
-        checks = CheckOptions(images=self.images, named=named) if self.checks else None
+        checks = CheckOptions(images=self.images) if self.checks else None
         with atomic_write(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path])) as part:
             with reading([self.path], self.mapping) as (path,), ProgressBar("reading", unit="item") as bar:
+                judged = results_of(path, ReadOptions(images=self.images, named=named)) if self.checks else ()
                 report = gather(
-                    path, camera=self.camera, checks=checks, workers=self.workers, named=named, advance=bar.set
+                    path,
+                    camera=self.camera,
+                    checks=checks,
+                    judged=judged,
+                    workers=self.workers,
+                    named=named,
+                    advance=bar.set,
                 )
             size = write_page(report, part)
         say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")

@@ -63,7 +63,8 @@ class View:
     episodes: str = ""
     """Which episodes, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
     rank: Literal["score"] | None = None
-    """Show the episodes of LeRobot datasets in this order, by demorec dataset score, the worst first."""
+    """Show the episodes of LeRobot datasets in this order, the worst first: by the verdict and score of demorec
+    check --no-images."""
     include_failures: bool = False
     """Also show the failed attempts of a run."""
     save: OptionalTarget = None
@@ -155,21 +156,22 @@ class View:
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
-        from demorec.datasets.lerobot.folder import LeRobotFolder
-        from demorec.datasets.scoring import score_dataset
+        from demorec.doctor.diagnosis import diagnose
+        from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
         from demorec.runs.find import find
 
         if others := [path for path in self.paths if find(path).kind != "dataset"]:
             raise ConfigError(f"--rank score is for LeRobot datasets, which this is not: {others[0]}")
+        options = ReadOptions(images=False, named=self.roles.named)
         found = {
-            f"{path}: episode {episode.episode_index}": episode
+            f"{path}: episode {each.episode}": each
             for path in self.paths
-            for episode in score_dataset(LeRobotFolder(path, named=self.roles.named))
+            for each in diagnose(evidence_of_dataset(path, options)).episodes
         }
-        ranked = sorted(sources, key=lambda source: found[source.name].score)
-        for episode in [found[source.name] for source in ranked[:_MOST_REASONS]]:
-            reasons = "; ".join(reason.text for reason in episode.reasons)
-            tell(f"{episode.score:.2f}  episode {episode.episode_index}{': ' * bool(reasons)}{reasons}")
+        ranked = sorted(sources, key=lambda source: found[source.name].rank)
+        for each in [found[source.name] for source in ranked[:_MOST_REASONS]]:
+            reasons = "; ".join(each.reasons)
+            tell(f"{each.verdict}, {each.score:.2f}  episode {each.episode}{': ' * bool(reasons)}{reasons}")
         return ranked
 
     def _validate(self) -> None:

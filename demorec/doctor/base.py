@@ -29,6 +29,10 @@ class NotMeasuredError(Exception):
     """A check cannot judge this evidence; the text says why."""
 
 
+class NotApplicableError(NotMeasuredError):
+    """A check is about other kinds of data, or was not asked for."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class Fault:
     """What a check found in one place.
@@ -90,8 +94,8 @@ class Check:
         """Its explanation, for people."""
         return inspect.cleandoc(self.find.__doc__ or "")
 
-    def run(self, evidence: Evidence) -> tuple[list[Finding], str]:
-        """Return what it finds, and why it could not be made ("" if it could).
+    def run(self, evidence: Evidence) -> tuple[list[Finding], str | None]:
+        """Return what it finds, and why it could not be made: "" if it could, None if it does not apply.
 
         Raises:
             ResourceError: This machine cannot measure it, which says nothing about the data.
@@ -99,6 +103,8 @@ class Check:
         found: list[Finding] = []
         try:
             found += (self._finding(fault, evidence) for fault in self.find(evidence))
+        except NotApplicableError:
+            return found, None
         except NotMeasuredError as error:
             return found, str(error)
         except Exception as error:
@@ -114,6 +120,9 @@ class Check:
     def _finding(self, fault: Fault, evidence: Evidence) -> Finding:
         number = "" if fault.episode is None else str(fault.episode)
         do = (fault.do or self.do).format(path=evidence.quoted_path, episode=number)
+        if evidence.folder is None and "demorec dataset" in do:
+            name = evidence.names.get(-1 if fault.episode is None else fault.episode, "the recordings")
+            do = f"look at it: demorec view {evidence.quoted_path}; then leave {name} out, or record it again"
         return Finding(**{**vars(fault), "do": do}, check=self.name, why=self.why)
 
 

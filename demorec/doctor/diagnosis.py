@@ -30,6 +30,11 @@ class EpisodeVerdict:
     score: float
     reasons: tuple[str, ...]
 
+    @property
+    def rank(self) -> tuple[int, float, int]:
+        """Key that sorts the worst first."""
+        return -RANK[self.verdict], self.score, self.episode
+
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
@@ -41,6 +46,7 @@ class Diagnosis:
         findings: The worst first.
         episodes: The worst first.
         not_measured: Check -> why it could not be made.
+        num_checks: Checks that were made.
         num_frames: Frames that were read.
         cameras: Names of the cameras whose images were decoded.
     """
@@ -50,6 +56,7 @@ class Diagnosis:
     findings: tuple[Finding, ...]
     episodes: tuple[EpisodeVerdict, ...]
     not_measured: Mapping[str, str]
+    num_checks: int = 0
     num_frames: int = 0
     cameras: tuple[str, ...] = ()
 
@@ -102,9 +109,11 @@ def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: S
     """
     findings = list(extra)
     not_measured: dict[str, str] = {}
+    made = 0
     for check in all_checks() if checks is None else checks:
         found, reason = check.run(evidence)
         findings += found
+        made += reason == ""
         if reason:
             not_measured[check.name] = reason
     order = {check.name: FAMILIES.index(check.family) for check in all_checks()}
@@ -117,6 +126,7 @@ def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: S
         findings=tuple(findings),
         episodes=_verdicts(evidence, findings),
         not_measured=not_measured,
+        num_checks=made,
         num_frames=sum(episode.length for episode in evidence.episodes),
         cameras=tuple(evidence.cameras),
     )
@@ -137,4 +147,4 @@ def _verdicts(evidence: Evidence, findings: Sequence[Finding]) -> tuple[EpisodeV
                 reasons=tuple(dict.fromkeys(reasons)),
             )
         )
-    return tuple(sorted(found, key=lambda each: (-RANK[each.verdict], each.score, each.episode)))
+    return tuple(sorted(found, key=lambda each: each.rank))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array, signs_of_course
 from demorec.doctor.base import NotMeasuredError
 from demorec.doctor.robust import without_gaps
-from demorec.episode.roles import Roles
+from demorec.episode.roles import Role, Roles
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -42,7 +42,6 @@ class EpisodeEvidence:
         time_s: (T,) measured timestamps of the frames; None where they are not known.
         image_ages_s: Camera or feature -> (T,) how much older than its frame each image or sample is.
         drops: What was lost while recording, in words.
-        source: Name of its file, "" in a dataset.
     """
 
     number: int
@@ -53,7 +52,6 @@ class EpisodeEvidence:
     time_s: Array | None = None
     image_ages_s: Mapping[str, Array] = field(default_factory=dict)
     drops: str = ""
-    source: str = ""
 
     @property
     def length(self) -> int:
@@ -86,6 +84,7 @@ class Evidence:
         urdf: Text of the robot's description, "" where it is not known.
         arm_joints: Joint of the URDF for each element of the state, "" for others.
         opens_lerobot: Whether the installed LeRobot opens the dataset too.
+        names: Number of an episode -> its file, for recordings.
         earlier: The sets that the user named before this one.
     """
 
@@ -100,6 +99,7 @@ class Evidence:
     urdf: str = ""
     arm_joints: tuple[str, ...] = ()
     opens_lerobot: bool = False
+    names: Mapping[int, str] = field(default_factory=dict)
     earlier: Sequence[Evidence] = ()
     _visible: dict[int, VisibleMotion | None] = field(default_factory=dict)
 
@@ -107,6 +107,10 @@ class Evidence:
     def quoted_path(self) -> str:
         """The path for a shell, with braces doubled for `str.format`."""
         return shlex.quote(str(self.path))
+
+    def without_images(self) -> Evidence:
+        """Return the same episodes without their images, to compare other sets with."""
+        return Evidence(path=self.path, fps=self.fps, roles=self.roles, episodes=self.episodes)
 
     @cached_property
     def elements(self) -> tuple[str, ...]:
@@ -165,12 +169,21 @@ class Evidence:
             raise NotMeasuredError("there are no cameras")
         return self.cameras
 
-    @cached_property
+    @property
     def relation(self) -> ActionRelation:
         """How the state follows the action. Raises NotMeasuredError where it does not."""
+        if isinstance(self._relation, NotMeasuredError):
+            raise NotMeasuredError(str(self._relation))
+        return self._relation
+
+    @cached_property
+    def _relation(self) -> ActionRelation | NotMeasuredError:
         from demorec.doctor.relation import relation_of
 
-        return relation_of(self)
+        try:
+            return relation_of(self)
+        except NotMeasuredError as error:
+            return error
 
     @cached_property
     def arm(self) -> Arm:
@@ -205,7 +218,7 @@ class Evidence:
         """Duration of frames."""
         return frames / self.fps
 
-    def taken(self) -> Iterator[tuple[str, str | None]]:
+    def taken(self) -> Iterator[tuple[str, Role | None]]:
         """Yield (column, role) of every feature but counters."""
         yield from self.roles.of.items()
 

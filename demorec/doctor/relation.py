@@ -133,7 +133,7 @@ def _usual_minimum(curves: list[Array]) -> float:
 
 
 def _lag(curve: Array, lags: NDArray[np.intp]) -> EpisodeLag | None:
-    judged = np.isfinite(curve).all(axis=0)
+    judged = np.asarray(np.isfinite(curve).all(axis=0))
     judged[judged] &= curve[:, judged].min(axis=0) < MAX_UNEXPLAINED
     if not judged.any():
         return None

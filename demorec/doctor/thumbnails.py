@@ -37,6 +37,16 @@ class Images:
     colour: Array
     frames: NDArray[np.intp]
 
+    def taken(self, numbers: NDArray[np.intp], frames: NDArray[np.intp]) -> Images:
+        """Take some of the images, for these frames."""
+        return Images(
+            thumbnails=self.thumbnails[numbers],
+            change=self.change[numbers],
+            detail=self.detail[numbers],
+            colour=self.colour,
+            frames=frames,
+        )
+
     @property
     def steps(self) -> Array:
         """(N - 1,) mean difference of each thumbnail from the one before, of 255."""

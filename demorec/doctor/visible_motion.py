@@ -12,6 +12,7 @@ from demorec.doctor.thumbnails import CameraImages, Images
 
 MIN_FRAMES = 20
 """Frames, at least, from which the change is learned."""
+_SWEEPS = 100
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,8 +34,6 @@ class VisibleMotion:
 
 def visible_motion(evidence: Evidence, camera: CameraImages) -> VisibleMotion | None:
     """Fit the change of a camera's images to the joints' steps; None where nothing moves or changes."""
-    from scipy.optimize import nnls
-
     steps: list[Array] = []
     changes: list[Array] = []
     for number, images in camera.episodes.items():
@@ -47,10 +46,20 @@ def visible_motion(evidence: Evidence, camera: CameraImages) -> VisibleMotion | 
         return None
     x, y = np.concatenate(steps), np.concatenate(changes)
     rest = float(np.median(y[x.max(axis=1, initial=0.0) == 0])) if (x == 0).all(axis=1).any() else 0.0
-    weights, _ = nnls(x.T @ x, x.T @ np.maximum(y - rest, 0.0))
+    weights = _non_negative_fit(x.T @ x, x.T @ np.maximum(y - rest, 0.0))
     moving = y[x @ weights > np.median(x @ weights)]
     usual_change = float(np.quantile(moving, 0.75)) if len(moving) else 0.0
     return VisibleMotion(weights=weights, usual_change=usual_change) if usual_change > 0 else None
+
+
+def _non_negative_fit(squares: Array, products: Array) -> Array:
+    """(D,) weights of least squares, none below zero, by coordinate descent on the normal equations."""
+    weights = np.zeros(len(products))
+    for _ in range(_SWEEPS):
+        for place in np.flatnonzero(np.diag(squares) > 0):
+            rest = products[place] - squares[place] @ weights
+            weights[place] = max(0.0, weights[place] + rest / squares[place, place])
+    return weights
 
 
 def _steps(evidence: Evidence, episode: EpisodeEvidence, images: Images) -> Array:

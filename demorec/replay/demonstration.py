@@ -32,7 +32,7 @@ from demorec.robots.robot import RobotSpec
 from demorec.sim.sensors import SENSORS
 
 if TYPE_CHECKING:
-    from demorec.check.evidence import Motion
+    from demorec.replay.motion import RobotMotion
 
 JOINTS, OPENING, EE_POSE, POSE_OF = "joint positions", "gripper opening", "the EE pose", "the pose of "
 _LEAST_HZ = Physics.hz
@@ -209,7 +209,7 @@ def seen_in(observation: Observation) -> dict[str, Array]:
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
     """A recording's file to be replayed; errors as `open_demonstration` or, with a robot, `demonstration_of`."""
     if options.robot is not None:
-        from demorec.check.evidence import motion_of_features
+        from demorec.replay.motion import motion_of_features
 
         with open_recording(path) as recording:
             if options.motors is not None:
@@ -217,9 +217,7 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
             if recording.info.simulation is not None:
                 raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
             info, table = recording.info, recording.table()
-            motion = motion_of_features(
-                table.features, info.features, info.fps, info.urdf, table.time_ns, named=options.named
-            )
+            motion = motion_of_features(table.features, info.features, info.fps, info.urdf, named=options.named)
         return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=info.episode_index)
     with open_simulated(path) as recording:
         return replace(open_demonstration(recording, options), source=path)
@@ -241,6 +239,7 @@ def dataset_demonstrations(
         ExportError: It is damaged.
     """
     from demorec.check.dataset import CheckedDataset
+    from demorec.replay.motion import motions_of_dataset
 
     if options.states or options.export_hz:
         raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
@@ -250,7 +249,7 @@ def dataset_demonstrations(
     if bad := [problem for number, problem in dataset.unreadable.items() if wanted(number)]:
         raise ExportError(f"{bad[0]}, in {path}")
     if options.robot is not None:
-        for number, motion in zip(dataset.rows, dataset.motions, strict=False):
+        for number, motion in zip(dataset.rows, motions_of_dataset(dataset), strict=False):
             if not wanted(number):
                 continue
             name = f"{path.name}_episode_{number:06d}"
@@ -285,7 +284,7 @@ def dataset_demonstrations(
 
 
 def demonstration_of(
-    motion: Motion | None, robot: RobotSpec, *, name: str, where: Path, episode_index: int
+    motion: RobotMotion | None, robot: RobotSpec, *, name: str, where: Path, episode_index: int
 ) -> Demonstration:
     """The actions of a real arm in an episode, for a simulated arm of its kind.
 
@@ -340,10 +339,10 @@ def demonstration_of(
     )
 
 
-def _of_robot(values: Array, motion: Motion, robot: RobotSpec, where: Path) -> Array:
+def _of_robot(values: Array, motion: RobotMotion, robot: RobotSpec, where: Path) -> Array:
     """(T, n_arm + 1) positions of the arm's joints, rad, and opening of the gripper, m, of (T, D) of a motion."""
-    from demorec.check.evidence import GRIPPER
     from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS
+    from demorec.replay.motion import GRIPPER
 
     fingers = robot.gripper.joints
     wanted = [*robot.arm_joints, *(() if GRIPPER in motion.names else fingers)]

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -116,6 +116,22 @@ def add_components(into: Components, found: Components) -> None:
         into.setdefault(key, []).extend(parts)
 
 
+class EpisodeResult(NamedTuple):
+    """A result of the doctor, and the number of its episode; None for the whole set."""
+
+    episode: int | None
+    result: Result
+
+
+def flags_of(judged: Iterable[EpisodeResult]) -> dict[int, tuple[Result, ...]]:
+    """Number of an episode -> its results."""
+    found: dict[int, tuple[Result, ...]] = {}
+    for episode, result in judged:
+        if episode is not None:
+            found[episode] = (*found.get(episode, ()), result)
+    return found
+
+
 class CheckSummaries:
     """The checks over everything that they looked at, in the order of the first results.
 
@@ -139,9 +155,20 @@ class CheckSummaries:
             if result.check not in self.worst or _rank(result) > _rank(self.worst[result.check][0]):
                 self.worst[result.check] = result, where
 
+    def count(self, result: Result, where: str) -> None:
+        """Count one more result of something that was counted before."""
+        self.num_subjects -= 1
+        self.add([result], where)
+
     def of(self, *levels: Level) -> list[tuple[Result, str]]:
         """The worst results that have one of these levels, level by level, and what each was found in."""
         return [item for level in levels for item in self.worst.values() if item[0].level == level]
+
+
+def add_judged(summaries: CheckSummaries, judged: Iterable[EpisodeResult]) -> None:
+    """Count what the doctor found."""
+    for episode, result in judged:
+        summaries.count(result, "the whole set" if episode is None else f"episode {episode}")
 
 
 def _rank(result: Result) -> tuple[int, float]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,15 +10,13 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, check_subject
-from demorec.core.errors import ConfigError, ExportError, describe_error, without_path
+from demorec.core.errors import ConfigError, ExportError, describe_error
 from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.datasets.scoring import MIN_EPISODES, MIN_SOUND, score_dataset
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.roles import NamedRoles, Roles
@@ -26,10 +24,13 @@ from demorec.report.content import (
     MAX_COMPONENTS,
     CheckSummaries,
     Components,
+    EpisodeResult,
     Report,
     ReportedEpisode,
     add_components,
+    add_judged,
     common_facts,
+    flags_of,
     motion_components,
 )
 from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
@@ -43,7 +44,12 @@ _Row = Mapping[str, Any]
 
 
 def dataset_report(
-    root: Path, camera: str, checks: CheckOptions | None, named: NamedRoles, advance: Callable[[int, int], None]
+    root: Path,
+    camera: str,
+    checks: CheckOptions | None,
+    judged: Sequence[EpisodeResult],
+    named: NamedRoles,
+    advance: Callable[[int, int], None],
 ) -> Report:
     """The content of a page about a dataset; arguments and errors as of `demorec.report.gather.gather`."""
     folder = LeRobotFolder(root, named=named)
@@ -60,7 +66,7 @@ def dataset_report(
     stride = max(1, -(-len(folder.places) // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    flags = {} if checks is None else _flags(folder, missing)
+    flags = flags_of(judged)
     for number, place in enumerate(folder.places):
         columns: Mapping[str, NDArray[Any]] = {}
         strip: Filmstrip | None = None
@@ -80,6 +86,7 @@ def dataset_report(
         missing.append("No checks were run (--no-checks).")
     else:
         summaries.add(check_subject(Subject(path=root, kind="dataset"), checks).results, "the dataset")
+        add_judged(summaries, judged)
     advance(total, total)
     return Report(
         title=root.resolve().name,
@@ -91,34 +98,6 @@ def dataset_report(
         checks=summaries if checks else None,
         missing=tuple(missing),
     )
-
-
-def _flags(folder: LeRobotFolder, missing: list[str]) -> dict[int, tuple[Result]]:
-    """Return episode_index -> its score, of the worst below `MIN_SOUND`; why there are none goes into `missing`."""
-    if len(folder.places) < MIN_EPISODES:
-        return {}
-    try:
-        found = sorted(score_dataset(folder), key=lambda episode: episode.score)
-    except ExportError as error:
-        missing.append(f"Its episodes have no scores: {without_path(error, folder.root)}")
-        return {}
-    return {
-        episode.episode_index: (
-            Result(
-                check="score",
-                group="demonstration",
-                level="warn",
-                value=episode.score,
-                unit="",
-                warn=MIN_SOUND,
-                fail=0.0,
-                frame=episode.reasons[0].first if episode.reasons else None,
-                detail="; ".join(reason.text for reason in episode.reasons),
-            ),
-        )
-        for episode in found[:MAX_SHOWN]
-        if episode.score < MIN_SOUND
-    }
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:

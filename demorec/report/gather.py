@@ -17,11 +17,14 @@ from demorec.mcap import Recording, open_recording
 from demorec.report.content import (
     CheckSummaries,
     Components,
+    EpisodeResult,
     Report,
     ReportedEpisode,
     add_components,
+    add_judged,
     common_facts,
     few,
+    flags_of,
     motion_components,
 )  # fmt: skip
 from demorec.report.dataset import dataset_report
@@ -53,6 +56,7 @@ def gather(
     *,
     camera: str = "",
     checks: CheckOptions | None = None,
+    judged: Sequence[EpisodeResult] = (),
     workers: int = 1,
     named: NamedRoles = NO_NAMES,
     advance: Callable[[int, int], None] = lambda done, total: None,
@@ -62,7 +66,8 @@ def gather(
     Args:
         path: Of that.
         camera: Which images the filmstrips show; "" for the first camera.
-        checks: Which checks are run; None for none.
+        checks: Which checks of files are run; None for none.
+        judged: What the doctor found.
         workers: Processes that read and check recordings.
         named: Features whose role the user names, in what demorec did not simulate.
         advance: Called with the number of finished items and of all items.
@@ -73,14 +78,15 @@ def gather(
     """
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
-        return dataset_report(path, camera, checks, named, advance)
-    return _recordings_report(found, camera, checks, workers, named, advance)
+        return dataset_report(path, camera, checks, judged, named, advance)
+    return _recordings_report(found, camera, checks, judged, workers, named, advance)
 
 
 def _recordings_report(
     found: Found,
     camera: str,
     checks: CheckOptions | None,
+    judged: Sequence[EpisodeResult],
     workers: int,
     named: NamedRoles,
     advance: Callable[[int, int], None],
@@ -100,12 +106,12 @@ def _recordings_report(
     total = len(subjects) + len(folders)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for episode, found_in, checked in _read_all(path, camera, checks, subjects, workers, named):
-        episodes.append(episode)
+    flags = flags_of(judged)
+    for number, (episode, found_in, checked) in enumerate(_read_all(path, camera, checks, subjects, workers, named)):
+        episodes.append(replace(episode, flags=(*episode.flags, *flags.get(number, ()))))
         add_components(components, found_in)
         if checked is not None:
             summaries.add(checked.results, episode.name)
-            missing += [note for note in checked.notes if note not in missing]
         advance(len(episodes), total)
     if checks is None:
         missing.append("No checks were run (--no-checks).")
@@ -113,6 +119,7 @@ def _recordings_report(
         for number, subject in enumerate(folders, len(subjects) + 1):
             summaries.add(check_subject(subject, checks).results, f"the {subject.kind}")
             advance(number, total)
+        add_judged(summaries, judged)
         if not checks.images:
             missing.append("The checks that decode all images were not run; --images runs them, too.")
     if run is not None:

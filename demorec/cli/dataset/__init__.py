@@ -1,4 +1,4 @@
-"""`demorec dataset`: the commands that edit, compare and score LeRobot datasets, whoever wrote them."""
+"""`demorec dataset`: the commands that edit and compare LeRobot datasets, whoever wrote them."""
 
 from __future__ import annotations
 
@@ -29,6 +29,5 @@ class DatasetCommand:
             "shuffle": "demorec.cli.dataset.operations:Shuffle",
             "repair": "demorec.cli.dataset.damage:Repair",
             "diff": "demorec.cli.dataset.diff:Diff",
-            "score": "demorec.cli.dataset.score:Score",
         },
     )

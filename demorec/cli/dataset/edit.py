@@ -25,7 +25,7 @@ MAX_SHOWN = 20
 DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
 CONDITION_HELP = (
     "Condition on columns of the table of episodes or of demorec's sidecar, and on episode_index, num_frames, "
-    'duration_s, task, score: success and num_frames < 300; "cube" in task.'
+    'duration_s, task, and verdict, score of demorec check: success and num_frames < 300; "cube" in task.'
 )
 
 

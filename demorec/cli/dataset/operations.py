@@ -25,15 +25,13 @@ class Chosen(EditOne):
     where: Annotated[str, arg(help=CONDITION_HELP)] = ""
     episodes: tuple[str, ...] = ()
     """Numbers of episodes, 0,3,5:9."""
-    scores: Path | None = None
-    """File of demorec dataset score --out, for conditions on the score (auto: the dataset is scored)."""
 
     def chosen(self, source: LeRobotFolder) -> list[int]:
         """Numbers of the chosen episodes."""
-        from demorec.cli.dataset.score import scored_columns
+        from demorec.cli.dataset.verdicts import judged_columns
         from demorec.datasets.editing.operations import chosen, names_in
 
-        rows = scored_columns(source, names_in(self.where), self.scores)
+        rows = judged_columns(source, names_in(self.where))
         return chosen(source, rows, self.where, episode_numbers(self.episodes) if self.episodes else None)
 
 
@@ -43,7 +41,7 @@ class Select(Chosen):
 
     Examples:
       demorec dataset select cups --where 'success and num_frames < 300' --out good
-      demorec dataset select cups --where 'score > 0.8' --out good
+      demorec dataset select cups --where 'verdict == "good"' --out good
       demorec dataset select cups --episodes 0:50 --out first
     """
 
@@ -148,8 +146,6 @@ class Split(EditOne):
     """Column to stratify by: each of its values is divided in the same proportions."""
     seed: int = 0
     """Seed of the random parts."""
-    scores: Path | None = None
-    """With --by score: file of demorec dataset score --out (auto: the dataset is scored)."""
 
     def part_names(self) -> Sequence[str]:
         """Names of the parts."""
@@ -157,10 +153,10 @@ class Split(EditOne):
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """Name of each part -> its episodes."""
-        from demorec.cli.dataset.score import scored_columns
+        from demorec.cli.dataset.verdicts import judged_columns
         from demorec.datasets.editing.operations import split
 
-        rows = scored_columns(sources[0], {self.by}, self.scores)
+        rows = judged_columns(sources[0], {self.by})
         return split(sources[0], rows, self._shares(), self.seed, by=self.by)
 
     def _shares(self) -> Mapping[str, float]:
@@ -265,15 +261,13 @@ class Reorder(EditOne):
     """With --by: largest first."""
     order: tuple[str, ...] = ()
     """Numbers of all episodes in their new order, 2,0,1."""
-    scores: Path | None = None
-    """With --by score: file of demorec dataset score --out (auto: the dataset is scored)."""
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes in the new order."""
-        from demorec.cli.dataset.score import scored_columns
+        from demorec.cli.dataset.verdicts import judged_columns
         from demorec.datasets.editing.operations import reorder
 
-        rows = scored_columns(sources[0], {self.by}, self.scores) if self.by else ()
+        rows = judged_columns(sources[0], {self.by}) if self.by else ()
         return reorder(sources[0], rows, self.by, episode_numbers(self.order), descending=self.descending)
 
 

@@ -17,7 +17,7 @@ MIN_OTHERS = 3
 MIN_SHIFT = 0.7
 """Frames by which the lag of an episode differs, at least: whole frames are lost or doubled, not parts."""
 MIN_GAIN = 0.7
-"""Natural logarithm of how many times less variance an episode's own lag leaves unexplained than the usual one: half."""
+"""Natural logarithm of the factor by which an episode's own lag leaves less variance unexplained: two."""
 MIN_LEAD = 0.4
 """Frames by which the state is ahead of its action from which the two are misaligned: a command is never late."""
 MAX_LAG_S = 0.5

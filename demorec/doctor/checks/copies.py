@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 
 PIECE_S = 1.0
@@ -65,7 +67,7 @@ def copies(
                 break
 
 
-def _moments(state: Array, ranges: Array, alive: np.ndarray) -> Array:
+def _moments(state: Array, ranges: Array, alive: NDArray[np.bool_]) -> Array:
     moments = np.linspace(0, len(state) - 1, _MOMENTS).round().astype(int)
     return np.asarray(state[moments][:, alive] / ranges[alive])
 
@@ -105,7 +107,7 @@ def _shared(episode: EpisodeEvidence, size: int, first_seen: dict[bytes, tuple[i
     """Earlier episode, or this one -> first frames of the windows that both have; new windows are noted."""
     rows = _digests(episode)
     found: dict[int, list[int]] = defaultdict(list)
-    moving = np.flatnonzero([one != two for one, two in zip(rows, rows[1:], strict=False)])
+    moving = np.flatnonzero([one != two for one, two in pairwise(rows)])
     is_moving = np.zeros(len(rows), dtype=np.int64)
     is_moving[moving + 1] = 1
     counts = np.concatenate([[0], np.cumsum(is_moving)])
@@ -139,7 +141,7 @@ def _digests(episode: EpisodeEvidence) -> list[bytes]:
 def leakage(evidence: Evidence) -> Iterator[Fault]:
     """Find the episodes and pieces of every dataset of the command in those that were named before it."""
     if not evidence.earlier:
-        raise NotMeasuredError("it compares two datasets: demorec check TRAIN VAL")
+        raise NotApplicableError("it compares two datasets: demorec check TRAIN VAL")
     for other in evidence.earlier:
         yield from _leaks(other, evidence)
 

@@ -54,15 +54,14 @@ def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
             speeds[episode.number] = float(speed[-count:].mean()) / size
     if len(speeds) <= MIN_OTHERS:
         raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
-    at_rest = np.mean([speed < MAX_REST_SPEED for speed in speeds.values()])
-    for number, speed in speeds.items() if at_rest >= MIN_RESTING_SHARE else ():
-        if speed > MIN_END_SPEED:
+    at_rest = np.mean([each < MAX_REST_SPEED for each in speeds.values()])
+    for number, end_speed in speeds.items() if at_rest >= MIN_RESTING_SHARE else ():
+        if end_speed > MIN_END_SPEED:
             yield Fault(
                 severity="look",
                 episode=number,
-                value=f"{speed:.0%}",
-                message=f"it ends while the arm moves at {speed:.0%} of its usual speed; {at_rest:.0%} of the episodes "
-                "end at rest",
+                value=f"{end_speed:.0%}",
+                message=f"it ends while the arm moves at {end_speed:.0%} of its usual speed; {at_rest:.0%} of all end at rest",
             )
 
 

@@ -15,7 +15,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
 from demorec.datasets.lerobot.videos import opened_video
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence
 
 _TYPES = {
@@ -28,7 +28,7 @@ _RATE_TOLERANCE = 0.01
 def folder_of(evidence: Evidence) -> LeRobotFolder:
     """Return the open dataset. Raises NotMeasuredError for recordings."""
     if evidence.folder is None:
-        raise NotMeasuredError("recordings have files of another kind, whose integrity is checked by itself")
+        raise NotApplicableError("recordings have files of another kind, whose integrity is checked by itself")
     return evidence.folder
 
 
@@ -63,8 +63,7 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     measures="counters and indices that contradict",
     unit="contradictions",
     why="LeRobot takes rows and images by these numbers: it finds others, or none.",
-    do="write them again with the recorder's own tools; demorec dataset select {path} --where 'num_frames > 0' --out NEW "
-    "renumbers them",
+    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW numbers them again; otherwise record it again",
 )
 def counts(evidence: Evidence) -> Iterator[Fault]:
     """Compare totals with the tables; indices count up without a gap, and tasks are those of the episodes' table."""
@@ -84,7 +83,7 @@ def counts(evidence: Evidence) -> Iterator[Fault]:
             yield Fault(
                 severity="broken",
                 episode=place.episode_index,
-                message=f"the table of episodes has it at episode {number} from row {place.from_index}, expected row {start}",
+                message=f"the table of episodes has it at row {place.from_index}, expected {start}",
             )
         if (episode := evidence.by_number.get(place.episode_index)) is not None:
             wrong = _wrong_indices(episode.columns, number, start)
@@ -228,7 +227,7 @@ def video_format(evidence: Evidence) -> Iterator[Fault]:
     """Compare size, rate, codec and sound of each video file with info.json, and info.json with itself."""
     folder = folder_of(evidence)
     if not folder.info.video_keys:
-        raise NotMeasuredError("there are no videos")
+        raise NotApplicableError("there are no videos")
     for key in folder.info.video_keys:
         feature = folder.info.features[key]
         stated = _stated_format(feature)
@@ -298,7 +297,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
     """
     folder = folder_of(evidence)
     if not folder.info.video_keys:
-        raise NotMeasuredError("there are no videos")
+        raise NotApplicableError("there are no videos")
     for key in folder.info.video_keys:
         ends: dict[Path, int] = {}
         for place in folder.listed:

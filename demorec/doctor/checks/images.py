@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import runs
 from demorec.doctor.thumbnails import CameraImages, Images
@@ -29,10 +29,17 @@ MIN_MISSING_CHANGE = 4.0
 MIN_FROZEN_FRAMES = 3
 FROZEN_TIMES = 4.0
 """Times the longest usual missing change: cameras that see the arm only now and then repeat images for long."""
-MIN_FAST_FRAMES = 8
-"""Frames of fast visible motion, at least, by which the rate of a camera is judged."""
+MIN_VISIBLE = 0.25
+"""Share of the usual change from which motion is visible in every new image."""
+MIN_GAPS = 8
+"""Times from one new image to the next, at least, by which the rate of a camera is judged."""
+MIN_REGULAR = 0.95
+"""Share of these times that are one frame or less from their mean where a camera has a rate of its own."""
+MIN_RATE_CHANGE = 1.5
+"""Usual change of images, of 255, from which they are judged closely: codecs leave smaller ones out of every second
+image."""
 MIN_REPEATED = 0.3
-"""Share of repeated images among these frames from which a camera is slower than the frames."""
+"""Share of repeated images from which a camera is slower than the frames."""
 MIN_FIT = 0.8
 """Correlation of an episode's mean image with that of another camera, or with it turned, from which they are the same
 view."""
@@ -158,10 +165,14 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state()
     for camera, images in evidence.need_images().items():
         rests = {n: _rests(evidence, n, each, images) for n, each in images.episodes.items()}
+        visible = evidence.visible_motion(images)
+        if visible is None or (len(rests) <= MIN_OTHERS and visible.usual_change < MIN_RATE_CHANGE):
+            continue
         longest = {number: max((missing for missing, _, _ in found), default=0.0) for number, found in rests.items()}
         for number, found in rests.items():
             others = [missing for other, missing in longest.items() if other != number]
-            limit = max(MIN_MISSING_CHANGE, FROZEN_TIMES * float(np.median(others or [0.0])))
+            least = MIN_MISSING_CHANGE if len(others) >= MIN_OTHERS else 3 * MIN_MISSING_CHANGE
+            limit = max(least, FROZEN_TIMES * float(np.median(others or [0.0])))
             bad = [(missing, first, end) for missing, first, end in found if missing > limit]
             bad = [each for each in bad if each[2] - each[1] >= MIN_FROZEN_FRAMES]
             if bad:
@@ -171,7 +182,7 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
                     episode=number,
                     frames=(first, end),
                     value=f"{evidence.seconds(end - first):.1f} s",
-                    message=f"{camera} repeats one image for {evidence.seconds(end - first):.1f} s while the robot moves",
+                    message=f"{camera} shows one image for {evidence.seconds(end - first):.1f} s while the robot moves",
                 )
 
 
@@ -217,14 +228,11 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
             episode = evidence.by_number.get(number)
             if visible is None or episode is None or episode.state is None or len(each.frames) < 2:
                 continue
-            fast = visible.expected(evidence, episode, each) > visible.usual_change
-            if fast.sum() < MIN_FAST_FRAMES:
-                continue
-            same = _repeats(each, visible.usual_change)
-            short = np.zeros(len(same), dtype=np.bool_)
-            for first, end in runs(same):
-                short[first:end] = end - first <= 3
-            shares[number] = float((short & fast).sum() / fast.sum())
+            visibly = visible.expected(evidence, episode, each) > MIN_VISIBLE * visible.usual_change
+            changed = np.flatnonzero(~_repeats(each, visible.usual_change) & visibly)
+            gaps = np.diff(changed)[visibly[changed[1:] - 1]] if len(changed) > 1 else np.zeros(0, dtype=np.intp)
+            if len(gaps) >= MIN_GAPS and visible.usual_change >= MIN_RATE_CHANGE:
+                shares[number] = _share_repeated(gaps)
         if not shares:
             continue
         slow = [number for number, share in shares.items() if share > MIN_REPEATED]
@@ -237,7 +245,7 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
                 message=f"{camera} repeats {share:.0%} of its images: it gives about {rate:.0f} images a second, not "
                 f"{evidence.fps:g}",
             )
-        else:
+        elif float(np.median(list(shares.values()))) == 0:
             for number in slow:
                 yield Fault(
                     severity="look",
@@ -246,6 +254,16 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
                     message=f"{camera} repeats {shares[number]:.0%} of its images",
                     do=DROP,
                 )
+
+
+def _share_repeated(gaps: NDArray[np.intp]) -> float:
+    """Share of repeated images where new ones come regularly, after n or n + 1 frames; 0 where they do not.
+
+    Slow motion, too, changes an image only now and then, but not regularly.
+    """
+    mean = float(np.mean(gaps))
+    regular = np.abs(gaps - mean) < 1.0
+    return 1 - 1 / mean if regular.mean() >= MIN_REGULAR else 0.0
 
 
 @check(
@@ -318,7 +336,7 @@ def doubled_cameras(evidence: Evidence) -> Iterator[Fault]:
     """Compare the thumbnails of each two cameras, frame by frame."""
     cameras = list(evidence.need_images().items())
     if len(cameras) < 2:
-        raise NotMeasuredError("there is one camera")
+        raise NotApplicableError("there is one camera")
     for place, (name, images) in enumerate(cameras):
         for other_name, other in cameras[place + 1 :]:
             both = images.episodes.keys() & other.episodes.keys()

@@ -56,7 +56,7 @@ def empty_instructions(evidence: Evidence) -> Iterator[Fault]:
     do="demorec dataset set-task {path} --task 'WORDS' --episodes {episode} --out NEW",
 )
 def odd_instructions(evidence: Evidence) -> Iterator[Fault]:
-    """Find instructions that differ by a typing error alone, and one that a single episode has among many of another."""
+    """Find instructions that differ by a typing error alone, and one that a single episode has."""
     counts = Counter(each.instruction for each in evidence.episodes if each.instruction.strip())
     if len(counts) < 2:
         return

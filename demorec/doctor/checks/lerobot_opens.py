@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from demorec.core.errors import MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
-from demorec.doctor.base import Fault, NotMeasuredError, check
+from demorec.doctor.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.checks.files import folder_of
 from demorec.doctor.evidence import Evidence
 
@@ -49,7 +49,7 @@ def lerobot_opens(evidence: Evidence) -> Iterator[Fault]:
     """Let the installed LeRobot open the dataset and read the first, middle and last frame, images included."""
     folder = folder_of(evidence)
     if not evidence.opens_lerobot:
-        raise NotMeasuredError("LeRobot is started by --lerobot, which takes seconds")
+        raise NotApplicableError("LeRobot is started by --lerobot, which takes seconds")
     if folder.info.is_old:
         raise NotMeasuredError("LeRobot 0.6 reads v3.0 alone: demorec dataset select writes it")
     if not lerobot_is_installed():

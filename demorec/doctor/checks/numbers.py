@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.evidence import EpisodeEvidence, Evidence, joined, number_in_words, quaternion_places
 from demorec.doctor.robust import runs, without_gaps
 from demorec.doctor.units import MIN_UNIT_RATIO
@@ -38,10 +38,10 @@ MIN_SAME_STATE = 5
 VELOCITY_WINDOW_S = 0.3
 """Time over which velocities are integrated: filters of drivers are 20 to 100 ms late, which cancels over longer."""
 MAX_VELOCITY_ERROR = 0.3
-"""Distance from one of the ratio of displacement and integrated velocity: filters and rounding change it by a tenth, the
-nearest wrong unit or rate by a half."""
+"""Distance from one of the ratio of displacement and integrated velocity: filters and rounding change it by a
+tenth, the nearest wrong unit or rate by a half."""
 MAX_NORM_ERROR = 0.02
-"""Distance of a quaternion's length from one: float16 rounds to 0.001, interpolation between frames loses a hundredth."""
+"""Distance of a quaternion's length from one: float16 rounds to 0.001, interpolation loses 0.01."""
 
 
 @check(
@@ -225,9 +225,12 @@ def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, 
     for element, column in enumerate(evidence.action_of):
         if column is None or evidence.is_gripper[element] or any(np.ptp(state[:, element]) for _, state in episodes):
             continue
-        moved = [np.ptp(each.action[:, column]) for each, _ in episodes if each.action is not None]
-        others = [np.ptp(e.action[:, c]) for e, _ in episodes if e.action is not None for c in evidence.action_of if c]
-        if moved and np.median(moved) > 0.1 * np.median(others or [0.0]) > 0:
+        acting = [each.action for each, _ in episodes if each.action is not None]
+        if not acting:
+            return
+        spans = np.median(np.stack([np.ptp(action, axis=0) for action in acting]), axis=0)
+        usual_span = float(np.median(spans[spans > 0])) if (spans > 0).any() else 0.0
+        if spans[column] > 0.1 * usual_span:
             yield Fault(
                 severity="broken",
                 value="0",
@@ -278,7 +281,7 @@ def _frozen_whole(
     evidence: Evidence, episode: EpisodeEvidence, state: Array, same: NDArray[np.bool_], needed: int
 ) -> Fault | None:
     """A rest of the whole state that ends with a jump, or in which the whole action moves."""
-    rests = [(first, end) for first, end in runs(same.all(axis=1)) if end - first >= needed]
+    rests = [(first, end) for first, end in runs(np.asarray(same.all(axis=1))) if end - first >= needed]
     alive = evidence.ranges > 0
     for first, end in rests:
         if end >= len(state) - 1:
@@ -417,7 +420,7 @@ def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
         for place in quaternion_places(column.elements)
     ]
     if not places:
-        raise NotMeasuredError("no elements have the names of a quaternion")
+        raise NotApplicableError("no elements have the names of a quaternion")
     for name, place in places:
         worst: dict[int, float] = {}
         for episode in evidence.episodes:

@@ -7,13 +7,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 
 MAX_GAP_PERIODS = 2.5
 """Periods between two frames above which frames are missing between them; one late frame takes two."""
 MAX_RATE_ERROR = 0.1
-"""Difference of the measured rate from the stated one, as a share of it, above which motion is learned at a wrong speed."""
+"""Difference of the measured rate from the stated one, as a share of it, above which motion has a wrong speed."""
 MIN_FRAMES = 5
 MAX_AGE_S = 0.2
 """Age of a sample or an image, in seconds, above which a policy sees the past: people react in as much time."""
@@ -98,7 +98,7 @@ def frame_rate(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="broken",
             value=f"{rate:.3g} Hz",
-            message=f"the frames are {1 / rate:.3g} s apart, which is {rate:.3g} Hz, and {evidence.fps:g} Hz are stated",
+            message=f"the frames are {1 / rate:.3g} s apart, {rate:.3g} Hz; stated are {evidence.fps:g} Hz",
         )
         return
     for number, rate in wrong.items():
@@ -126,7 +126,7 @@ def _period(times: Array) -> float:
 def time_grid(evidence: Evidence) -> Iterator[Fault]:
     """Compare the timestamps of a dataset with frame_index / fps, as LeRobot does when it loads one."""
     if evidence.folder is None:
-        raise NotMeasuredError("recordings have times of their own")
+        raise NotApplicableError("recordings have times of their own")
     from demorec.datasets.lerobot.episode_table import are_on_grid
 
     worst: dict[int, float] = {}
@@ -140,7 +140,7 @@ def time_grid(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="look",
             value=f"{1000 * largest:.1f} ms",
-            message=f"the timestamps of {len(worst)} episodes are not frame_index / fps, by up to {1000 * largest:.1f} ms",
+            message=f"timestamps of {len(worst)} episodes are off frame_index / fps by up to {1000 * largest:.1f} ms",
         )
         return
     for number, error in worst.items():
@@ -164,7 +164,7 @@ def time_grid(evidence: Evidence) -> Iterator[Fault]:
 def sample_age(evidence: Evidence) -> Iterator[Fault]:
     """Compare the timestamps of samples and images with those of their frames, stream by stream."""
     if not any(episode.image_ages_s for episode in evidence.episodes):
-        raise NotMeasuredError("samples have no timestamps of their own")
+        raise NotApplicableError("samples have no timestamps of their own")
     for episode in evidence.episodes:
         for name, ages in episode.image_ages_s.items():
             old = np.abs(ages) > MAX_AGE_S
@@ -191,7 +191,7 @@ def sample_age(evidence: Evidence) -> Iterator[Fault]:
 def recording_losses(evidence: Evidence) -> Iterator[Fault]:
     """Report the frames and images that the recorder itself counted as dropped."""
     if evidence.folder is not None:
-        raise NotMeasuredError("LeRobot datasets do not state what was lost")
+        raise NotApplicableError("LeRobot datasets do not state what was lost")
     for episode in evidence.episodes:
         if episode.drops:
             yield Fault(severity="look", episode=episode.number, value=episode.drops, message=f"lost: {episode.drops}")

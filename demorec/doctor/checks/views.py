@@ -80,8 +80,8 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
                     severity="broken",
                     episode=number,
                     value=f"{max(explained, 0):.0%}",
-                    message=f"{camera} does not show the motion of this episode ({max(explained, 0):.0%} of its changes are "
-                    f"explained by the state, usual are {usual_best:.0%})",
+                    message=f"{camera} does not show the motion of this episode: the state explains "
+                    f"{max(explained, 0):.0%} of its changes, usual are {usual_best:.0%}",
                 )
 
 
