@@ -21,8 +21,8 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-
 from demorec.check.kinematics import matrices
+
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array

@@ -22,11 +22,10 @@ from demorec.core.geometry import Array
 Level = Literal["pass", "warn", "fail", "skip"]
 Form = Literal["simulated", "external", "run", "external run", "dataset"]
 """What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
-Group = Literal["file", "time", "alignment", "images", "run", "dataset"]
+Group = Literal["file", "time", "images", "run", "dataset"]
 ADVICE: Mapping[Group, tuple[str, str]] = {
     "file": ("The recording is damaged or incomplete.", "demorec recover {path}, or record it again"),
     "time": ("Streams are not where their frames are.", "record it again: the file was changed, or written wrongly"),
-    "alignment": ("A frame holds what was measured at another moment.", "record it again at a lower rate"),
     "images": ("Images are missing or damaged.", "record it again, or leave it out"),
     "run": ("The run is not what its run.json states.", "run the command that began it again, or restore the files"),
     "dataset": ("The dataset is not what was exported.", "export it again"),
@@ -37,7 +36,6 @@ BLOCKED = "it needs what is damaged"
 NOTHING = "nothing to measure"
 
 SCENE = "a simulated scene"
-ANY_EPISODE: tuple[Form, ...] = ("simulated", "external", "dataset")
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -5,7 +5,6 @@ The streams of recordings that demorec did not simulate have clocks of their own
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -13,7 +12,6 @@ import numpy as np
 from demorec.check.base import (
     Found,
     Measurement,
-    NotMeasured,
     check,
     counted,
     external_check,
@@ -24,8 +22,6 @@ from demorec.check.base import (
 from demorec.check.episode import CheckedEpisode
 from demorec.episode.episode import NO_IMAGE
 from demorec.mcap import channels, messages
-
-_NANOSECONDS = 1_000_000_000
 
 
 @file_check(
@@ -169,69 +165,6 @@ def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
         place = keyframes[int(np.argmax(gaps))] if late and keyframes else None
         detail = f"camera {camera.name}: {len(keyframes)} keyframes, GOP {settings.gop}"
         yield Measurement(value=late, frame=place, detail=detail)
-
-
-@external_check(
-    group="time",
-    measures="frames and images dropped while recording",
-    fail=math.inf,
-)
-def drops(subject: CheckedEpisode) -> Found:
-    """Count the frames and images that the recorder dropped."""
-    outcome = subject.recording.outcome
-    if outcome is None:
-        return NotMeasured(why="the recording has no outcome, which would state it")
-    lost = ", ".join(f"{count} of {what}" for what, count in outcome.drops.items() if count)
-    return Measurement(value=sum(outcome.drops.values()), detail=lost)
-
-
-@external_check(
-    group="time",
-    measures="another mean rate than the nominal one (share)",
-    warn=0.05,
-    fail=0.5,
-)
-def rate(subject: CheckedEpisode) -> Found:
-    """Compare the mean rate of the frames with the nominal one, which datasets and policies use."""
-    times, fps = subject.recording.table().time_ns, subject.recording.info.fps
-    if len(times) < 2:
-        return None
-    rate = (len(times) - 1) * _NANOSECONDS / float(times[-1] - times[0])
-    return Measurement(value=abs(rate / fps - 1), detail=f"{rate:.4g} Hz instead of {fps} Hz")
-
-
-@external_check(
-    group="time",
-    measures="time between two frames, in nominal periods",
-    warn=2.5,
-    fail=30,
-)
-def gaps(subject: CheckedEpisode) -> Found:
-    """Find frames that are missing between others."""
-    steps = np.diff(subject.recording.table().time_ns)
-    if not len(steps):
-        return None
-    frame = int(steps.argmax())
-    periods = float(steps[frame]) * subject.recording.info.fps / _NANOSECONDS
-    return Measurement(value=periods, frame=frame + 1, detail=f"{steps[frame] / 1e6:.4g} ms after the frame before")
-
-
-@external_check(
-    group="alignment",
-    unit="s",
-    measures="samples and images older than their frame",
-    warn=0.2,
-    fail=1.0,
-)
-def sample_age(subject: CheckedEpisode) -> Iterator[Found]:
-    """Compare the timestamp of each frame with those of its samples and images."""
-    table = subject.recording.table()
-    for name in table.stamps:
-        yield worst_frame(np.abs(table.age_ns(name)) / _NANOSECONDS, name)
-    for camera, numbers in table.images.items():
-        ages = np.full(len(numbers), np.nan)
-        ages[numbers != NO_IMAGE] = np.abs(table.image_age_ns(camera)) / _NANOSECONDS
-        yield worst_frame(ages, f"camera {camera}")
 
 
 @external_check(

@@ -90,16 +90,15 @@ class CheckCommand:
         leave_pandas_out()
         integrity, chosen = split_checks(self.only)
         subjects = find_subjects(self.paths)
-        if self.only and not integrity:
-            subjects = []
+        files = subjects if integrity or not self.only else []
         workers = self.workers
         if workers is None:
             workers = useful_workers(subjects, images=self.images, cores=available_cores())
         options = CheckOptions(images=self.images, colours=bool(integrity), only=integrity, workers=workers)
         options.validate()
-        with ProgressBar("checking files", total=len(subjects), unit="item", at_once=workers) as bar:
+        with ProgressBar("checking files", total=len(files), unit="item", at_once=workers) as bar:
             reports = []
-            for report in check_subjects(subjects, options):
+            for report in check_subjects(files, options):
                 reports.append(report)
                 bar.advance()
         diagnoses = self._diagnosed(reports, chosen)

@@ -96,7 +96,7 @@ CHECKS: Registry[Check] = Registry(
     rows=_named_alike(
         "demorec.check",
         ("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps", "video_frames"),
-        ("file", "drops", "rate", "gaps", "sample_age", "missing_images"),
+        ("file", "missing_images"),
         ("images", "images_decode"),
         ("run", "run_files", "run_complete", "run_agrees"),
         ("run_dataset", "run_dataset"),

@@ -40,11 +40,9 @@ def test_a_run_stands_for_its_dataset(tmp_path: Path, capsys: pytest.CaptureFixt
     run = tmp_path / "run"
     run.mkdir()
     (run / "run.json").write_text("{}")
-    assert exit_code("dataset", "score", run) == 2
+    assert exit_code("dataset", "select", run, "--where", "score > 0", "--out", tmp_path / "none") == 2
     assert "This run has no dataset in dataset/" in capsys.readouterr().err
     write_foreign(run / "dataset", episodes=3)
-    assert exit_code("dataset", "score", run, "--json") == 0
-    assert len(json.loads(capsys.readouterr().out)["episodes"]) == 3
     assert exit_code("dataset", "select", run, "--episodes", "1", "--out", tmp_path / "one") == 0
     assert "1 of 3 episodes, 8 of 24 frames" in capsys.readouterr().out
     assert exit_code("dataset", "drop", run, "--episodes", "0,", "2", "--out", tmp_path / "rest") == 0
@@ -82,7 +80,7 @@ def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
     printed = capsys.readouterr().out
     assert "3 of 5 episodes, 24 of 40 frames: parts/a" in printed
     assert "2 of 5 episodes, 16 of 40 frames: parts/b" in printed
-    assert exit_code("dataset", "score", "parts") == 2
+    assert exit_code("dataset", "select", "parts", "--episodes", "0", "--out", "x") == 2
     assert "it holds datasets, name one (a, b): parts" in capsys.readouterr().err
 
 
@@ -160,8 +158,4 @@ def test_the_home_folder_within_quotes(
     monkeypatch.setenv("HOME", str(cups.parent))
     assert exit_code("dataset", "select", "~/cups", "--episodes", "0", "--out=~/new") == 0
     assert (cups.parent / "new/meta/info.json").is_file()
-    assert exit_code("dataset", "score", "cups", "--out", "~/scores.json") == 0
-    assert f"Scores of 5 episodes: {cups.parent}/scores.json" in capsys.readouterr().err
     assert not Path("~").exists()
-    assert exit_code("dataset", "score", "cups", "--out", "x" * 250) == 2
-    assert "A file of scores (JSON) cannot be written (File name too long)" in capsys.readouterr().err

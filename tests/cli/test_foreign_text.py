@@ -131,7 +131,7 @@ def test_recordings(hostile: Path, name: str, tmp_path: Path) -> None:
     path = hostile / name
     for arguments in (
         *_on_a_path(path, tmp_path / NAME),
-        ["info", path, "--json"], ["check", path, "--verbose"], ["check", path, "--json"],
+        ["info", path, "--json"], ["check", path, "--all"], ["check", path, "--json"],
         ["render", path, "--cameras", HOSTILE, "--out", tmp_path / "new.mcap", "--workers", "1"],
     ):  # fmt: skip
         _spoken(arguments)
@@ -148,7 +148,7 @@ def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
     path = hostile / name
     for arguments in (
         *_on_a_path(path, tmp_path / f"new_{NAME}"),
-        ["info", path, "--json"], ["check", path, "--no-images", "--verbose"],
+        ["info", path, "--json"], ["check", path, "--no-images", "--all"],
         ["export", "lerobot", hostile / "good.mcap", "--out", path, "--append", "--no-verify"],
         ["dataset", "rename", path, f"observation.state={HOSTILE}", "--out", tmp_path / "new"],
         ["dataset", "merge", path, hostile / "dataset", "--out", tmp_path / NAME],

@@ -409,13 +409,6 @@ KEPT: dict[str, dict[str, str]] = {
         "lock.html": "lock.html",
     },
     "report dataset --out": {"dataset/report.html": "Nothing else is written into a dataset"},
-    "dataset score dataset --out": {
-        "thesis.json": "thesis.json",
-        "thesis.tex": "thesis.tex",
-        "thesis": "it is a folder",
-        "dataset/meta/info.json": "info.json",
-        "dataset/scores.json": "Nothing else is written into a dataset",
-    },
     **{f"export {exporter} alone.mcap --out": {"lock": "lock"} for exporter in EXPORTERS.names()},
 }
 """Command -> what it shall not write over, and words of the reason."""
@@ -457,7 +450,6 @@ def test_a_command_replaces_its_own_files_only(
 
 OWN = {
     "report --no-checks alone.mcap --out": "new.html",
-    "dataset score dataset --out": "new.json",
     "recover broken.mcap --out": "new.mcap",
 }
 

@@ -18,7 +18,6 @@ CALLS = {
     "import": "import lerobot DATASET --out NEW",
     "dataset": "dataset select DATASET --episodes 0 --out NEW",
     "dataset split": "dataset split DATASET --shares a=0.5 b=0.5 --out NEW",
-    "dataset score": "dataset score DATASET --out NEW.json",
     "report": "report RECORDING --no-checks --out NEW.html",
     "view": "view RECORDING --save NEW.rrd",
     "replay": "replay RECORDING --out NEW",

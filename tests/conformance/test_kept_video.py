@@ -183,10 +183,14 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Imag
 
 
 def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> None:
-    for name in ("dataset_videos", "dataset_sidecar"):
+    for name in ("undecodable_images", "dataset_sidecar"):
         assert level_of(dataset, name, "dataset") == "pass"
     # An episode that is off by an image has a gap of the right kind in front, but not the images of its digest.
-    for check, episode, shift in (("dataset_sidecar", 1, -1), ("dataset_sidecar", 1, 1), ("dataset_videos", 0, -GOP)):
+    for check, episode, shift in (
+        ("dataset_sidecar", 1, -1),
+        ("dataset_sidecar", 1, 1),
+        ("undecodable_images", 0, -GOP),
+    ):
         spoilt = tmp_path / f"{check}{shift}"
         shutil.copytree(dataset, spoilt)
         (path,) = (spoilt / "meta" / "episodes").rglob("*.parquet")

@@ -210,10 +210,10 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     assert not any((tmp_path / name / "demorec").exists() for name in ("both", "merged"))
     # The merge takes means of both datasets' quantiles: said, but no failure; other numbers are one.
     levels = {r.check: r.level for r in checked(tmp_path / "both", "dataset").results}
-    assert levels["dataset_statistics"] == "warn"
-    assert [name for name, level in levels.items() if level == "fail"] == ["duplicates"]  # they are
+    assert levels["wrong_statistics"] == "warn"
+    assert [name for name, level in levels.items() if level == "fail"] == ["copied_episodes"]  # they are
     edit_json(tmp_path / "both/meta/stats.json", lambda data: data["action"].update(q90=data["action"]["max"]))
-    assert level_of(tmp_path / "both", "dataset_statistics", "dataset") == "fail"
+    assert level_of(tmp_path / "both", "wrong_statistics", "dataset") == "fail"
 
 
 @pytest.mark.slow

@@ -18,6 +18,7 @@ from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.doctor.evidence import Evidence
 
 
 @pytest.fixture(scope="module")
@@ -66,7 +67,7 @@ LINES: dict[str, Callable[[Any], None]] = {
 
 def test_the_good_one_passes(good: Path) -> None:
     assert {(result.check, result.level) for result in checked(good, "run").results} == {
-        (check, "pass") for check in ("run_files", "run_complete", "run_agrees", "run_dataset", "duplicates")
+        (check, "pass") for check in ("run_files", "run_complete", "run_agrees", "run_dataset")
     }
 
 
@@ -118,7 +119,7 @@ def an_episode_twice(run: Path) -> None:
 
 FOLDERS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
     "recordings exchanged": (recordings_exchanged, {"run_agrees", "run_files"}),
-    "an episode twice": (an_episode_twice, {"duplicates", "run_files"}),
+    "an episode twice": (an_episode_twice, {"run_files"}),
     "a missing file": (lambda run: (run / "episodes/episode_000001.mcap").unlink(), {"run_files"}),
 }
 
@@ -140,11 +141,10 @@ def test_a_recording_that_a_killed_run_has_not_listed_yet(run: Path, complete: b
     assert ("the command that began the run takes it in" in found.detail) != complete
 
 
-def test_a_fixed_layout_is_no_duplicate(tmp_path: Path) -> None:
-    run = simulate_run(tmp_path / "run", 2, seed=3, task="tutorial", fixed=True, variation="none")
-    (result,) = checked(run, "run", only=["duplicates"]).results
-    assert result.level == "skip"
-    assert "--fixed" in result.detail
+def test_an_episode_twice_is_a_copy(run: Path) -> None:
+    assert level_of(run, "copied_episodes", "run") == "pass"
+    an_episode_twice(run)
+    assert level_of(run, "copied_episodes", "run") == "fail"
 
 
 # ------------------------------------------------------------------------------------------------- its dataset
@@ -196,22 +196,22 @@ def test_one_bad_recording_leaves_the_reports_of_the_others(workers: int, run: P
     ]
 
 
-def test_an_unexpected_error_is_one_finding(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from demorec.check.episode import CheckedEpisode
-
-    def broken(self: CheckedEpisode) -> Iterator[None]:
+def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken(self: Evidence) -> None:
         raise IndexError("list index out of range")
 
-    monkeypatch.setattr(CheckedEpisode, "motions", property(broken))
-    report = checked(good / "episodes" / "episode_000000.mcap")
-    ((check, detail),) = [(result.check, result.detail) for result in report.results if result.level == "fail"]
-    assert check == "joint_limits"
-    assert "cannot be computed" in detail
-    assert "index" not in detail
-    assert {"opens", "checksums", "finite_numbers"} <= {r.check for r in report.results if r.level == "pass"}
+    monkeypatch.setattr(Evidence, "arm", property(broken))
+    results = {result.check: result for result in checked(good / "episodes" / "episode_000000.mcap").results}
+    assert results["joint_limits"].level == "skip"
+    assert "cannot be computed" in results["joint_limits"].detail
+    assert "index" not in results["joint_limits"].detail
+    assert {results[name].level for name in ("opens", "checksums", "missing_numbers")} == {"pass"}
 
 
 def test_the_command_goes_on_after_a_bad_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "episodes" / "episode_000000.mcap").write_bytes(b"")
     assert exit_code("check", run, "--json", "--no-images") == 1
-    assert [row["level"] for row in json.loads(capsys.readouterr().out)] == ["fail", "fail", "pass", "pass"]
+    found = json.loads(capsys.readouterr().out)
+    assert found["verdict"] == "broken"
+    assert {each["episode"]: each["verdict"] for each in found["episodes"]} == {0: "broken", 1: "good"}
+    assert {each["check"] for each in found["findings"] if each["episode"] is None} == {"run_files", "run_dataset"}

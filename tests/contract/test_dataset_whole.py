@@ -19,7 +19,7 @@ from support.export import content_of, export, make_run, recordings
 NUM_EPISODES, LENGTH = 4, 8
 READERS = {
     "info": "info PATH",
-    "check": "check PATH --only dataset_readable dataset_counts",
+    "check": "check PATH --only unreadable_episodes contradicting_counts",
     "view": "view PATH --episodes 1 --save NEW.rrd",
     "export-hdf5": "export hdf5 PATH --out NEW.hdf5",
     "export-lerobot": "export lerobot PATH --out NEW --no-verify",
@@ -37,7 +37,6 @@ READERS = {
     "reorder": "dataset reorder PATH --by num_frames --out NEW",
     "shuffle": "dataset shuffle PATH --out NEW",
     "diff": "dataset diff PATH PATH",
-    "score": "dataset score PATH --out NEW.json",
 }
 """Command -> how it is called with a PATH; what it writes begins with NEW."""
 
@@ -239,14 +238,14 @@ def test_the_checks_judge_the_other_episodes(spoilt: tuple[Path, Path]) -> None:
     root, path = spoilt
     found = {result.check: result for result in checked(root, "dataset", images=False).results}
     is_data = path.suffix == ".parquet"
-    assert found["dataset_readable"].value == (1 if is_data else 0)
-    assert found["dataset_videos"].value == (0 if is_data else 1)
-    assert path.name in found["dataset_readable" if is_data else "dataset_videos"].detail
-    assert {found[name].level for name in ("finite_numbers", "dataset_counts", "dataset_statistics")} <= {
+    assert (found["unreadable_episodes"].level == "fail") == is_data
+    assert (found["video_places"].level == "fail") != is_data
+    assert path.name in found["unreadable_episodes" if is_data else "video_places"].detail
+    assert {found[name].level for name in ("missing_numbers", "contradicting_counts", "wrong_statistics")} <= {
         "pass",
         "skip",
     }
-    assert found["finite_numbers"].level == "pass"
+    assert found["missing_numbers"].level == "pass"
 
 
 def test_the_other_episodes_are_shown(spoilt: tuple[Path, Path], tmp_path: Path) -> None:

@@ -271,7 +271,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     kept = [note for note in notes if note.topic != "/follower/joint_states" or note.log_ns not in gone]
     bag = bags.write_mcap(kept, tmp_path / "bag.mcap")
     mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "so101.toml")
-    assert exit_code("check", bag, "--mapping", mapping, "--verbose") == 0
+    assert exit_code("check", bag, "--mapping", mapping, "--all") == 0
     printed = capsys.readouterr().out
     assert f"warn  run {bag}: " in printed
     (judged,) = [line for line in printed.splitlines() if "  import_findings 1" in line]

@@ -54,7 +54,7 @@ def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
 
 
 def test_copies_are_counted_beside_messages_without_a_time(notes: bags.Notes, tmp_path: Path) -> None:
-    """Every third message twice, and no time in the last header, which the duplicates do not belong to."""
+    """Every third message twice, and no time in the last header, which the copied_episodes do not belong to."""
     topic = "/follower/joint_states"
     twice = hurt(notes, "duplicated messages")
     last = max(note.log_ns for note in twice if note.topic == topic)

@@ -70,7 +70,7 @@ def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
     for path in (dataset, small):
         report = checked(path, "dataset", images=False)
         assert [r for r in report.results if r.level in ("warn", "fail")] == []
-    for check in ("forward_kinematics", "joint_limits"):
+    for check in ("pose_mismatch", "joint_limits"):
         assert level_of(small, check, "dataset") == "pass"
 
 
@@ -78,7 +78,7 @@ def test_a_wrong_pose_in_the_state_is_found(small: Path) -> None:
     before = states(small)
     edit_column(small, STATE, lambda rows: rows[:, [*range(11), 14, 11, 12, 13]])  # scalar first
     assert not np.array_equal(states(small), before)
-    assert level_of(small, "forward_kinematics", "dataset") == "fail"
+    assert level_of(small, "pose_mismatch", "dataset") == "fail"
 
 
 def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:

@@ -141,7 +141,7 @@ def test_a_video_that_claims_very_many_images(table: bytes, commands: LimitedCom
     (length,) = struct.unpack_from(">I", whole, begin)
     spoilt = whole[:begin] + table + _box(b"free", bytes(length)) + whole[begin + length :]
     video.write_bytes(spoilt)
-    commands.refused("check", dataset, "--only", "dataset_videos")
+    commands.refused("check", dataset, "--only", "undecodable_images")
     commands.refused("import", "lerobot", dataset, "--out", tmp_path / "run")
 
 
@@ -151,7 +151,7 @@ def test_fifos_in_a_dataset(name: str, good: Path, commands: LimitedCommands, tm
     export([good], dataset)
     (dataset / name).unlink()
     os.mkfifo(dataset / name)
-    checks = ["--only", "dataset_readable", "dataset_statistics"]
+    checks = ["--only", "unreadable_episodes", "wrong_statistics"]
     assert "it is a FIFO" in commands.refused("check", dataset, *checks)
     commands.refused("export", "lerobot", good, "--out", dataset, "--append", "--no-verify")
 

@@ -96,7 +96,7 @@ def test_a_dataset_claims_very_much(claim: Callable[[Path], None], commands: Lim
     assert sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) < 1_000_000
     _told(commands, "info", root)
     _told(commands, "report", root, "--out", tmp_path / "report.html")
-    _told(commands, "check", root, "--only", "dataset_readable", "dataset_counts", "dataset_schema")
+    _told(commands, "check", root, "--only", "unreadable_episodes", "contradicting_counts", "table_schema")
     assert len(commands.refused("import", "lerobot", root, "--out", tmp_path / "run").splitlines()) == 1
 
 

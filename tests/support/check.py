@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +18,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from demorec.check.base import Result
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
+from demorec.cli.explain import split_checks
+from demorec.cli.shared.diagnoses import examine
 from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.doctor.base import Check
+from demorec.doctor.from_dataset import ReadOptions
 from demorec.episode.episode import CameraImages, Event, Frame, Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
@@ -80,9 +85,32 @@ def checked(
     images: bool = True,
     motors: Motors | None = None,
 ) -> SubjectReport:
-    """The report of some checks, or of all."""
-    options = CheckOptions(only=tuple(only), images=images, motors=motors)
-    return check_subject(Subject(path=path, kind=kind), options)  # type: ignore[arg-type]
+    """The report of some checks, or of all: of files' integrity, and of the doctor in the same form."""
+    integrity, doctors = split_checks(only)
+    subject = Subject(path=path, kind=kind)  # type: ignore[arg-type]
+    found: tuple[Result, ...] = ()
+    if integrity or not only:
+        found = check_subject(subject, CheckOptions(only=integrity, images=images)).results
+    if doctors and (kind != "run" or only):
+        found += tuple(_of_doctor(path, doctors, ReadOptions(images=images, motors=motors)))
+    return SubjectReport(**vars(subject), results=found)
+
+
+def _of_doctor(path: Path, checks: Sequence[Check], options: ReadOptions) -> Iterator[Result]:
+    """A result for each check of the doctor that applies: its worst finding."""
+    diagnosis, _ = examine(path, options, checks=checks)
+    levels = {"look": "warn", "broken": "fail"}
+    for check in checks:
+        mine = [finding for finding in diagnosis.findings if finding.check == check.name]
+        level, detail = "pass", ""
+        if mine:
+            level, detail = levels[mine[0].severity], mine[0].message
+        elif check.name in diagnosis.not_measured:
+            level, detail = "skip", diagnosis.not_measured[check.name]
+        yield Result(
+            check=check.name, group=check.family, level=level, value=None, unit=check.unit, warn=0, fail=0, frame=None,
+            detail=detail, why=check.why, do=check.do,
+        )  # type: ignore[arg-type]  # fmt: skip
 
 
 def level_of(path: Path, check: str, kind: str = "recording") -> str:

@@ -14,11 +14,11 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
-from demorec.check import lerobot_opens
 from demorec.core.config import VideoConfig
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import export as lerobot_export
 from demorec.datasets.options import ExportReport
+from demorec.doctor.checks import lerobot_opens
 from support.recording import write_episode
 
 

@@ -71,7 +71,7 @@ dataset = "actions"
 dataset = "obs/agentview_image"
 colors = "rgb"
 """
-_CHECKS = tuple(name for name in CHECKS.names() if name.startswith("dataset_") and name != "dataset_opens")
+_CHECKS = tuple(name for name in CHECKS.names() if name.startswith("dataset_") and name != "lerobot_opens")
 """Of datasets; LeRobot takes seconds to load."""
 Case = tuple[str, list[str]]
 

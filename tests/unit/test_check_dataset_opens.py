@@ -10,13 +10,19 @@ import pytest
 from support.commands import exit_code
 from support.export import export
 
-from demorec.check import lerobot_opens
-from demorec.check.base import Measurement
-from demorec.check.dataset import CheckedDataset
+from demorec.doctor.base import Finding
+from demorec.doctor.checks import lerobot_opens
+from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_HUB_OFFLINE` environment variable."
 """What LeRobot 0.6.1 ends with where a file of the dataset is missing: it asks the Hub for it."""
+
+
+def opened(dataset: Path) -> list[Finding]:
+    """What is found when LeRobot opens it."""
+    evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
+    return lerobot_opens.lerobot_opens.run(evidence)[0]
 
 
 def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -29,11 +35,10 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
 
     monkeypatch.setattr(lerobot_opens, "lerobot_is_installed", lambda: True)
     monkeypatch.setattr(subprocess, "run", run)
-    found = lerobot_opens.dataset_opens.measure(CheckedDataset(tmp_path / "d"))
-    assert isinstance(found, Measurement)
-    assert found.value == 1
-    assert str(video.relative_to(tmp_path / "d")) in found.detail
-    assert "HF_HUB_OFFLINE" not in found.detail
+    (found,) = opened(tmp_path / "d")
+    assert found.severity == "broken"
+    assert str(video.relative_to(tmp_path / "d")) in found.message
+    assert "HF_HUB_OFFLINE" not in found.message
 
 
 @pytest.mark.parametrize(
@@ -56,7 +61,7 @@ def test_too_little_memory_says_nothing_about_the_dataset(
         path.touch()
     (fake / "lerobot_dataset.py").write_text(module)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
-    assert exit_code("check", tmp_path / "d", "--only", "dataset_opens") == 1
+    assert exit_code("check", tmp_path / "d", "--lerobot", "--only", "lerobot_opens") == 1
     out, err = capsys.readouterr()
     assert "failed" not in out
     assert "is there too little memory?" in err
@@ -73,12 +78,11 @@ def test_a_dataset_that_lerobot_refuses_fails(tmp_path: Path, monkeypatch: pytes
         "class LeRobotDataset:\n    def __init__(self, **_): raise ValueError('no')"
     )
     monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
-    found = lerobot_opens.dataset_opens.measure(CheckedDataset(tmp_path / "d"))
-    assert isinstance(found, Measurement)
-    assert found.value == 1
+    (found,) = opened(tmp_path / "d")
+    assert found.severity == "broken"
 
 
-def test_lerobot_opens_a_dataset_by_request_or_where_another_check_failed(
+def test_lerobot_opens_a_dataset_by_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     asked = []
@@ -94,6 +98,3 @@ def test_lerobot_opens_a_dataset_by_request_or_where_another_check_failed(
     assert asked == []
     exit_code("check", tmp_path / "d", "--lerobot")
     assert len(asked) == 1
-    (tmp_path / "d" / "meta" / "stats.json").unlink()
-    assert exit_code("check", tmp_path / "d") == 1
-    assert len(asked) == 2

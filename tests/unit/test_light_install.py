@@ -11,13 +11,13 @@ import pytest
 from support.commands import exit_code
 from support.export import make_run
 
-from demorec.check.dataset import CheckedDataset
 from demorec.cli import COMMANDS
 from demorec.core.errors import ExportError, MissingDependencyError
-from demorec.core.tables import CHECKS
 from demorec.datasets.lerobot.export import export_lerobot, push_to_hub
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.verify import LEROBOT
+from demorec.doctor.checks.lerobot_opens import lerobot_opens
+from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
 from demorec.learn.evaluate.policy import Policy
 
 ROOT = Path(__file__).parents[2]
@@ -63,8 +63,9 @@ def test_an_export_says_that_nothing_was_verified(
 def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tmp_path / "d"
     export_lerobot([run], dataset, ExportOptions(verify=False))
-    result = CHECKS.load("dataset_opens").run(CheckedDataset(dataset))
-    assert (result.level, "needs the package 'lerobot'" in result.detail) == ("skip", True)
+    evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
+    found, reason = lerobot_opens.run(evidence)
+    assert (found, "needs the package 'lerobot'" in str(reason)) == ([], True)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingDependencyError, match="train"):
         Policy(tmp_path)

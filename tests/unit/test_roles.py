@@ -6,7 +6,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,34 +26,31 @@ UNKNOWN = Convention({"measured": (None, (0, 1, 2, 3))}, {"wanted": (None, (0, 1
 NAMED = ("--state", "measured", "--action", "wanted")
 
 
-def results(capsys: Capture, *words: object) -> dict[str, Any]:
-    """Check -> its result, and "notes", of `demorec check`."""
+def diagnosis(capsys: Capture, *words: object) -> dict[str, Any]:
+    """Give what `demorec check` finds."""
     capsys.readouterr()
     exit_code("check", *words, "--no-images", "--json")
-    (report,) = json.loads(capsys.readouterr().out)
-    return {result["check"]: result for result in report["results"]} | {"notes": report["notes"]}
+    found: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return found
+
+
+def found_by(found: dict[str, Any], check: str) -> list[dict[str, Any]]:
+    return [finding for finding in found["findings"] if finding["check"] == check]
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
 def test_motion_is_checked_whatever_the_features_are_called(name: str, tmp_path: Path, capsys: Capture) -> None:
-    good = results(capsys, write_convention(tmp_path / "good", CONVENTIONS[name]))
-    assert good["notes"] == []
-    assert (good["action_lag"]["level"], good["action_lag"]["detail"][:27]) == ("pass", "the state follows by +3.00 ")
-    assert good["frozen_sensors"]["level"] == "pass"
-    bad = results(capsys, write_convention(tmp_path / "bad", CONVENTIONS[name], frozen=True))
-    assert bad["frozen_sensors"]["level"] == "fail"
-    assert "episode 2" in bad["frozen_sensors"]["detail"]
+    good = diagnosis(capsys, write_convention(tmp_path / "good", CONVENTIONS[name]))
+    assert {name for name, role in good["taken"].items() if role is None} == set()
+    assert not {"action_lag", "frozen_state"} & {each["check"] for each in good["not_measured"]}
+    assert not found_by(good, "action_lag")
+    assert not found_by(good, "frozen_state")
+    bad = diagnosis(capsys, write_convention(tmp_path / "bad", CONVENTIONS[name], frozen=True))
+    (finding,) = found_by(bad, "frozen_state")
+    assert (finding["severity"], finding["episode"]) == ("broken", 2)
     is_named = CONVENTIONS[name].state.get("observation.state", (None,))[0] is not None
-    assert not is_named or bad["frozen_sensors"]["detail"].startswith("elbow")
-
-
-@pytest.mark.parametrize("name", CONVENTIONS)
-def test_the_spoilt_episode_has_the_lowest_score(name: str, tmp_path: Path, capsys: Capture) -> None:
-    root = write_convention(tmp_path / "d", CONVENTIONS[name], frozen=True)
-    assert exit_code("dataset", "score", root, "--json") == 0
-    scores = [episode["score"] for episode in json.loads(capsys.readouterr().out)["episodes"]]
-    assert int(np.argmin(scores)) == 2
-    assert scores[2] < 0.96
+    assert not is_named or finding["message"].startswith("elbow")
+    assert bad["episodes"][0]["episode"] == 2
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
@@ -76,15 +72,15 @@ def test_without_state_and_action_the_verdict_says_what_was_not_looked_at(tmp_pa
     assert exit_code("dataset", "drop", source, "--episodes", "0", "--out", root) == 0  # it writes statistics
     capsys.readouterr()
     assert exit_code("check", root, "--no-images") == 0
-    verdict, first, second, *_ = capsys.readouterr().out.splitlines()
-    assert verdict.startswith("pass")
-    assert first.strip() == (
-        "No state and no action found, so nothing was judged by it; name it: --state FEATURE, --action FEATURE."
-    )
-    assert second.strip() == "Without a role, so not looked at: measured, wanted."
-    assert results(capsys, root)["action_lag"]["level"] == "skip"
-    named = results(capsys, root, *NAMED)
-    assert (named["notes"], named["action_lag"]["level"], named["frozen_sensors"]["level"]) == ([], "pass", "fail")
+    taken, verdict, *_ = capsys.readouterr().out.splitlines()
+    assert "no state: --state COLUMN names it; no action: --action COLUMN names it" in taken
+    assert "no role, so not looked at: measured, wanted" in taken
+    assert verdict.startswith("good: ")
+    assert "action_lag" in {each["check"] for each in diagnosis(capsys, root)["not_measured"]}
+    named = diagnosis(capsys, root, *NAMED)
+    assert named["taken"]["measured"] == "state"
+    assert "action_lag" not in {each["check"] for each in named["not_measured"]}
+    assert found_by(named, "frozen_state")
 
 
 def test_info_shows_what_has_no_role_first_and_what_the_user_names(tmp_path: Path, capsys: Capture) -> None:
@@ -113,7 +109,6 @@ def test_info_shows_what_has_no_role_first_and_what_the_user_names(tmp_path: Pat
         "view {d} --save {new}.rrd",
         "report {d} --out {new}.html",
         "import lerobot {d} --out {new}",
-        "dataset score {d}",
         "replay {d} --robot panda",
     ],
 )
@@ -146,7 +141,7 @@ def test_an_import_records_what_the_user_names(tmp_path: Path, capsys: Capture) 
     assert exit_code("import", "lerobot", root, "--out", run, *NAMED) == 0
     recording = run / "episodes/episode_000002.mcap"
     named = results(capsys, recording)
-    assert (named["notes"], named["frozen_sensors"]["level"]) == ([], "fail")
+    assert (named["notes"], named["frozen_state"]["level"]) == ([], "fail")
     assert exit_code("info", recording) == 0
     assert "feature measured  state, 4 float32 (unnamed), units unknown" in capsys.readouterr().out
     assert exit_code("info", run) == 0
@@ -196,13 +191,6 @@ def test_a_report_draws_state_and_action(tmp_path: Path, capsys: Capture) -> Non
     text = (tmp_path / "c.html").read_text()
     assert "No state and no action found" not in text
     assert "component 3" in text
-
-
-def test_nothing_to_score_by_is_no_perfect_score(tmp_path: Path, capsys: Capture) -> None:
-    root = write_convention(tmp_path / "d", UNKNOWN)
-    assert exit_code("dataset", "score", root) == 1
-    assert "No state was found to score episodes by" in capsys.readouterr().err
-    assert exit_code("dataset", "score", root, *NAMED) == 0
 
 
 def test_idle_frames_are_found_in_anybodys_state(tmp_path: Path, capsys: Capture) -> None:

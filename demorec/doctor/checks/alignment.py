@@ -18,10 +18,10 @@ MIN_SHIFT = 0.7
 """Frames by which the lag of an episode differs, at least: whole frames are lost or doubled, not parts."""
 MIN_GAIN = 0.7
 """Natural logarithm of the factor by which an episode's own lag leaves less variance unexplained: two."""
-MIN_LEAD = 0.4
+MIN_LEAD = 0.25
 """Frames by which the state is ahead of its action from which the two are misaligned: a command is never late."""
-MAX_LAG_S = 0.5
-"""Time by which a state follows at most: an arm that is half a second behind cannot be teleoperated."""
+MAX_LAG_S = 0.35
+"""Time by which a state usually follows at most: hobby servos under teleoperation need 0.1 to 0.2 s."""
 EQUAL_RATIO = 1e-4
 """Difference of action and state, as a share of the range, up to which they are the same number."""
 MIN_EQUAL_SHARE = 0.95
@@ -42,7 +42,7 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
     """Compare how far the state follows the action: over the whole set, and in each episode against the others.
 
     The lag is where the action explains most of the state's motion, as a target or as an increment. The state may
-    follow by up to half a second; it cannot be ahead. An episode is judged by the difference from the usual lag.
+    follow by up to 0.35 s; it cannot be ahead. An episode is judged by the difference from the usual lag.
     """
     relation = evidence.relation
     usual_lag = relation.usual_lag

@@ -61,7 +61,7 @@ def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
                 severity="look",
                 episode=number,
                 value=f"{end_speed:.0%}",
-                message=f"it ends while the arm moves at {end_speed:.0%} of its usual speed; {at_rest:.0%} of all end at rest",
+                message=f"it ends while the arm moves at {end_speed:.0%} of its speed; {at_rest:.0%} end at rest",
             )
 
 

@@ -65,7 +65,7 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     why="LeRobot takes rows and images by these numbers: it finds others, or none.",
     do="demorec dataset select {path} --where 'num_frames > 0' --out NEW numbers them again; otherwise record it again",
 )
-def counts(evidence: Evidence) -> Iterator[Fault]:
+def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
     """Compare totals with the tables; indices count up without a gap, and tasks are those of the episodes' table."""
     folder = folder_of(evidence)
     info = folder.info

@@ -20,6 +20,9 @@ from demorec.robots.urdf import Urdf, UrdfJoint
 
 KNOWN_ERROR_M = 0.05
 """Error that hands and drivers have: they sag, and joints and pose are read at different times."""
+MIN_ORDER_ERROR_M = 0.002
+MAX_ORDER_RATIO = 0.2
+"""Error with the scalar first, as a share of that with the scalar last, from which it is first."""
 MAX_SIZE_RATIO = 2.0
 """How many times as large as its model a robot may be built, or as small."""
 MIN_FRAMES = 30
@@ -48,6 +51,7 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
     arm = evidence.arm
     episodes = evidence.need_state(MIN_FRAMES)
     errors: dict[int, float] = {}
+    others: list[float] = []
     for episode, state in episodes[:: max(1, len(episodes) // MAX_FITTED_EPISODES)]:
         joints = {name: column for name, column in zip(arm.joints, state.T, strict=True) if name}
         pose = _pose(episode.columns, poses)
@@ -55,6 +59,17 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
         if len(frames) >= MIN_FRAMES and np.ptp(pose[frames], axis=0).any():
             error_m = _fitted_error(arm.urdf, {name: values[frames] for name, values in joints.items()}, pose[frames])
             errors[episode.number] = float(np.quantile(error_m, 0.9))
+            if not others and errors[episode.number] > MIN_ORDER_ERROR_M:
+                turned = pose[frames][:, [0, 1, 2, 4, 5, 6, 3]]
+                other = _fitted_error(arm.urdf, {name: values[frames] for name, values in joints.items()}, turned)
+                others.append(float(np.quantile(other, 0.9)) / errors[episode.number])
+    if others and others[0] < MAX_ORDER_RATIO:
+        yield Fault(
+            severity="broken",
+            value="w first",
+            message="the quaternion of the EE pose has its scalar first, not last as its names say",
+        )
+        return
     bad = {number: error for number, error in errors.items() if error > KNOWN_ERROR_M}
     if len(bad) > len(errors) / 2:
         error = float(np.median(list(bad.values())))
