@@ -210,11 +210,11 @@ def measured(out: Path, cell: str, episodes: int, workers: int) -> Iterator[tupl
         root = out / f"{name}_{form}"
         if not root.exists():
             write(root, found, fps=FPS // stride, is_foreign=form == "foreign")
-        command = [Path(sys.executable).parent / "demorec", "dataset", "score", root, "--json"]
+        command = [Path(sys.executable).parent / "demorec", "check", root, "--no-images", "--json"]
         begun = time.perf_counter()
-        answer = subprocess.run([*map(str, command)], capture_output=True, text=True, check=True)
+        answer = subprocess.run([*map(str, command)], capture_output=True, text=True, check=False)
         print(f"{root.name}: {time.perf_counter() - begun:.1f} s for {len(found)} episodes", file=sys.stderr)
-        rows = json.loads(answer.stdout)["episodes"]
+        rows = sorted(json.loads(answer.stdout)["episodes"], key=lambda row: int(row["episode"]))
         (out / f"{name}_{form}.json").write_text(answer.stdout)
         yield from ((form, each.kind, row["score"]) for each, row in zip(found, rows, strict=True))
 

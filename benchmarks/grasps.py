@@ -21,12 +21,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from demorec.check.kinematics import matrices
 
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.core.tables import ROBOTS, TASKS
+from demorec.doctor.checks.kinematics import matrices
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body
 from demorec.loop import ScriptAgent, Session, make_world, prepare

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
     from demorec.doctor.visible_motion import VisibleMotion
 
 Flags = NDArray[np.bool_]
+_HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
+"""How the joints of a hand with fingers are called."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -125,7 +128,10 @@ class Evidence:
     @cached_property
     def is_gripper(self) -> Flags:
         """(D,) which elements of the state are grippers or their fingers."""
-        return self.roles.grippers() if self.roles.state else np.zeros(0, dtype=np.bool_)
+        if not self.roles.state:
+            return np.zeros(0, dtype=np.bool_)
+        hands = np.array([_HAND.search(name) is not None for name in self.elements], dtype=np.bool_)
+        return np.asarray(self.roles.grippers() | hands)
 
     @cached_property
     def action_of(self) -> list[int | None]:

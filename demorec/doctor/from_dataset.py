@@ -88,7 +88,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         unreadable=unreadable,
         folder=folder,
         cameras=_cameras(folder) if options.images else {},
-        images_missing="" if options.images else "images are not decoded (--no-images)",
+        images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
         urdf=options.urdf or ("" if robot is None else robot.urdf),
         arm_joints=joints,
         opens_lerobot=options.lerobot,
@@ -141,10 +141,23 @@ def _in_si(
     return found
 
 
+def _is_absent(folder: LeRobotFolder, key: str) -> bool:
+    """Whether none of a camera's video files is here, as after a download of the tables alone."""
+    return not any(place.videos[key][0].exists() for place in folder.listed)
+
+
+def _why_no_images(folder: LeRobotFolder) -> str:
+    """Why no image is looked at: no video file is here; "" if there are some, or no cameras."""
+    keys = folder.info.video_keys
+    if keys and all(_is_absent(folder, key) for key in keys):
+        return f"no video of {', '.join(keys)} is here; download them"
+    return ""
+
+
 def _cameras(folder: LeRobotFolder) -> dict[str, CameraImages]:
     found = {}
     for key, feature in folder.info.features.items():
-        if feature.is_depth or not feature.is_camera:
+        if feature.is_depth or not feature.is_camera or (feature.is_video and _is_absent(folder, key)):
             continue
         episodes: dict[int, Images] = {}
         errors: dict[int, str] = {}

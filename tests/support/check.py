@@ -18,7 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from demorec.check.base import Result
+from demorec.check.base import Level, Result
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
 from demorec.cli.explain import split_checks
 from demorec.cli.shared.diagnoses import examine
@@ -99,10 +99,11 @@ def checked(
 def _of_doctor(path: Path, checks: Sequence[Check], options: ReadOptions) -> Iterator[Result]:
     """A result for each check of the doctor that applies: its worst finding."""
     diagnosis, _ = examine(path, options, checks=checks)
-    levels = {"look": "warn", "broken": "fail"}
+    levels: dict[str, Level] = {"look": "warn", "broken": "fail"}
     for check in checks:
         mine = [finding for finding in diagnosis.findings if finding.check == check.name]
-        level, detail = "pass", ""
+        level: Level = "pass"
+        detail = ""
         if mine:
             level, detail = levels[mine[0].severity], mine[0].message
         elif check.name in diagnosis.not_measured:
@@ -110,7 +111,7 @@ def _of_doctor(path: Path, checks: Sequence[Check], options: ReadOptions) -> Ite
         yield Result(
             check=check.name, group=check.family, level=level, value=None, unit=check.unit, warn=0, fail=0, frame=None,
             detail=detail, why=check.why, do=check.do,
-        )  # type: ignore[arg-type]  # fmt: skip
+        )  # fmt: skip
 
 
 def level_of(path: Path, check: str, kind: str = "recording") -> str:

@@ -127,7 +127,7 @@ def test_a_good_episode_passes(tmp_path: Path) -> None:
     assert {found[check] for check in measured} == {"pass"}
 
 
-@pytest.mark.parametrize(("force_n", "level"), [(0.0, "pass"), (5.0, "warn")])
+@pytest.mark.parametrize(("force_n", "level"), [(0.0, "pass"), (5.0, "fail")])
 def test_a_contact_sensor_may_stay_at_zero(force_n: float, level: str, tmp_path: Path) -> None:
     episode = steady()
     touch = replace(FORCE, name="observation.contact_force", names=("gripper.force",), units=("N",))

@@ -149,7 +149,10 @@ def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
     place = round(relation.usual_lag)
     matrices = {number: _unexplained_by_any(evidence, relation, number, place) for number in relation.episodes}
     names = [evidence.elements[element] for element in relation.elements]
-    whole = np.nanmedian(np.stack(list(matrices.values())), axis=0)
+    stacked = np.stack(list(matrices.values()))
+    whole = np.ones(stacked.shape[1:])
+    known = np.isfinite(stacked).any(axis=0)
+    whole[known] = np.nanmedian(stacked[:, known], axis=0)
     swapped = _swaps(whole)
     for one, two in swapped:
         yield Fault(

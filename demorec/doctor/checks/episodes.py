@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 
 import numpy as np
@@ -16,6 +17,8 @@ MIN_OTHERS = 7
 """Episodes, at least, that one is compared with: with fewer, "usual" says little."""
 MAX_UNUSUAL_SPREADS = 10.0
 """Usual spreads from which a quantity of an episode is worth a look."""
+MAX_UNUSUAL_SHARE = 0.1
+"""Share of episodes up to which a quantity far from the median is unusual, not another way to do the task."""
 MIN_END_SPEED = 0.8
 """Speed at the end, as a share of the episode's root mean square, from which it ends amid the motion."""
 MAX_REST_SPEED = 0.3
@@ -157,9 +160,12 @@ def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state(8)
     if len(evidence.episodes) <= MIN_OTHERS:
         raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
-    for number, score in score_episodes(evidence).items():
+    scores = score_episodes(evidence)
+    far = Counter(r.kind for score in scores.values() for r in score.reasons if r.spreads > MAX_UNUSUAL_SPREADS)
+    rare = {kind for kind, count in far.items() if count <= max(1, MAX_UNUSUAL_SHARE * len(scores))}
+    for number, score in scores.items():
         for reason in score.reasons if number not in evidence.other_units else ():
-            if reason.kind not in ("flaw", "lag") and reason.spreads > MAX_UNUSUAL_SPREADS:
+            if reason.kind in rare - {"flaw", "lag"} and reason.spreads > MAX_UNUSUAL_SPREADS:
                 yield Fault(
                     severity="look",
                     episode=number,

@@ -86,6 +86,9 @@ def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
                 message=f"the table of episodes has it at row {place.from_index}, expected {start}",
             )
         if (episode := evidence.by_number.get(place.episode_index)) is not None:
+            absent = [name for name in ("index", "episode_index", "frame_index") if name not in episode.columns]
+            if absent:
+                yield Fault(severity="look", episode=number, message=f"its rows have no {', '.join(absent)}")
             wrong = _wrong_indices(episode.columns, number, start)
             if wrong:
                 yield Fault(severity="broken", episode=number, message=f"its {', '.join(wrong)} does not count up")
@@ -107,7 +110,7 @@ def _wrong_indices(columns: Mapping[str, Any], number: int, start: int) -> list[
     return [
         name
         for name, values in expected.items()
-        if name not in columns or not np.array_equal(columns[name].reshape(-1), values)
+        if name in columns and not np.array_equal(columns[name].reshape(-1), values)
     ]
 
 
@@ -171,7 +174,9 @@ def table_schema(evidence: Evidence) -> Iterator[Fault]:
     features = {name: feature for name, feature in folder.info.features.items() if not feature.is_video}
     for name, fixed in AUTOMATIC_FEATURES.items():
         found = features.get(name)
-        if found is None or (found.dtype, found.shape) != (fixed.dtype, fixed.shape):
+        if found is None:
+            yield Fault(severity="look", message=f"{name} is not in info.json, where LeRobot expects it")
+        elif (found.dtype, found.shape) != (fixed.dtype, fixed.shape):
             yield Fault(severity="broken", message=f"{name} is not stated as {fixed.dtype} of shape {fixed.shape}")
     seen: set[str] = set()
     for path in tables_in(folder.root, "data"):
@@ -299,6 +304,9 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
     if not folder.info.video_keys:
         raise NotApplicableError("there are no videos")
     for key in folder.info.video_keys:
+        if evidence.cameras and key not in evidence.cameras and not folder.info.features[key].is_depth:
+            yield Fault(severity="look", message=f"no video of {key} is here", do="download it")
+            continue
         ends: dict[Path, int] = {}
         for place in folder.listed:
             path, first = place.videos[key]
@@ -312,7 +320,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
                         value=f"{first - end:+d} images",
                         message=f"{key} starts at image {first} of {path.name}, the episode before ends at {end}",
                     )
-            if problems and not evidence.cameras:
+            if problems and not evidence.cameras and path.exists():
                 yield Fault(severity="broken", episode=place.episode_index, message=f"{key}: {problems[0]}")
 
 

@@ -112,7 +112,7 @@ def _confusion(ratio: float) -> str:
     """The confusion of units whose factor is nearest, as words."""
     size = max(ratio, 1 / ratio)
     name, factor = min(UNIT_FACTORS.items(), key=lambda item: abs(math.log(item[1] / size)))
-    if abs(math.log(factor / size)) > math.log(1.6):
+    if abs(math.log(factor / size)) > math.log(1.2):
         return "another unit or scale?"
     if ratio < 1:
         one, _, two = name.partition(" instead of ")
@@ -139,7 +139,7 @@ def _action_units(evidence: Evidence) -> Iterator[Fault]:
     ratio = float(np.nanmedian(np.stack(ratios)))
     if not 1 / MIN_UNIT_RATIO < ratio < MIN_UNIT_RATIO:
         yield Fault(
-            severity="broken",
+            severity="look" if _confusion(ratio).startswith("another") else "broken",
             value=f"{ratio:.3g} times",
             message=f"the action is {_in_words(ratio)} the size of the state that follows it ({_confusion(ratio)})",
             do="convert one of the two in the program that recorded them",
@@ -214,13 +214,23 @@ def frozen_state(evidence: Evidence) -> Iterator[Fault]:
     episodes = evidence.need_state(8)
     yield from _never_moving(evidence, episodes)
     needed = max(MIN_SAME_STATE, round(MIN_FROZEN_S * evidence.fps))
+    faults: list[Fault] = []
     for episode, state in episodes:
         same = state[1:] == state[:-1]
         fault = _frozen_element(evidence, episode, same, needed) or _frozen_whole(
             evidence, episode, state, same, needed
         )
         if fault is not None:
-            yield fault
+            faults.append(fault)
+    if len(faults) > max(MIN_OTHERS, len(episodes) / 2):
+        yield Fault(
+            severity="look",
+            value=f"{len(faults)} of {len(episodes)} episodes",
+            message=f"{faults[0].message}; so in {len(faults)} of {len(episodes)} episodes",
+            do="compare the state with the command in the recorder: a blocked joint, or one that is not read",
+        )
+    else:
+        yield from faults
 
 
 def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:

@@ -68,7 +68,7 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
         error, quantity = _largest_error(stats.get(name), np.concatenate(episodes), count, ranges)
         if error > MAX_ERROR:
             yield Fault(
-                severity=_severity(error, name),
+                severity="look" if quantity == "count" else _severity(error, name),
                 value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
                 message=f"the {quantity} of {name} in {STATS_PATH} is not that of the rows",
             )
@@ -102,7 +102,7 @@ def _of_episodes(evidence: Evidence, folder: LeRobotFolder, names: Sequence[str]
             error, quantity = _largest_error(stored, values, len(values) if values.ndim else 0, ())
             if error > MAX_ERROR:
                 yield Fault(
-                    severity="look" if name in _COUNTED else _severity(error / 2, name),
+                    severity="look" if name in _COUNTED or quantity == "count" else _severity(error / 2, name),
                     episode=episode.number,
                     value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
                     message=f"the {quantity} of {name} in the table of episodes is not that of its rows",
