@@ -1,4 +1,4 @@
-"""AUC of `demorec dataset score` between sound and spoilt demonstrations, overall and by kind of fault.
+"""AUC of the scores of `demorec check` between sound and spoilt demonstrations, overall and by kind of fault.
 
     python benchmarks/curation.py --out curation                              all of it
     python benchmarks/curation.py --out curation --small                      to see that it runs: a minute

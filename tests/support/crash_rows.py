@@ -106,12 +106,6 @@ _GENERATE = "generate --num-episodes 2 --workers 1 --no-check --out new"
 _POLICY = "--policy SOURCES/policy --action joint --num-episodes 2 --episode-length 12 --workers 1 --out new"
 
 ROWS = {
-    "score": Row(
-        call="dataset score SOURCES/dataset --out new.json",
-        targets=("new.json",),
-        old="dataset score SOURCES/other --out new.json",
-        runs=(),
-    ),
     "split": Row(
         call="dataset split SOURCES/dataset --shares train=0.7 val=0.3 --seed 1 --out new",
         targets=("new/train", "new/val"),

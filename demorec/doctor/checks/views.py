@@ -74,6 +74,8 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
     for camera, fits in _judged(evidence):
         best = {number: float(fit.explained.max()) for number, fit in fits.items()}
         usual_best, spread = usual(list(best.values()), floor=0.05)
+        if float(np.quantile(list(best.values()), 0.2)) < 0.75 * usual_best:
+            continue  # the state explains the images of other episodes no better
         for number, explained in best.items():
             if explained < min(usual_best - 8 * spread, 0.25 * usual_best):
                 yield Fault(

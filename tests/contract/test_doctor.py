@@ -1,0 +1,189 @@
+"""The doctor on teleoperated-looking episodes: sound ones are good, each planted fault is found by its check."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from demorec.core.geometry import Array
+from demorec.doctor.checks import all_checks
+from demorec.doctor.diagnosis import Diagnosis, diagnose
+from demorec.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.episode.roles import NO_NAMES, Column, find_roles
+
+NAMES = ("pan.pos", "lift.pos", "elbow.pos", "wrist.pos", "gripper.pos")
+FPS, LAG, EPISODES, BAD = 30, 3, 12, 5
+ROLES = find_roles(
+    {"observation.state": Column("float32", NAMES), "action": Column("float32", NAMES), "top": Column("video")},
+    NO_NAMES,
+)
+
+
+def motion(number: int, count: int) -> tuple[Array, Array]:
+    """State and action, degrees: from home through two places back to rest; the gripper closes and opens."""
+    rng = np.random.default_rng(number)
+    places = np.array([0.0, -60, 60, 10]) + np.vstack([np.zeros(4), rng.uniform(-30, 30, (3, 4))])
+    at = np.minimum(np.linspace(0, 3.4, count), 3.0)
+    leg = np.minimum(at.astype(int), 2)
+    u = (at - leg)[:, None]
+    arm = places[leg] + (places[leg + 1] - places[leg]) * (10 * u**3 - 15 * u**4 + 6 * u**5)
+    gripper = 40 / (1 + np.exp(-20 * (np.abs(at - 1.5) - 0.5)))
+    target = np.column_stack([arm, gripper])
+    state = np.vstack([np.repeat(target[:1], LAG, axis=0), target[:-LAG]])
+    return state + rng.normal(0, 0.03, state.shape), target + rng.normal(0, 0.03, target.shape)
+
+
+def images_of(state: Array, number: int) -> Images:
+    """A bright blob that follows the first two joints over a textured table."""
+    rng = np.random.default_rng(number)
+    table = np.random.default_rng(0).uniform(40, 120, (16, 16))
+    y, x = np.mgrid[:16, :16]
+    centres = np.column_stack([8 + state[:, 0] / 12, 8 + (state[:, 1] + 60) / 12])
+    blob = 120 * np.exp(-((x - centres[:, :1, None]) ** 2 + (y - centres[:, 1:, None]) ** 2) / 60)
+    shown = np.clip(table + blob + rng.normal(0, 0.5, blob.shape), 0, 255).astype(np.uint8)
+    return as_images(shown)
+
+
+def as_images(shown: np.ndarray) -> Images:  # type: ignore[type-arg]
+    change = np.abs(np.diff(shown.astype(float), axis=0, prepend=shown[:1])).mean(axis=(1, 2))
+    detail = np.abs(np.diff(shown.astype(float), axis=2)).mean(axis=(1, 2))
+    return Images(
+        thumbnails=shown,
+        change=change.astype(np.float32),
+        detail=detail.astype(np.float32),
+        colour=np.full(3, 0.3),
+        frames=np.arange(len(shown)),
+    )
+
+
+def episode(number: int, state: Array, action: Array, instruction: str = "sort the cups") -> EpisodeEvidence:
+    columns = {"observation.state": state.astype(np.float32), "action": action.astype(np.float32)}
+    time_s = np.arange(len(state)) / FPS
+    return EpisodeEvidence(
+        number=number, instruction=instruction, columns=columns, state=state, action=action, time_s=time_s
+    )
+
+
+@pytest.fixture
+def sound() -> Evidence:
+    lengths = [120 + 7 * number for number in range(EPISODES)]
+    motions = [motion(number, length) for number, length in enumerate(lengths)]
+    shown = {number: images_of(state, number) for number, (state, _) in enumerate(motions)}
+    return Evidence(
+        path=Path("cups"),
+        fps=FPS,
+        roles=ROLES,
+        episodes=[episode(number, *both) for number, both in enumerate(motions)],
+        cameras={"top": CameraImages(episodes=shown)},
+    )
+
+
+Change = Callable[[Array, Array], tuple[Array, Array]]
+
+
+def frozen_elbow(state: Array, action: Array) -> tuple[Array, Array]:
+    state[20:130, 2] = state[20, 2]
+    return state, action
+
+
+def jumping(state: Array, action: Array) -> tuple[Array, Array]:
+    state[60, 0] += 40
+    return state, action
+
+
+def resting(state: Array, action: Array) -> tuple[Array, Array]:
+    return np.vstack([state, np.repeat(state[-1:], 300, axis=0)]), np.vstack(
+        [action, np.repeat(action[-1:], 300, axis=0)]
+    )
+
+
+NUMBERS: dict[str, tuple[Change, str]] = {
+    "radians": (lambda s, a: (np.radians(s), np.radians(a)), "unit_mismatch"),
+    "an action two frames late": (lambda s, a: (s, np.vstack([a[:1], a[:1], a[:-2]])), "action_lag"),
+    "an action that is the state": (lambda s, a: (s, s.copy()), "action_equals_state"),
+    "exchanged actions": (lambda s, a: (s, a[:, [1, 0, 2, 3, 4]]), "swapped_elements"),
+    "an inverted gripper": (lambda s, a: (s, np.column_stack([a[:, :4], 40 - a[:, 4]])), "gripper_action"),
+    "a frozen elbow": (frozen_elbow, "frozen_state"),
+    "a jump": (jumping, "state_jumps"),
+    "half a minute's rest": (resting, "idle_ends"),
+    "the end cut off": (lambda s, a: (s[: len(s) // 2], a[: len(a) // 2]), "cut_off_episodes"),
+}
+
+
+def spoilt(sound: Evidence, change: Change) -> Evidence:
+    state, action = sound.by_number[BAD].state, sound.by_number[BAD].action
+    assert state is not None
+    assert action is not None
+    changed = episode(BAD, *change(state.copy(), action.copy()))
+    return replace(sound, episodes=[changed if each.number == BAD else each for each in sound.episodes], cameras={})
+
+
+def found(diagnosis: Diagnosis, check: str) -> set[int | None]:
+    return {finding.episode for finding in diagnosis.findings if finding.check == check}
+
+
+def test_sound_episodes_are_good(sound: Evidence) -> None:
+    diagnosis = diagnose(sound)
+    assert [(each.check, each.message) for each in diagnosis.findings] == []
+    assert {each.verdict for each in diagnosis.episodes} == {"good"}
+    assert min(each.score for each in diagnosis.episodes) > 0.5
+    assert not {"action_lag", "swapped_elements", "frozen_images", "image_lag"} & diagnosis.not_measured.keys()
+
+
+@pytest.mark.parametrize("name", NUMBERS)
+def test_a_fault_of_numbers_is_found_in_its_episode(name: str, sound: Evidence) -> None:
+    change, check = NUMBERS[name]
+    diagnosis = diagnose(spoilt(sound, change))
+    assert found(diagnosis, check) == {BAD}
+    assert diagnosis.episodes[0].episode == BAD
+    others = {each.episode for each in diagnosis.findings} - {BAD}
+    assert others == set()
+
+
+def test_a_copy_and_a_lone_instruction(sound: Evidence) -> None:
+    twin = replace(sound.episodes[2], number=EPISODES)
+    other = replace(sound.episodes[4], instruction="open the drawer")
+    episodes = [other if each.number == 4 else each for each in sound.episodes]
+    diagnosis = diagnose(replace(sound, episodes=[*episodes, twin], cameras={}))
+    assert found(diagnosis, "copied_episodes") == {EPISODES}
+    assert found(diagnosis, "odd_instructions") == {4}
+
+
+IMAGES: dict[str, tuple[Callable[[np.ndarray], np.ndarray], str]] = {  # type: ignore[type-arg]
+    "frozen": (
+        lambda shown: np.concatenate([shown[:40], np.repeat(shown[40:41], 60, axis=0), shown[100:]]),
+        "frozen_images",
+    ),
+    "black": (lambda shown: shown * 0, "blank_images"),
+    "upside down": (lambda shown: shown[:, ::-1, ::-1], "camera_views"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_a_fault_of_images_is_found_in_its_episode(name: str, sound: Evidence) -> None:
+    change, check = IMAGES[name]
+    shown = dict(sound.cameras["top"].episodes)
+    shown[BAD] = as_images(np.ascontiguousarray(change(shown[BAD].thumbnails)))
+    diagnosis = diagnose(replace(sound, cameras={"top": CameraImages(episodes=shown)}))
+    assert found(diagnosis, check) == {BAD}
+    assert {each.episode for each in diagnosis.findings} == {BAD}
+
+
+def test_another_set_that_holds_the_same_episode(sound: Evidence) -> None:
+    train = replace(sound, episodes=sound.episodes[:8], cameras={})
+    held_out = replace(sound, episodes=sound.episodes[7:], cameras={}, earlier=(train,))
+    assert found(diagnose(held_out), "leakage") == {7}
+
+
+def test_every_check_explains_itself() -> None:
+    for check in all_checks():
+        assert check.page, check.name
+        assert check.why.endswith("."), check.name
+        assert check.do, check.name
+        assert len(check.name) + 2 + len(check.measures) <= 80, check.name
+        assert check.name in (Path(__file__).parents[2] / "docs/checks.md").read_text(), check.name
