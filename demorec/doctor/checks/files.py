@@ -51,6 +51,8 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     for reason, numbers in reasons.items():
         for number in numbers:
             yield Fault(severity="broken", episode=number, message=reason, value="1 episode")
+    for note in folder.notes:
+        yield Fault(severity="look", message=note, do="demorec dataset repair {path} --out NEW")
     if missing := folder.missing:
         yield Fault(severity="broken", message=missing.partition(": /")[0], do="complete the recording or the download")
     if not folder.listed:
