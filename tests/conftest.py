@@ -47,7 +47,7 @@ def pytest_runtest_call() -> Iterator[None]:
 
 @pytest.fixture
 def without_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exports are not verified and `dataset_opens` is left out: a process of LeRobot takes seconds to start."""
+    """Exports are not verified and `lerobot_opens` is left out: a process of LeRobot takes seconds to start."""
     without_verification(monkeypatch)
 
 

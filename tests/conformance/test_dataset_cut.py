@@ -43,7 +43,7 @@ def test_parts_at_given_frames(video: bool, tmp_path: Path, capsys: pytest.Captu
     whole, found = items(root), items(tmp_path / "new")
     expected = [*parts_of(whole[0], 0, 5, 9, 12), whole[1], *parts_of(whole[2], 0, 6, 14)]
     assert [same(a, b) for a, b in zip(found, expected, strict=True)] == [True] * 6
-    assert exit_code("check", tmp_path / "new", "--lerobot", "--only", "dataset_counts", "dataset_opens") == 0
+    assert exit_code("check", tmp_path / "new", "--lerobot", "--only", "contradicting_counts", "lerobot_opens") == 0
 
 
 def collapsed(root: Path, lengths: tuple[int, ...], *, slow: int = 1) -> Path:
@@ -102,7 +102,7 @@ def test_only_the_last_part_ends_as_the_episode_did(tmp_path: Path) -> None:
         assert table.column(name).to_pylist() == data_table(tmp_path / "d").column(name).to_pylist()
     sidecar = pq.read_table(tmp_path / "new/demorec/episodes").to_pylist()
     assert [row["success"] for row in sidecar] == [None, True, True]
-    assert exit_code("check", tmp_path / "new", "--only", "dataset_counts", "dataset_sidecar") == 0
+    assert exit_code("check", tmp_path / "new", "--only", "contradicting_counts", "dataset_sidecar") == 0
     assert exit_code("dataset", "repair", tmp_path / "new", "--out", tmp_path / "again") == 0
     assert not (tmp_path / "again").exists()
 
