@@ -85,6 +85,7 @@ class Evidence:
         cameras: Camera -> its images; empty where they are not looked at.
         images_missing: Why no image is looked at, "" if they are.
         urdf: Text of the robot's description, "" where it is not known.
+        robot_problem: Why the description of the robot that belongs to the dataset cannot be read, "" if it can.
         arm_joints: Joint of the URDF for each element of the state, "" for others.
         opens_lerobot: Whether the installed LeRobot opens the dataset too.
         names: Number of an episode -> its file, for recordings.
@@ -100,6 +101,7 @@ class Evidence:
     cameras: Mapping[str, CameraImages] = field(default_factory=dict)
     images_missing: str = ""
     urdf: str = ""
+    robot_problem: str = ""
     arm_joints: tuple[str, ...] = ()
     opens_lerobot: bool = False
     names: Mapping[int, str] = field(default_factory=dict)

@@ -56,7 +56,10 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
     unreadable: dict[int, str] = {}
     elements = roles.elements(roles.state) if roles.state else ()
     acted = roles.elements(roles.action) if roles.action else ()
-    robot = _robot(folder, options, elements)
+    robot_problems: list[str] = []
+    robot: DatasetRobot | None = None
+    with noted(robot_problems, root):
+        robot = _robot(folder, options, elements)
     joints = _joints(robot, folder, elements)
     in_si = robot is not None and not options.urdf
     reader = folder.rows([name for name in folder.columns if folder.info.features[name].dtype != "image"])
@@ -90,6 +93,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         cameras=_cameras(folder) if options.images else {},
         images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
         urdf=options.urdf or ("" if robot is None else robot.urdf),
+        robot_problem="; ".join(robot_problems),
         arm_joints=joints,
         opens_lerobot=options.lerobot,
     )
@@ -108,12 +112,9 @@ def _robot(folder: LeRobotFolder, options: ReadOptions, elements: tuple[str, ...
     """The robot that the user names by its servos, the sidecar describes, or the elements' names imply."""
     if options.motors is not None and elements == options.motors.names:
         return robot_of_motors(options.motors)
-    try:
-        digests = {row["robot_digest"] for row in folder.sidecar(["robot_digest"])} - {None}
-        if len(digests) == 1:
-            return folder.robot(digests.pop())
-    except ExportError:
-        return None  # reported by the checks of the sidecar
+    digests = {row["robot_digest"] for row in folder.sidecar(["robot_digest"])} - {None}
+    if len(digests) == 1:
+        return folder.robot(digests.pop())
     return recognised_robot(elements) if elements else None
 
 

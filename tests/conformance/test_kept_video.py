@@ -189,7 +189,7 @@ def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> Non
     for check, episode, shift in (
         ("dataset_sidecar", 1, -1),
         ("dataset_sidecar", 1, 1),
-        ("undecodable_images", 0, -GOP),
+        ("video_places", 0, -GOP),
     ):
         spoilt = tmp_path / f"{check}{shift}"
         shutil.copytree(dataset, spoilt)

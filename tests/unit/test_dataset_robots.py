@@ -161,7 +161,7 @@ FAULTS: dict[str, Callable[[Path], object]] = {
 def test_a_description_that_changed_is_found(name: str, dataset: Path) -> None:
     assert level_of(dataset, "joint_limits", "dataset") == "pass"
     FAULTS[name](dataset)
-    assert level_of(dataset, "joint_limits", "dataset") == "fail"
+    assert level_of(dataset, "unreadable_episodes", "dataset") == "fail"
 
 
 def test_an_arm_whose_model_is_not_installed_is_drawn_from_the_dataset(

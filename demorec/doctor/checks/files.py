@@ -51,6 +51,8 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     for reason, numbers in reasons.items():
         for number in numbers:
             yield Fault(severity="broken", episode=number, message=reason, value="1 episode")
+    if evidence.robot_problem:
+        yield Fault(severity="broken", message=evidence.robot_problem, do="restore the folder demorec/robots")
     for note in folder.notes:
         yield Fault(severity="look", message=note, do="demorec dataset repair {path} --out NEW")
     if missing := folder.missing:
@@ -312,6 +314,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
             yield Fault(severity="look", message=f"no video of {key} is here", do="download it")
             continue
         ends: dict[Path, int] = {}
+        is_here = any(place.videos[key][0].exists() for place in folder.listed)
         for place in folder.listed:
             path, first = place.videos[key]
             end, ends[path] = ends.get(path, 0), first + place.length
@@ -324,7 +327,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
                         value=f"{first - end:+d} images",
                         message=f"{key} starts at image {first} of {path.name}, the episode before ends at {end}",
                     )
-            if problems and not evidence.cameras and path.exists():
+            if problems and not evidence.cameras and is_here:
                 yield Fault(severity="broken", episode=place.episode_index, message=f"{key}: {problems[0]}")
 
 
