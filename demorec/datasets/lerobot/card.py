@@ -89,6 +89,49 @@ _RECORDED_SIDECAR = (
 
 
 @dataclass(frozen=True, kw_only=True)
+class _Provenance:
+    """The parts of a card that depend on where the episodes come from.
+
+    Attributes:
+        demonstration: Start of the summary: "demonstration{plural} of {robot}", to be formatted.
+        origin: What demorec did.
+        packets: What the video packets are, unless images were transcoded.
+        licence: Licence unless the user names one, None if unknown.
+        tags: Tags besides those of every card.
+        rows: Meaning of row t.
+        sidecar: Content of the sidecar.
+    """
+
+    demonstration: str
+    origin: str
+    packets: str
+    licence: str | None
+    tags: tuple[str, ...]
+    rows: str
+    sidecar: str
+
+
+_SIMULATED = _Provenance(
+    demonstration="scripted demonstration{plural} by a simulated {robot} arm in PyBullet",
+    origin="Recorded and exported by demorec",
+    packets="every video packet is the one that was recorded",
+    licence=_OWN_LICENCE,
+    tags=("simulation",),
+    rows=_SIMULATED_ROWS,
+    sidecar=_SIMULATED_SIDECAR,
+)
+_RECORDED = _Provenance(
+    demonstration="demonstration{plural} of {robot}",
+    origin="Exported by demorec",
+    packets="every video packet is the one that the recordings hold",
+    licence=None,
+    tags=(),
+    rows=_RECORDED_ROWS,
+    sidecar=_RECORDED_SIDECAR,
+)
+
+
+@dataclass(frozen=True, kw_only=True)
 class CardContent:
     """What a card says beyond what the tables of the dataset hold.
 
@@ -129,18 +172,18 @@ def _marked(text: str) -> str:
 def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
     configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
     options = content.options
-    is_simulated = bool(configs) and _all_simulated(root)
+    provenance = _SIMULATED if configs and _all_simulated(root) else _RECORDED
     sensed = {name: markdown(source) for name, source in content.meanings.items() if source}
-    meaning = {**_MEANING, **sensed, **(_simulated_meaning(options) if is_simulated else {})}
+    meaning = {**_MEANING, **sensed, **(_simulated_meaning(options) if provenance is _SIMULATED else {})}
     tasks = read_tasks(root)
-    licence = options.license or (_OWN_LICENCE if is_simulated else None)
+    licence = options.license or provenance.licence
     yield "---"
     if licence is not None:
         yield f"license: {licence}"
     yield from ("task_categories:", "- robotics")
-    yield from ("tags:", "- LeRobot", "- demorec", *(["- simulation"] if is_simulated else []))
+    yield from ("tags:", "- LeRobot", "- demorec", *(f"- {tag}" for tag in provenance.tags))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
-    yield from (f"# {options.repo_id}", "", _summary(info, content, is_simulated=is_simulated))
+    yield from (f"# {options.repo_id}", "", _summary(info, content, provenance))
     yield from ("", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:20]))
     if len(tasks) > 20:
         yield f"- and {len(tasks) - 20} more"
@@ -152,9 +195,9 @@ def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
         name = f"`{key}`" if markdown(key) == key else markdown(key)
         yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_feature_meaning(key, item, meaning)} |"
     yield from ("", "Names of all components are in `meta/info.json`.", "", "## Contract", "")
-    yield from (_SIMULATED_ROWS if is_simulated else _RECORDED_ROWS, "")
+    yield from (provenance.rows, "")
     yield from _success_section(root)
-    yield from ("## What stands beside", "", _SIMULATED_SIDECAR if is_simulated else _RECORDED_SIDECAR)
+    yield from ("## Other files", "", provenance.sidecar)
     yield from _robot_section(root)
     yield ""
     if configs:
@@ -162,24 +205,19 @@ def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
 
 
 def _all_simulated(root: Path) -> bool:
-    """Whether the sidecar has a seed of every episode, which those of other robots and programs lack."""
+    """Return whether the sidecar has a seed for every episode; recordings of other robots have none."""
     return all(row["root_seed"] is not None for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"]))
 
 
-def _summary(info: DatasetInfo, content: CardContent, *, is_simulated: bool) -> str:
-    """Say in one paragraph what the dataset holds and where it comes from."""
+def _summary(info: DatasetInfo, content: CardContent, provenance: _Provenance) -> str:
+    """Describe the dataset's content and origin in one paragraph."""
     robot, plural = markdown(str(info.robot_type)), "" if info.total_episodes == 1 else "s"
     minutes = info.total_frames / info.fps / 60
-    kind, origin = f"demonstration{plural} of {robot}", "Exported by demorec"
-    if is_simulated:
-        kind = f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
-        origin = "Recorded and exported by demorec"
-    pictures = "some images were encoded again"
-    if not content.is_transcoded:
-        pictures = f"every video packet is the one that {'was recorded' if is_simulated else 'the recordings hold'}"
+    demonstrations = provenance.demonstration.format(plural=plural, robot=robot)
+    images = "some images were encoded again" if content.is_transcoded else provenance.packets
     return (
-        f"{info.total_episodes} {kind}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), in the "
-        f"LeRobot v3.0 format. {origin}; {pictures}."
+        f"{info.total_episodes} {demonstrations}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
+        f"in the LeRobot v3.0 format. {provenance.origin}; {images}."
     )
 
 
