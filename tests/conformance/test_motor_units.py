@@ -190,7 +190,7 @@ def test_a_real_arm_beyond_its_limits_is_found(
     chosen = ("--only", "joint_limits")
     assert exit_code("check", tmp_path / "d", *chosen) == 0
     capsys.readouterr()
-    assert exit_code("check", tmp_path / "d", "--motor-units", "degrees", *chosen) == 1
+    assert exit_code("check", tmp_path / "d", "--motor-units", "degrees", "--strict", *chosen) == 1
     assert "wrist_flex.pos" in capsys.readouterr().out
 
 
