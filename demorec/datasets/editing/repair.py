@@ -76,8 +76,8 @@ class RepairedDataset(LeRobotFolder):
         self._set_tasks(kept, stored)
         self.listed = self.places = placed(kept, images, self.tasks)
         self._check_timestamps()
-        self.changes += table_changes(self, stored)
-        self.info = replace(self.info, splits=stated_splits(self))
+        self.changes += table_changes(self, self.stated, stored)
+        self.info = replace(self.info, splits=stated_splits(self, self.stated))
 
     def _correct_info(self, repaired: Repaired) -> None:
         self.info, changes = repaired

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -12,36 +12,37 @@ from demorec.core.errors import ExportError, without_path
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.episode_table import EpisodePlace, read_tasks
 from demorec.datasets.lerobot.files import open_table, read_table
+from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, FilePosition
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES, Statistics, data_statistics
-
-if TYPE_CHECKING:
-    from demorec.datasets.editing.repair import RepairedDataset
 
 _MAX_ERROR = 0.05
 """Standard deviations by which a stored statistic may be off, as `demorec check` allows."""
 _MIN_DEVIATION = 1e-4
 
 
-def table_changes(folder: RepairedDataset, stored: Mapping[int, EpisodePlace]) -> Iterator[str]:
+def table_changes(
+    folder: LeRobotFolder, stated: Mapping[str, Any], stored: Mapping[int, EpisodePlace]
+) -> Iterator[str]:
     """Yield a sentence for each kind of difference.
 
     Args:
         folder: The dataset as it should be.
+        stated: Its info.json, before the repair.
         stored: Episode index -> where the table of episodes says that it is; empty if it is written from the rows.
     """
     if stored:
         yield from _places(folder, stored)
         yield from _ends(folder)
     yield from _paths(folder)
-    yield from _tasks(folder)
-    yield from _totals(folder)
+    yield from _tasks(folder, stated)
+    yield from _totals(folder, stated)
     yield from _strays(folder)
     if not folder.info.is_old:
         yield from _statistics(folder)
 
 
-def _places(folder: RepairedDataset, stored: Mapping[int, EpisodePlace]) -> Iterator[str]:
+def _places(folder: LeRobotFolder, stored: Mapping[int, EpisodePlace]) -> Iterator[str]:
     wrong: dict[str, int] = {}
     for place in folder.listed:
         told = stored.get(place.episode_index)
@@ -63,7 +64,7 @@ def _places(folder: RepairedDataset, stored: Mapping[int, EpisodePlace]) -> Iter
         yield f"The table of episodes loses {len(gone)} episodes that have no rows, such as episode {gone[0]}."
 
 
-def _ends(folder: RepairedDataset) -> Iterator[str]:
+def _ends(folder: LeRobotFolder) -> Iterator[str]:
     """Compare the ends of rows and images in the table of episodes with their beginnings and the lengths."""
     wrong: dict[str, int] = {}
     for path in folder.episode_tables:
@@ -83,7 +84,7 @@ def _ends(folder: RepairedDataset) -> Iterator[str]:
             yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
 
 
-def _paths(folder: RepairedDataset) -> Iterator[str]:
+def _paths(folder: LeRobotFolder) -> Iterator[str]:
     """Find paths of info.json that lead to no file; before v3.0, since others have the usual ones afterwards."""
     last, info = folder.listed[-1], folder.info
     position = FilePosition(chunk=last.episode_index // int(info.chunks_size), file=last.episode_index)
@@ -93,7 +94,7 @@ def _paths(folder: RepairedDataset) -> Iterator[str]:
         yield "info.json names files that are not there: the paths are those of v3.0."
 
 
-def _tasks(folder: RepairedDataset) -> Iterator[str]:
+def _tasks(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
     try:
         tasks = read_tasks(folder.root)
         numbers = list(range(len(tasks)))
@@ -107,24 +108,24 @@ def _tasks(folder: RepairedDataset) -> Iterator[str]:
         pandas = (open_table(folder.root / TASKS_PATH).schema_arrow.metadata or {}).get(b"pandas", b"{}")
         if not json.loads(pandas).get("index_columns"):
             yield "The table of tasks has the text as its index, where LeRobot looks for it."
-    total = folder.stated.get("total_tasks")
+    total = stated.get("total_tasks")
     if total != len(numbers):
         yield f"info.json says total_tasks {total}; the table of tasks has {len(numbers)}."
 
 
-def _totals(folder: RepairedDataset) -> Iterator[str]:
+def _totals(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
     found = {
         "total_episodes": len(folder.listed),
         "total_frames": sum(place.length for place in folder.listed),
     }
     for name, count in found.items():
-        if folder.stated.get(name) != count:
-            yield f"info.json says {name} {folder.stated.get(name)}; the rows have {count}."
+        if stated.get(name) != count:
+            yield f"info.json says {name} {stated.get(name)}; the rows have {count}."
     for name in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
         usual = getattr(folder.info, name)
-        if not folder.info.is_old and folder.stated.get(name) != usual:
-            yield f"info.json says {name} {folder.stated.get(name)}; it is {usual} now."
-    if not has_possible_splits(folder.stated.get("splits"), len(folder.listed)):
+        if not folder.info.is_old and stated.get(name) != usual:
+            yield f"info.json says {name} {stated.get(name)}; it is {usual} now."
+    if not has_possible_splits(stated.get("splits"), len(folder.listed)):
         yield f"splits of info.json are one, train, of all {len(folder.listed)} episodes."
 
 
@@ -140,13 +141,13 @@ def has_possible_splits(splits: Any, episodes: int) -> bool:
     return all(len(each) == 2 for each in ranges) and ends == sorted(ends) and ends[-1] <= episodes
 
 
-def _strays(folder: RepairedDataset) -> Iterator[str]:
+def _strays(folder: LeRobotFolder) -> Iterator[str]:
     used = {path for place in folder.listed for path, _ in place.videos.values()}
     for path in sorted(set((folder.root / "videos").rglob("*.mp4")) - used):
         yield f"{path.relative_to(folder.root).as_posix()} is left out: no episode has images in it."
 
 
-def _statistics(folder: RepairedDataset) -> Iterator[str]:
+def _statistics(folder: LeRobotFolder) -> Iterator[str]:
     """Compare the statistics with those of the rows."""
     try:
         stored = folder.statistics
@@ -182,8 +183,8 @@ def _is_close(stored: Mapping[str, Any] | None, found: Statistics) -> bool:
     return all(bool((each | unknown).all()) for each in is_right)
 
 
-def stated_splits(folder: RepairedDataset) -> Mapping[str, str] | None:
+def stated_splits(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Mapping[str, str] | None:
     """The splits that info.json says, if they are possible and the episodes keep their numbers."""
-    splits = folder.stated.get("splits")
+    splits = stated.get("splits")
     is_kept = [place.episode_index for place in folder.listed] == list(range(len(folder.listed)))
     return splits if is_kept and has_possible_splits(splits, len(folder.listed)) else None
