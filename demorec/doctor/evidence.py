@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 import re
 import shlex
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,11 +21,7 @@ from demorec.episode.roles import Role, Roles
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.doctor.arm import Arm
-    from demorec.doctor.relation import ActionRelation
     from demorec.doctor.thumbnails import CameraImages
-    from demorec.doctor.view_fit import ViewFit
-    from demorec.doctor.visible_motion import VisibleMotion
 
 Flags = NDArray[np.bool_]
 _HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
@@ -106,7 +102,7 @@ class Evidence:
     opens_lerobot: bool = False
     names: Mapping[int, str] = field(default_factory=dict)
     earlier: Sequence[Evidence] = ()
-    _visible: dict[int, VisibleMotion | None] = field(default_factory=dict)
+    _derived: dict[tuple[object, ...], object] = field(default_factory=dict)
 
     @property
     def quoted_path(self) -> str:
@@ -177,50 +173,18 @@ class Evidence:
             raise NotMeasuredError("there are no cameras")
         return self.cameras
 
-    @property
-    def relation(self) -> ActionRelation:
-        """How the state follows the action. Raises NotMeasuredError where it does not."""
-        if isinstance(self._relation, NotMeasuredError):
-            raise NotMeasuredError(str(self._relation))
-        return self._relation
-
-    @cached_property
-    def _relation(self) -> ActionRelation | NotMeasuredError:
-        from demorec.doctor.relation import relation_of
-
-        try:
-            return relation_of(self)
-        except NotMeasuredError as error:
-            return error
-
-    @cached_property
-    def arm(self) -> Arm:
-        """The joint tree of the robot. Raises NotMeasuredError if it is not known."""
-        from demorec.doctor.arm import arm_of
-
-        return arm_of(self)
-
-    def visible_motion(self, camera: CameraImages) -> VisibleMotion | None:
-        """Give how much the motion of each joint changes the images of a camera; None where nothing can be learned."""
-        from demorec.doctor.visible_motion import visible_motion
-
-        if id(camera) not in self._visible:
-            self._visible[id(camera)] = visible_motion(self, camera)
-        return self._visible[id(camera)]
-
-    @cached_property
-    def other_units(self) -> Mapping[int, Mapping[str, float]]:
-        """Episode -> "state" or "action" -> ratio of its size to the others', where it has another unit."""
-        from demorec.doctor.units import other_units
-
-        return other_units(self)
-
-    @cached_property
-    def view_fits(self) -> Mapping[str, Mapping[int, ViewFit]]:
-        """Camera -> episode -> how well the state explains its images."""
-        from demorec.doctor.view_fit import view_fits
-
-        return {camera: view_fits(self, images) for camera, images in self.cameras.items()}
+    def once[T](self, derive: Callable[..., T], *arguments: object) -> T:
+        """Return `derive(self, *arguments)`, computed at the first call; a NotMeasuredError is raised each time."""
+        key = (derive, *map(id, arguments))
+        if key not in self._derived:
+            try:
+                self._derived[key] = derive(self, *arguments)
+            except NotMeasuredError as error:
+                self._derived[key] = error
+        found = self._derived[key]
+        if isinstance(found, NotMeasuredError):
+            raise NotMeasuredError(str(found))
+        return cast("T", found)
 
     def seconds(self, frames: float) -> float:
         """Duration of frames."""

@@ -12,6 +12,7 @@ from demorec.core.geometry import Array
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.doctor.robust import finest
 from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.units import other_units
 
 MIN_EPISODES = 5
 """Episodes, at least: each is predicted from the others."""
@@ -41,8 +42,12 @@ class ViewFit:
         return finest(self.lags.tolist(), -self.explained)
 
 
-def view_fits(evidence: Evidence, images: CameraImages) -> Mapping[int, ViewFit]:
-    """Fit the images of a camera in every episode from the other episodes."""
+def view_fits(evidence: Evidence) -> Mapping[str, Mapping[int, ViewFit]]:
+    """Camera -> episode -> how well the state explains its images, by a fit on the other episodes."""
+    return {camera: _fits(evidence, images) for camera, images in evidence.cameras.items()}
+
+
+def _fits(evidence: Evidence, images: CameraImages) -> Mapping[int, ViewFit]:
     known = _known(evidence, images)
     known = {number: both for number, both in known.items() if len(both[1].frames) >= MIN_FRAMES}
     if len(known) < MIN_EPISODES:
@@ -110,6 +115,6 @@ def _known(evidence: Evidence, camera: CameraImages) -> Mapping[int, tuple[Episo
         for number, images in camera.episodes.items()
         if (episode := evidence.by_number.get(number)) is not None
         and episode.state is not None
-        and number not in evidence.other_units
+        and number not in evidence.once(other_units)
         and len(images.frames) == len(episode.state)
     }

@@ -9,6 +9,7 @@ import numpy as np
 from demorec.core.geometry import Array
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.units import other_units
 
 MIN_FRAMES = 20
 """Frames, at least, from which the change is learned."""
@@ -38,7 +39,7 @@ def visible_motion(evidence: Evidence, camera: CameraImages) -> VisibleMotion | 
     changes: list[Array] = []
     for number, images in camera.episodes.items():
         episode = evidence.by_number.get(number)
-        if episode is None or episode.state is None or len(images.frames) < 2 or number in evidence.other_units:
+        if episode is None or episode.state is None or len(images.frames) < 2 or number in evidence.once(other_units):
             continue
         steps.append(_steps(evidence, episode, images))
         changes.append(images.change[1:].astype(np.float64))

@@ -9,7 +9,7 @@ import numpy as np
 from demorec.core.geometry import Array
 from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence
-from demorec.doctor.relation import ActionRelation, EpisodeLag
+from demorec.doctor.relation import ActionRelation, EpisodeLag, relation_of
 from demorec.doctor.robust import usual
 
 MIN_OTHERS = 3
@@ -44,7 +44,7 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
     The lag is where the action explains most of the state's motion, as a target or as an increment. The state may
     follow by up to 0.35 s; it cannot be ahead. An episode is judged by the difference from the usual lag.
     """
-    relation = evidence.relation
+    relation = evidence.once(relation_of)
     usual_lag = relation.usual_lag
     if usual_lag < -MIN_LEAD:
         yield Fault(
@@ -143,7 +143,7 @@ def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
 )
 def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
     """Find two elements whose actions explain each other's motion several times better than their own."""
-    relation = evidence.relation
+    relation = evidence.once(relation_of)
     if len(relation.elements) < 2:
         raise NotMeasuredError("it needs two moving elements with actions")
     place = round(relation.usual_lag)

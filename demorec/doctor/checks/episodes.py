@@ -12,6 +12,7 @@ from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import usual
 from demorec.doctor.scores import score_episodes
+from demorec.doctor.units import other_units
 
 MIN_OTHERS = 7
 """Episodes, at least, that one is compared with: with fewer, "usual" says little."""
@@ -164,7 +165,7 @@ def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
     far = Counter(r.kind for score in scores.values() for r in score.reasons if r.spreads > MAX_UNUSUAL_SPREADS)
     rare = {kind for kind, count in far.items() if count <= max(1, MAX_UNUSUAL_SHARE * len(scores))}
     for number, score in scores.items():
-        for reason in score.reasons if number not in evidence.other_units else ():
+        for reason in score.reasons if number not in evidence.once(other_units) else ():
             if reason.kind in rare - {"flaw", "lag"} and reason.spreads > MAX_UNUSUAL_SPREADS:
                 yield Fault(
                     severity="look",

@@ -12,6 +12,7 @@ from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredErro
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import runs
 from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.visible_motion import visible_motion
 
 MIN_OTHERS = 3
 """Episodes, at least, that one is compared with."""
@@ -165,7 +166,7 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state()
     for camera, images in evidence.need_images().items():
         rests = {n: _rests(evidence, n, each, images) for n, each in images.episodes.items()}
-        visible = evidence.visible_motion(images)
+        visible = evidence.once(visible_motion, images)
         if visible is None or (len(rests) <= MIN_OTHERS and visible.usual_change < MIN_RATE_CHANGE):
             continue
         longest = {number: max((missing for missing, _, _ in found), default=0.0) for number, found in rests.items()}
@@ -188,7 +189,7 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
 
 def _rests(evidence: Evidence, number: int, images: Images, camera: CameraImages) -> list[tuple[float, int, int]]:
     """(images' worth of change that is missing, first frame, last frame) of each run of repeated images."""
-    visible = evidence.visible_motion(camera)
+    visible = evidence.once(visible_motion, camera)
     episode = evidence.by_number.get(number)
     if visible is None or episode is None or episode.state is None or len(images.frames) < 2:
         return []
@@ -223,7 +224,7 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state()
     for camera, images in evidence.need_images().items():
         shares: dict[int, float] = {}
-        visible = evidence.visible_motion(images)
+        visible = evidence.once(visible_motion, images)
         for number, each in images.episodes.items():
             episode = evidence.by_number.get(number)
             if visible is None or episode is None or episode.state is None or len(each.frames) < 2:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
+from demorec.doctor.arm import arm_of
 from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence
 from demorec.episode.features import EE_POSE
@@ -48,7 +49,7 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
     is of; up to 20 episodes are judged. A hand may be 5 cm off.
     """
     poses = _pose_columns(evidence)
-    arm = evidence.arm
+    arm = evidence.once(arm_of)
     episodes = evidence.need_state(MIN_FRAMES)
     errors: dict[int, float] = {}
     others: list[float] = []

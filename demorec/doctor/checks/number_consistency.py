@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.core.geometry import Array
+from demorec.doctor.arm import arm_of
 from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence, joined, quaternion_places
 from demorec.doctor.robust import without_gaps
@@ -145,7 +146,7 @@ def joint_limits(evidence: Evidence) -> Iterator[Fault]:
     The robot is that of the recording or the sidecar, the one named by --urdf or --motor-units, or a known one whose
     joints have the names of the state's elements. Up to 0.1 rad or m beyond is calibration.
     """
-    arm = evidence.arm
+    arm = evidence.once(arm_of)
     known = np.flatnonzero(np.isfinite(arm.lower) | np.isfinite(arm.upper))
     if not len(known):
         raise NotMeasuredError("the URDF has no limits of the state's joints")

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array
 from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
 from demorec.doctor.evidence import EpisodeEvidence, Evidence, number_in_words
+from demorec.doctor.relation import relation_of
 from demorec.doctor.robust import runs
-from demorec.doctor.units import MIN_UNIT_RATIO
+from demorec.doctor.units import MIN_UNIT_RATIO, other_units
 from demorec.episode.element_names import joint_of
 
 MIN_OTHERS = 3
@@ -84,7 +85,7 @@ def unit_mismatch(evidence: Evidence) -> Iterator[Fault]:
     Sizes are those of values and of ranges. Most elements must agree on a factor of at least seven.
     """
     evidence.need_state()
-    for number, ratios in evidence.other_units.items():
+    for number, ratios in evidence.once(other_units).items():
         ratio = next(iter(ratios.values()))
         yield Fault(
             severity="broken",
@@ -114,7 +115,7 @@ def _confusion(ratio: float) -> str:
 def _action_units(evidence: Evidence) -> Iterator[Fault]:
     """Whether targets have another unit than the state that follows them."""
     try:
-        relation = evidence.relation
+        relation = evidence.once(relation_of)
     except NotMeasuredError:
         return
     if relation.kind != "target":
@@ -247,12 +248,12 @@ def _frozen_element(evidence: Evidence, episode: EpisodeEvidence, same: NDArray[
     if episode.action is None:
         return None
     try:
-        kind = evidence.relation.kind
+        kind = evidence.once(relation_of).kind
     except NotMeasuredError:
         return None
     worst: Fault | None = None
     longest = 0
-    lag = max(round(evidence.relation.usual_lag), 0)
+    lag = max(round(evidence.once(relation_of).usual_lag), 0)
     for element, column in enumerate(evidence.action_of):
         if column is None or evidence.is_gripper[element] or not evidence.ranges[element]:
             continue

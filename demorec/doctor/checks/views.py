@@ -13,7 +13,7 @@ import numpy as np
 from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import usual
-from demorec.doctor.view_fit import MIN_EPISODES, MIN_FRAMES, ViewFit
+from demorec.doctor.view_fit import MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
 
 MIN_EXPLAINED = 0.35
 """Usual share of the images' variance that the state explains, from which a camera is judged."""
@@ -92,7 +92,7 @@ def _judged(evidence: Evidence) -> Iterator[tuple[str, Mapping[int, ViewFit]]]:
     evidence.need_state(MIN_FRAMES)
     reasons = []
     for camera in evidence.need_images():
-        fits = evidence.view_fits.get(camera, {})
+        fits = evidence.once(view_fits).get(camera, {})
         if len(fits) < MIN_EPISODES:
             reasons.append(f"{camera} has fewer than {MIN_EPISODES} episodes of {MIN_FRAMES} frames")
         elif np.median([fit.explained.max() for fit in fits.values()]) < MIN_EXPLAINED:
