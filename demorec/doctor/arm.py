@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import NotMeasuredError
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import Evidence
 from demorec.episode.element_names import joint_of
 from demorec.robots.urdf import Urdf

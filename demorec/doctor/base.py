@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
 from demorec.core.errors import DemorecError, resource_error
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 
 if TYPE_CHECKING:
     from demorec.doctor.evidence import Evidence
@@ -23,14 +24,6 @@ Verdict = Literal["good", "look", "broken"]
 Family = Literal["files", "time", "numbers", "alignment", "images", "set"]
 RANK: Mapping[str, int] = {"good": 0, "look": 1, "broken": 2}
 """How bad a verdict is."""
-
-
-class NotMeasuredError(Exception):
-    """A check cannot judge this evidence; the text says why."""
-
-
-class NotApplicableError(NotMeasuredError):
-    """A check is about other kinds of data, or was not asked for."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, signs_of_course
-from demorec.doctor.base import NotMeasuredError
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.robust import without_gaps
 from demorec.episode.roles import Role, Roles
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import NotMeasuredError
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.doctor.robust import finest
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 
 PIECE_S = 1.0

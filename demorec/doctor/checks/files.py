@@ -15,7 +15,8 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
 from demorec.datasets.lerobot.videos import opened_video
-from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence
 
 _TYPES = {

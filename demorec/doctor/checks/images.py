@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import runs
 from demorec.doctor.thumbnails import CameraImages, Images

@@ -7,7 +7,8 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from demorec.doctor.base import Fault, NotMeasuredError, check
+from demorec.doctor.base import Fault, check
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import Evidence
 
 _PLACEHOLDERS = frozenset(("", "none", "null", "nan", "task", "todo", "test", "unknown", "n/a", "default"))

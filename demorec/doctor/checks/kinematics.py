@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.doctor.arm import arm_of
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import Evidence
 from demorec.episode.features import EE_POSE
 from demorec.robots.urdf import Urdf, UrdfJoint

@@ -14,8 +14,9 @@ from collections.abc import Iterator
 from demorec.core.errors import MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
-from demorec.doctor.base import Fault, NotApplicableError, NotMeasuredError, check
+from demorec.doctor.base import Fault, check
 from demorec.doctor.checks.files import folder_of
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence
 
 _TIMEOUT_S = 600

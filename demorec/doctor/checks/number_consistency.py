@@ -8,7 +8,8 @@ import numpy as np
 
 from demorec.core.geometry import Array
 from demorec.doctor.arm import arm_of
-from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence, joined, quaternion_places
 from demorec.doctor.robust import without_gaps
 

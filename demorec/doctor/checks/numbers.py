@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import EpisodeEvidence, Evidence, number_in_words
 from demorec.doctor.relation import relation_of
 from demorec.doctor.robust import runs

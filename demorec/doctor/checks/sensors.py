@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.doctor.robust import runs
 

@@ -13,8 +13,9 @@ from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
-from demorec.doctor.base import Fault, NotMeasuredError, Severity, check
+from demorec.doctor.base import Fault, Severity, check
 from demorec.doctor.checks.files import folder_of
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import Evidence
 
 _RENUMBERED = ("index", "episode_index")

@@ -7,7 +7,8 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.doctor.base import DROP, Fault, NotApplicableError, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 
 MAX_GAP_PERIODS = 2.5

@@ -10,7 +10,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from demorec.doctor.base import DROP, Fault, NotMeasuredError, check
+from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import usual
 from demorec.doctor.view_fit import MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
