@@ -15,6 +15,8 @@ MIN_OTHERS = 3
 MIN_UNIT_RATIO = 7.0
 """Ratio of sizes from which an episode has another unit: demonstrations of one task differ by a factor of two or three,
 the nearest confusion of units is 11."""
+BOUND_QUANTILES = (0.005, 0.995)
+"""Share of the frames below and above the bounds of the whole set: a single wrong reading widens none."""
 
 
 def other_units(evidence: Evidence) -> dict[int, dict[str, float]]:
@@ -26,6 +28,16 @@ def other_units(evidence: Evidence) -> dict[int, dict[str, float]]:
             for number, ratio in _other_sizes(values).items():
                 found.setdefault(number, {})[role] = ratio
     return found
+
+
+def state_bounds(evidence: Evidence) -> tuple[Array, Array]:
+    """(D,) lowest and highest value of each element of the state in the whole set but episodes in another unit."""
+    others = evidence.once(other_units)
+    states = [state for episode, state in evidence.with_state() if episode.number not in others]
+    if not states:
+        return np.zeros(len(evidence.elements)), np.zeros(len(evidence.elements))
+    lowest, highest = np.quantile(np.concatenate(states), BOUND_QUANTILES, axis=0)
+    return lowest, highest
 
 
 def _other_sizes(values: Mapping[int, Array]) -> dict[int, float]:

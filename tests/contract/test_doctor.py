@@ -145,6 +145,42 @@ def test_a_fault_of_numbers_is_found_in_its_episode(name: str, sound: Evidence) 
     assert others == set()
 
 
+def held_by_dead_band(target: Array, dead_band: float) -> Array:
+    """(T,) places of a hobby servo: it follows where the target is further away than its dead band, to 0.1 degrees."""
+    held = [target[0]]
+    for wanted in target[1:]:
+        excess = max(abs(wanted - held[-1]) - dead_band, 0.0)
+        held.append(held[-1] + excess * np.sign(wanted - held[-1]))
+    return np.round(np.array(held), 1)
+
+
+def test_a_servo_that_holds_its_joint_within_the_dead_band_is_sound(sound: Evidence) -> None:
+    episodes = []
+    for each in sound.episodes:
+        assert each.state is not None
+        assert each.action is not None
+        action = each.action.copy()
+        action[:, 3] = 10 + 3 * np.sin(np.arange(len(action)) / 15 + each.number)
+        state = each.state.copy()
+        state[LAG:, 3] = held_by_dead_band(action[:-LAG, 3], 1.5)
+        state[:LAG, 3] = state[LAG, 3]
+        episodes.append(episode(each.number, state, action))
+    assert found(diagnose(replace(sound, episodes=episodes, cameras={})), "frozen_state") == set()
+
+
+def test_a_resting_encoder_flickers_by_a_tick(sound: Evidence) -> None:
+    tick = 360 / 4096
+    episodes = []
+    for each in sound.episodes[:3]:
+        assert each.state is not None
+        assert each.action is not None
+        state, action = each.state.copy(), each.action.copy()
+        state[:, 3], action[:, 3] = 10 * tick, 10 * tick
+        state[40:43, 3] = 11 * tick
+        episodes.append(episode(each.number, state, action))
+    assert found(diagnose(replace(sound, episodes=episodes, cameras={})), "state_jumps") == set()
+
+
 def test_a_copy_and_a_lone_instruction(sound: Evidence) -> None:
     twin = replace(sound.episodes[2], number=EPISODES)
     other = replace(sound.episodes[4], instruction="open the drawer")

@@ -12,7 +12,8 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import OLD_EPISODES_PATH
 from demorec.datasets.lerobot.stats import NAMES
 
-_OLD_STATS = "meta/episodes_stats.jsonl"
+OLD_STATS = "meta/episodes_stats.jsonl"
+"""Statistics of each episode before v3.0."""
 _SIDECAR = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
 """Columns of the sidecar that episodes can be chosen by."""
 
@@ -55,7 +56,7 @@ def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
 def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
     """Yield (episode_index, feature, its statistics as LeRobot writes them) where a table has all ten."""
     if folder.info.is_old:
-        path = folder.root / _OLD_STATS
+        path = folder.root / OLD_STATS
         for line in read_json_lines(path) if path.exists() else ():
             stats, number = line.get("stats"), line.get("episode_index")
             if isinstance(stats, dict) and isinstance(number, int):

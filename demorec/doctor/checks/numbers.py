@@ -6,15 +6,13 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.doctor.base import DROP, Fault, check
 from demorec.doctor.errors import NotMeasuredError
 from demorec.doctor.evidence import EpisodeEvidence, Evidence, number_in_words
 from demorec.doctor.relation import relation_of
-from demorec.doctor.robust import runs
-from demorec.doctor.units import MIN_UNIT_RATIO, other_units
+from demorec.doctor.units import MIN_UNIT_RATIO, other_units, state_bounds
 from demorec.episode.element_names import joint_of
 
 MIN_OTHERS = 3
@@ -28,15 +26,12 @@ UNIT_FACTORS: Mapping[str, float] = {
 }
 """Confusion of units -> factor of the values."""
 MIN_JUMP_RANGE = 0.15
-"""Share of an element's usual range, at least, that a jump covers."""
+"""Share of an element's range, at least, that a jump covers."""
+MIN_JUMP_TICKS = 10.0
+"""Times the smallest difference that an element has, at least, that a jump is: a resting encoder flickers by a tick or
+two."""
 MIN_JUMP_STEPS = 6.0
 """Times the largest usual step, and the steps before and after it, that a jump is: motors accelerate over frames."""
-MIN_FROZEN_S = 0.4
-MIN_FROZEN_RANGE = 0.3
-"""Share of the usual range that the action covers while an element of the state stays the same to the last bit: dead
-bands and loads of hobby servos hold it back by less."""
-MIN_SAME_STATE = 5
-"""Frames, at least, of a frozen state."""
 
 
 @check(
@@ -156,14 +151,16 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     arm = ~evidence.is_gripper
     largest = [np.abs(np.diff(state, axis=0)).max(axis=0) for _, state in episodes]
     typical = [np.quantile(np.abs(np.diff(state, axis=0)), 0.98, axis=0) for _, state in episodes]
-    limit = np.maximum(MIN_JUMP_STEPS * np.median(typical, axis=0), MIN_JUMP_RANGE * evidence.ranges)
+    lowest, highest = evidence.once(state_bounds)
+    limit = np.maximum(MIN_JUMP_STEPS * np.median(typical, axis=0), MIN_JUMP_RANGE * (highest - lowest))
+    limit = np.maximum(limit, MIN_JUMP_TICKS * _ticks(episodes))
     if len(episodes) > MIN_OTHERS:
         limit = np.maximum(limit, 2 * np.median(largest, axis=0))
     for episode, state in episodes:
         sizes = np.abs(np.diff(state, axis=0))
         before = np.vstack([np.zeros_like(sizes[:1]), sizes[:-1]])
         after = np.vstack([sizes[1:], np.zeros_like(sizes[:1])])
-        own = np.maximum(MIN_JUMP_STEPS * np.quantile(sizes, 0.98, axis=0), MIN_JUMP_RANGE * np.ptp(state, axis=0))
+        own = MIN_JUMP_STEPS * np.quantile(sizes, 0.95, axis=0)
         smaller, other = np.minimum(before, after), np.maximum(before, after)
         spike = (other > 0.5 * sizes) & (smaller * MIN_JUMP_STEPS < sizes)
         alone = other * MIN_JUMP_STEPS / 2 < sizes
@@ -180,128 +177,22 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
             episode=episode.number,
             frames=(int(frames[0]) + 1, int(frames[-1]) + 1),
             value=f"{share:.0%} of its range",
-            message=f"{_element(evidence, element)} jumps from {number_in_words(state[frame, element])} to "
+            message=f"{element_name(evidence, element)} jumps from {number_in_words(state[frame, element])} to "
             f"{number_in_words(state[frame + 1, element])} within one frame (frame {frame + 1}{count})",
         )
 
 
-def _element(evidence: Evidence, element: int) -> str:
+def _ticks(episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Array:
+    """(D,) smallest difference between two frames of each element: the resolution of its encoder, or little."""
+    steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in episodes])
+    smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
+    return np.where(np.isfinite(smallest), smallest, 0.0)
+
+
+def element_name(evidence: Evidence, element: int) -> str:
+    """Name of an element of the state, for people."""
     name = evidence.elements[element]
     return f"element {name} of the state" if name.isdigit() else name
-
-
-@check(
-    family="numbers",
-    needs="state",
-    measures="readings of the state that stop changing",
-    unit="s",
-    why="The policy sees a robot that does not move while it acts.",
-    do=DROP,
-)
-def frozen_state(evidence: Evidence) -> Iterator[Fault]:
-    """Find elements that keep their value to the last bit while their action moves on, and whole states that do.
-
-    Without an action, a whole state counts as frozen where it continues with a jump. An element that never changes in
-    any episode while its action does is a fault of the whole set.
-    """
-    episodes = evidence.need_state(8)
-    yield from _never_moving(evidence, episodes)
-    needed = max(MIN_SAME_STATE, round(MIN_FROZEN_S * evidence.fps))
-    faults: list[Fault] = []
-    for episode, state in episodes:
-        same = state[1:] == state[:-1]
-        fault = _frozen_element(evidence, episode, same, needed) or _frozen_whole(
-            evidence, episode, state, same, needed
-        )
-        if fault is not None:
-            faults.append(fault)
-    if len(faults) > max(MIN_OTHERS, len(episodes) / 2):
-        yield Fault(
-            severity="look",
-            value=f"{len(faults)} of {len(episodes)} episodes",
-            message=f"{faults[0].message}; so in {len(faults)} of {len(episodes)} episodes",
-            do="compare the state with the command in the recorder: a blocked joint, or one that is not read",
-        )
-    else:
-        yield from faults
-
-
-def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:
-    for element, column in enumerate(evidence.action_of):
-        if column is None or evidence.is_gripper[element] or any(np.ptp(state[:, element]) for _, state in episodes):
-            continue
-        acting = [each.action for each, _ in episodes if each.action is not None]
-        if not acting:
-            return
-        spans = np.median(np.stack([np.ptp(action, axis=0) for action in acting]), axis=0)
-        usual_span = float(np.median(spans[spans > 0])) if (spans > 0).any() else 0.0
-        if spans[column] > 0.1 * usual_span:
-            yield Fault(
-                severity="broken",
-                value="0",
-                message=f"{_element(evidence, element)} never changes although its action does",
-                do="record the joint's own position",
-            )
-
-
-def _frozen_element(evidence: Evidence, episode: EpisodeEvidence, same: NDArray[np.bool_], needed: int) -> Fault | None:
-    """The longest rest of an element of the arm in which its action covers much of the usual range."""
-    if episode.action is None:
-        return None
-    try:
-        kind = evidence.once(relation_of).kind
-    except NotMeasuredError:
-        return None
-    worst: Fault | None = None
-    longest = 0
-    lag = max(round(evidence.once(relation_of).usual_lag), 0)
-    for element, column in enumerate(evidence.action_of):
-        if column is None or evidence.is_gripper[element] or not evidence.ranges[element]:
-            continue
-        target = episode.action[:, column]
-        if kind == "increment":
-            gain = evidence.ranges[element] / max(_usual_sum(evidence, column), 1e-12)
-            target = np.cumsum(target) * gain
-        for first, end in runs(same[:, element]):
-            moved = float(np.ptp(target[max(first - lag, 0) : max(end + 1 - lag, 1)]))
-            if end - first >= max(needed, longest) and moved > MIN_FROZEN_RANGE * evidence.ranges[element]:
-                longest = end - first
-                worst = Fault(
-                    severity="broken",
-                    episode=episode.number,
-                    frames=(first, end),
-                    value=f"{evidence.seconds(end - first):.1f} s",
-                    message=f"{_element(evidence, element)} keeps one value for {evidence.seconds(end - first):.1f} s "
-                    "while its action moves",
-                )
-    return worst
-
-
-def _usual_sum(evidence: Evidence, column: int) -> float:
-    spans = [np.ptp(np.cumsum(e.action[:, column])) for e in evidence.episodes if e.action is not None and e.length]
-    return float(np.median(spans))
-
-
-def _frozen_whole(
-    evidence: Evidence, episode: EpisodeEvidence, state: Array, same: NDArray[np.bool_], needed: int
-) -> Fault | None:
-    """A rest of the whole state that ends with a jump, or in which the whole action moves."""
-    rests = [(first, end) for first, end in runs(np.asarray(same.all(axis=1))) if end - first >= needed]
-    alive = evidence.ranges > 0
-    for first, end in rests:
-        if end >= len(state) - 1:
-            continue
-        steps = np.abs(np.diff(state[:, alive], axis=0))
-        jump = steps[end] > np.maximum(4 * np.quantile(steps, 0.95, axis=0), 0.1 * evidence.ranges[alive])
-        if jump.mean() >= 0.5:
-            return Fault(
-                severity="broken",
-                episode=episode.number,
-                frames=(first, end),
-                value=f"{evidence.seconds(end - first):.1f} s",
-                message=f"the whole state keeps its values for {evidence.seconds(end - first):.1f} s, then jumps",
-            )
-    return None
 
 
 @check(

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.files import open_table, rows_in, tables_in
+from demorec.datasets.editing.episode_records import OLD_STATS, episode_statistics
+from demorec.datasets.lerobot.files import open_table, rows_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
@@ -27,17 +28,21 @@ MIN_BROKEN_ERROR = 0.2
 """Error from which normalised values are wrong by a fifth of their spread."""
 MIN_DEVIATION = 1e-4
 """Standard deviation by which an element that hardly moves is measured."""
-FLOAT32_STEPS = 4.0
-"""LeRobot sums squares in float32: the variance of values far from zero is off by this many roundings of the square."""
-MAX_SUMMED = 1000
-"""Rows over which roundings of the sum of float32 add up to the error of the mean."""
+MAX_SUMMED = 4000
+"""Rows over which the roundings of a float32 sum add up: an episode of more than a minute at 60 fps."""
+FLOAT32_SUM = 0.25
+"""Error of a float32 sum of N equal values, in N roundings of its result: they round alike while the sum grows."""
+FLOAT32_VARIANCE = 3 * FLOAT32_SUM
+"""Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
+Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
+"""Episode -> feature -> quantity -> its numbers."""
 Ranges = Mapping[str, Array]
 """Quantile -> (2, D) lowest and highest value that it may have."""
 
 
 @check(
     family="files",
-    needs="a LeRobot dataset of v3.0",
+    needs="a LeRobot dataset",
     measures="statistics that are not those of the rows",
     unit="standard deviations",
     why="Training normalises by them: state and action are shifted and squeezed.",
@@ -50,13 +55,15 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     leaves it. The deviation of a joint that is parked far from zero may have the rounding of LeRobot's float32.
     """
     folder = folder_of(evidence)
-    if folder.info.is_old:
-        raise NotMeasuredError("before v3.0 each episode has its own statistics")
-    if not (evidence.path / STATS_PATH).exists():
-        raise NotMeasuredError(f"{STATS_PATH} is missing")
-    unused = (*_RENUMBERED, *(name for name in evidence.roles.having("label") if name not in folder.statistics))
+    stats_path = OLD_STATS if folder.info.is_old else STATS_PATH
+    if not (evidence.path / stats_path).exists():
+        raise NotMeasuredError(f"{stats_path} is missing")
+    known = {} if folder.info.is_old else folder.statistics
+    unused = (*_RENUMBERED, *(name for name in evidence.roles.having("label") if name not in known))
     names = [name for name, f in folder.info.features.items() if f.is_numeric and name not in unused]
     yield from _of_episodes(evidence, folder, names)
+    if folder.info.is_old:
+        return  # training aggregates those of the episodes
     if evidence.unreadable:
         raise NotMeasuredError(f"the whole dataset's, since {len(evidence.unreadable)} of its episodes cannot be read")
     stats = folder.statistics
@@ -83,32 +90,48 @@ def _severity(error: float, name: str) -> Severity:
 
 
 def _of_episodes(evidence: Evidence, folder: LeRobotFolder, names: Sequence[str]) -> Iterator[Fault]:
-    """Compare the statistics in the table of episodes."""
-    tables = tables_in(evidence.path, "meta/episodes")
-    there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
-    columns = [f"stats/{name}/{quantity}" for name in names for quantity in NAMES]
-    known = [column for column in columns if column in there]
-    if not known:
-        return
-    by_place = {place.episode_index: number for number, place in enumerate(folder.listed)}
-    rows = dict(zip(by_place, rows_in(evidence.path, "meta/episodes", known), strict=False))
+    """Compare the statistics of each episode, and yield the first error in each."""
+    entries = _old_entries(folder, names) if folder.info.is_old else _table_entries(folder, names)
+    place = OLD_STATS if folder.info.is_old else "the table of episodes"
     for episode in evidence.episodes:
-        if (row := rows.get(episode.number)) is None:
-            continue
-        for name in names:
-            stored = {q: row[column] for q in NAMES if (column := f"stats/{name}/{q}") in row}
+        for name, stored in entries.get(episode.number, {}).items():
             values = _vectors(folder, name, episode.columns[name])
-            if not stored or not np.isfinite(values).all():
+            if not np.isfinite(values).all():
                 continue
-            error, quantity = _largest_error(stored, values, len(values) if values.ndim else 0, ())
+            error, quantity = _largest_error(stored, values, len(values), ())
             if error > MAX_ERROR:
                 yield Fault(
                     severity="look" if name in _COUNTED or quantity == "count" else _severity(error / 2, name),
                     episode=episode.number,
                     value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
-                    message=f"the {quantity} of {name} in the table of episodes is not that of its rows",
+                    message=f"the {quantity} of {name} in {place} is not that of its rows",
                 )
                 break
+
+
+def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
+    """Read the statistics of the episodes before v3.0."""
+    found: dict[int, dict[str, Mapping[str, Any]]] = {}
+    for number, name, stored in episode_statistics(folder, names):
+        found.setdefault(number, {})[name] = stored
+    return found
+
+
+def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
+    """Read the statistics in the table of episodes, as far as it has them."""
+    tables = folder.episode_tables
+    there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
+    columns = {name: [q for q in NAMES if f"stats/{name}/{q}" in there] for name in names}
+    known = [f"stats/{name}/{quantity}" for name, quantities in columns.items() for quantity in quantities]
+    rows = rows_in(folder.root, "meta/episodes", known) if known else ()
+    return {
+        place.episode_index: {
+            name: {quantity: row[f"stats/{name}/{quantity}"] for quantity in quantities}
+            for name, quantities in columns.items()
+            if quantities
+        }
+        for place, row in zip(folder.listed, rows, strict=False)
+    }
 
 
 def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
@@ -140,7 +163,8 @@ def _largest_error(
         return math.inf, "mean"
     true = {quantity: getattr(values, quantity)(axis=0) for quantity in ("min", "max", "mean", "std")}
     scale = np.maximum(true["std"], MIN_DEVIATION)
-    rounding = FLOAT32_STEPS * np.finfo(np.float32).eps * (values**2).mean(axis=0)
+    roundings = min(len(values), MAX_SUMMED) * float(np.finfo(np.float32).eps)
+    variance_error = FLOAT32_VARIANCE * roundings * (values**2).mean(axis=0)
     between = {quantity: _between(quantity, values, episodes) for quantity in QUANTILES}
     worst = (0.0, "")
     for quantity in (*true, "count", *QUANTILES):
@@ -152,14 +176,15 @@ def _largest_error(
         elif found.shape != scale.shape:
             error = math.inf
         elif quantity == "std":
-            allowed = np.abs(np.sqrt(true["std"] ** 2 + rounding * len(values) ** 0.5) - true["std"])
-            error = float((np.maximum(np.abs(found - true["std"]) - allowed, 0.0) / scale).max())
+            low = np.sqrt(np.maximum(true["std"] ** 2 - variance_error, 0.0))
+            high = np.sqrt(true["std"] ** 2 + variance_error)
+            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
         elif quantity in between:
             low, high = between[quantity]
             error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
         else:
-            steps = min(len(values), MAX_SUMMED) / 4 if quantity == "mean" else 4.0
-            slack = steps * np.finfo(np.float32).eps * np.abs(true[quantity])
+            steps = FLOAT32_SUM * roundings if quantity == "mean" else 4 * float(np.finfo(np.float32).eps)
+            slack = steps * np.abs(true[quantity])
             error = float((np.maximum(np.abs(found - true[quantity]) - slack, 0.0) / scale).max())
         worst = max(worst, (error, quantity))
     return worst
