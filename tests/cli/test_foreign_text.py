@@ -161,7 +161,7 @@ def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
 def test_flags_and_names_on_the_command_line() -> None:
     for arguments in (
         [HOSTILE], ["import", HOSTILE, "--suggest"],
-        ["list", HOSTILE], ["info", f"--{HOSTILE}=1"], ["info", HOSTILE], ["export", HOSTILE],
+        ["list", HOSTILE], ["explain", HOSTILE], ["info", f"--{HOSTILE}=1"], ["info", HOSTILE], ["export", HOSTILE],
         ["generate", f"--{HOSTILE}"], ["generate", "--seed", HOSTILE], ["generate", "--task", HOSTILE, "--out", "/x"],
         ["check", "x", "--only", HOSTILE], ["check", "--workers", HOSTILE], ["view", "x", "--size", HOSTILE, "1"],
     ):  # fmt: skip

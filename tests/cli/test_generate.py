@@ -156,7 +156,6 @@ def test_the_demo_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
         ("robots", "panda"),
         ("renderers", "raster"),
         ("exporters", "lerobot"),
-        ("checks", "opens"),
     ],
 )
 def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], what: str, names: str) -> None:
@@ -168,3 +167,19 @@ def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], wh
     assert any(line.startswith(names + " ") for line in lines)
     assert all(re.match(r"\S+\s+\S+", line) for line in lines), "a row without a summary"
     assert len({line.split(maxsplit=1)[1] for line in lines}) == len(lines), "two rows that read the same"
+
+
+def test_every_check_is_listed_within_80_columns_and_explained(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("list", "checks") == 0
+    lines = capsys.readouterr().out.splitlines()
+    names = [line.split()[0] for line in lines]
+    assert {"opens", "action_lag", "frozen_images"} <= set(names)
+    assert len(set(names)) == len(names)
+    assert all(len(line) <= 80 and re.match(r"\S+\s+\S+", line) for line in lines)
+    for name in names:
+        assert exit_code("explain", name) == 0
+        page = capsys.readouterr().out
+        assert page.startswith(f"{name}\n")
+        assert {"finds", "needs", "unit", "why", "do"} <= {
+            line.split()[0] for line in page.splitlines() if line.strip()
+        }

@@ -197,7 +197,7 @@ def test_a_command_reads_it(
 
 def test_every_command_has_a_row() -> None:
     tried = {call.split()[0] for call in (*COMMANDS.values(), *OF_IMPORTED)}
-    assert {*tried, "list"} == set(cli.COMMANDS.names())  # which takes no path
+    assert {*tried, "list", "explain"} == set(cli.COMMANDS.names())  # which take no path
 
 
 @pytest.mark.parametrize("row", OF_IMPORTED)

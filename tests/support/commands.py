@@ -24,7 +24,7 @@ ON_A_PATH = {
 """How every command that takes recordings, runs or datasets is called with a PATH; what it makes begins with NEW."""
 ON_EVERYTHING = ("info", "check", "view", "report", "export")
 """Those that read bags and other formats, too."""
-OTHERS = {"import", "dataset", "evaluate", "correct", "list"}
+OTHERS = {"import", "dataset", "evaluate", "correct", "list", "explain"}
 """Commands that take other things."""
 
 
