@@ -77,10 +77,10 @@ def relation_of(evidence: Evidence) -> ActionRelation:
         raise NotMeasuredError("no element of the action has the name of a moving element of the state")
     elements, columns = (np.array(part, dtype=np.intp) for part in zip(*pairs, strict=True))
     reach = max(MIN_LAGS, round(MAX_LAG_S * evidence.fps))
-    lags = np.arange(-reach, reach + 1)
     long = [each for each in episodes if each.length >= 3 * reach + 4]
     if not long:
         raise NotMeasuredError("the episodes are too short to tell whether state or action is first")
+    lags = np.arange(-reach, reach + 1)  # not before: a stated rate of 2**31 would fill the memory
     best: ActionRelation | None = None
     fit = MAX_UNEXPLAINED
     for kind in ("target", "increment"):
