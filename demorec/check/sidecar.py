@@ -29,7 +29,7 @@ def dataset_sidecar(dataset: CheckedDataset) -> Measurement | None:
             continue
         if number in infos and dataset.folder.listed[number].tasks != (infos[number].instruction,):
             wrong.append(f"episode {number} has another instruction")
-        elif SUCCESS in rows and bool(rows[SUCCESS][-1, 0]) != row["success"]:
+        elif SUCCESS in rows and bool(rows[SUCCESS][-1, 0]) != bool(row["success"]):  # null: unknown, as of a part
             wrong.append(f"episode {number} has another outcome")
         elif digests[number] != row["content_digest"]:
             wrong.append(f"episode {number} has changed since it was exported")
