@@ -158,7 +158,7 @@ def test_an_export_that_would_append_names_the_command_that_converts_it(
         ("episodes.jsonl", '"length": 5|"length": -5', "has -5 as length"),
         ("episodes.jsonl", '"length": 5|"length": 9', "its table of episodes has 2 of 15"),
         ("episodes.jsonl", '{"episode_index": 1|[{"episode_index": 1', "The table cannot be read"),
-        ("tasks.jsonl", '"task_index": 0|"task_index": null', "no task_index"),
+        ("tasks.jsonl", '"task_index": 0|"task_index": null', "has None as task_index"),
         ("tasks.jsonl", '"task_index": 0|"task_index": 0}{', "The table cannot be read"),
     ],
 )
