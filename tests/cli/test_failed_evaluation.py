@@ -27,7 +27,7 @@ def evaluation(tmp_path: Path) -> Path:
     ("command", "told"),
     [
         ("info", "2 recordings"),
-        ("check --no-images", "2 checked"),
+        ("check --no-images", "2 episodes, 24 frames"),
         ("view --save NEW.rrd", "kB"),
         ("report --no-checks --out NEW.html", "2 episodes"),
     ],

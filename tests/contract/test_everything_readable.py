@@ -69,8 +69,8 @@ FRAMES_OF = {"run of simulations": (24, 20)}
 """Kind -> frames of each episode, where they are listed so."""
 EXTERNAL = "recorded by another robot or program"
 OF_IMPORTED: dict[str, tuple[int, str]] = {
-    "check RUN": (0, "2 checked, 0 failed, 0 with warnings."),
-    "check DATASET": (0, "1 checked, 0 failed, 0 with warnings."),
+    "check RUN": (0, "good: 1 episode, 24 frames, 2 cameras; "),
+    "check DATASET": (0, "good: 1 episode, 24 frames, 2 cameras; "),
     "check RUN --deep": (1, EXTERNAL),
     "check DATASET --deep": (1, EXTERNAL),
     "replay RECORDING": (1, EXTERNAL),
@@ -273,11 +273,11 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "so101.toml")
     assert exit_code("check", bag, "--mapping", mapping, "--all") == 0
     printed = capsys.readouterr().out
-    assert f"warn  run {bag}: " in printed
-    (judged,) = [line for line in printed.splitlines() if "  import_findings 1" in line]
-    assert judged.lstrip().startswith("warn")
-    assert "gap" in judged
-    assert f"recording {bag}: episode 0: " in printed
+    assert printed.startswith(f"{bag}: state observation.state; ")
+    assert "look: 1 episode, " in printed
+    (judged,) = [line for line in printed.splitlines() if "  import_findings  " in line]
+    assert judged.lstrip().startswith("look")
+    assert "gap, observation.state" in judged
 
 
 @pytest.mark.parametrize(

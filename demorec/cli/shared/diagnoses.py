@@ -74,7 +74,8 @@ def _evidence(path: Path, options: ReadOptions) -> Evidence:
     found = find(path)
     if found.kind == "dataset":
         return evidence_of_dataset(path, options)
-    return evidence_of_recordings(path, found.recordings, open_recording, options)
+    rollouts = found.failed if found.kind == "evaluation" else ()  # whose failures are results, not rejects
+    return evidence_of_recordings(path, (*found.recordings, *rollouts), open_recording, options)
 
 
 def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[Check]) -> Diagnosis:

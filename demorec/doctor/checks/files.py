@@ -15,7 +15,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
 from demorec.datasets.lerobot.videos import opened_video
-from demorec.doctor.base import DROP, Fault, check
+from demorec.doctor.base import DROP, Fault, Severity, check
 from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence
 
@@ -54,8 +54,10 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
             yield Fault(severity="broken", episode=number, message=reason, value="1 episode")
     if evidence.robot_problem:
         yield Fault(severity="broken", message=evidence.robot_problem, do="restore the folder demorec/robots")
-    for note in folder.notes:
-        yield Fault(severity="look", message=note, do="demorec dataset repair {path} --out NEW")
+    for number, note in enumerate(folder.notes):
+        # Without the table of episodes LeRobot opens nothing, by a wrong one it takes other rows.
+        severity: Severity = "broken" if number == 0 and folder.is_found_by_rows else "look"
+        yield Fault(severity=severity, message=note, do="demorec dataset repair {path} --out NEW")
     if missing := folder.missing:
         yield Fault(severity="broken", message=missing.partition(": /")[0], do="complete the recording or the download")
     if not folder.listed:
