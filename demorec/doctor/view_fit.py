@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,10 @@ MIN_EPISODES = 5
 """Episodes, at least: each is predicted from the others."""
 MIN_FRAMES = 20
 MAX_LAG_S = 1.0
+MAX_UNRELATED_RATIO = 0.25
+"""Share of what the state usually explains, up to which the states of other episodes are tried."""
+MAX_COMPARED = 5
+"""Episodes, at most, that are compared with all others."""
 _COMPONENTS = 8
 _MAX_PAIRED = 8
 """Elements of the state up to which products of two are features too."""
@@ -31,10 +35,18 @@ class ViewFit:
     Attributes:
         lags: (L,) frames by which the images come later than the state.
         explained: (L,) share of the images' variance that the state explains at each lag.
+        by_another: Largest share that the state of another episode explains; 0 where it was not computed, as the own
+            state explains enough.
     """
 
     lags: NDArray[np.intp]
     explained: Array
+    by_another: float = 0.0
+
+    @property
+    def best(self) -> float:
+        """Share that it explains at the best lag."""
+        return float(self.explained.max())
 
     @property
     def lag(self) -> float:
@@ -52,37 +64,70 @@ def _fits(evidence: Evidence, images: CameraImages) -> Mapping[int, ViewFit]:
     known = {number: both for number, both in known.items() if len(both[1].frames) >= MIN_FRAMES}
     if len(known) < MIN_EPISODES:
         return {}
-    inputs = _inputs(evidence, {number: episode for number, (episode, _) in known.items()})
+    states = _scaled(evidence, {number: episode for number, (episode, _) in known.items()})
     outputs = _outputs({number: images for number, (_, images) in known.items()})
-    products = {n: (x.T @ x, x.T @ outputs[n]) for n, x in inputs.items()}
-    squares, crossed = (sum(pair[k] for pair in products.values()) for k in (0, 1))
-    found: dict[int, ViewFit] = {}
+    weights = _weights(states, outputs)
     reach = max(3, round(MAX_LAG_S * evidence.fps))
-    for number, x in inputs.items():
-        own_squares, own_crossed = products[number]
-        left = squares - own_squares
-        ridge = _RIDGE * np.trace(left) / len(left) * np.eye(len(left))
-        predicted = x @ np.linalg.solve(left + ridge, crossed - own_crossed)
-        own_reach = min(reach, len(x) // 4)
+
+    def fit(shown: int, stated: int) -> ViewFit:
+        """Fit the images of one episode to the state of one, by what the episodes but the first show."""
+        others = [state for number, state in states.items() if number != shown]
+        predicted = _features(_within(states[stated], others)) @ weights[shown]
+        length = min(len(predicted), len(outputs[shown]))
+        own_reach = min(reach, length // 4)
         lags = np.arange(-own_reach, own_reach + 1)
-        found[number] = ViewFit(lags=lags, explained=_explained(predicted, outputs[number], lags))
+        return ViewFit(lags=lags, explained=_explained(predicted[:length], outputs[shown][:length], lags))
+
+    found = {number: fit(number, number) for number in states}
+    unexplained = _unexplained(found)
+    for number in unexplained:
+        by_another = max(fit(number, other).best for other in states if other != number)
+        found[number] = replace(found[number], by_another=by_another)
     return found
 
 
-def _inputs(evidence: Evidence, episodes: Mapping[int, EpisodeEvidence]) -> dict[int, Array]:
-    """Episode -> (T, F) elements of the state in units of their range, their squares and products."""
+def _unexplained(fits: Mapping[int, ViewFit]) -> list[int]:
+    """Few episodes whose images the state explains least, and less than usual."""
+    limit = MAX_UNRELATED_RATIO * float(np.median([fit.best for fit in fits.values()]))
+    found = [number for number, fit in fits.items() if fit.best < limit]
+    return sorted(found, key=lambda number: fits[number].best)[:MAX_COMPARED]
+
+
+def _weights(states: Mapping[int, Array], outputs: Mapping[int, Array]) -> dict[int, Array]:
+    """Episode -> (F, 8) weights that predict images from features, fitted to all other episodes."""
+    inputs = {number: _features(state) for number, state in states.items()}
+    products = {number: (x.T @ x, x.T @ outputs[number]) for number, x in inputs.items()}
+    squares, crossed = (sum(pair[k] for pair in products.values()) for k in (0, 1))
+    found = {}
+    for number, (own_squares, own_crossed) in products.items():
+        left = squares - own_squares
+        ridge = _RIDGE * np.trace(left) / len(left) * np.eye(len(left))
+        found[number] = np.linalg.solve(left + ridge, crossed - own_crossed)
+    return found
+
+
+def _scaled(evidence: Evidence, episodes: Mapping[int, EpisodeEvidence]) -> dict[int, Array]:
+    """Episode -> (T, E) moving elements of the state in units of their range."""
     states = {number: episode.state for number, episode in episodes.items() if episode.state is not None}
     alive = evidence.ranges > 0
     middle = np.median(np.stack([np.median(state, axis=0) for state in states.values()]), axis=0)[alive]
-    found = {}
-    for number, state in states.items():
-        z = np.clip((state[:, alive] - middle) / evidence.ranges[alive], -3, 3)
-        parts = [np.ones((len(z), 1)), z, z**2]
-        if z.shape[1] <= _MAX_PAIRED:
-            first, second = np.triu_indices(z.shape[1], 1)
-            parts.append(z[:, first] * z[:, second])
-        found[number] = np.hstack(parts)
-    return found
+    return {n: np.clip((state[:, alive] - middle) / evidence.ranges[alive], -3, 3) for n, state in states.items()}
+
+
+def _within(state: Array, others: Sequence[Array]) -> Array:
+    """(T, E) state, no further out than the others: a fit of squares and products says nothing beyond its data."""
+    lowest = np.min([other.min(axis=0) for other in others], axis=0)
+    highest = np.max([other.max(axis=0) for other in others], axis=0)
+    return np.clip(state, lowest, highest)
+
+
+def _features(state: Array) -> Array:
+    """(T, F) elements, their squares and products."""
+    parts = [np.ones((len(state), 1)), state, state**2]
+    if state.shape[1] <= _MAX_PAIRED:
+        first, second = np.triu_indices(state.shape[1], 1)
+        parts.append(state[:, first] * state[:, second])
+    return np.hstack(parts)
 
 
 def _outputs(images: Mapping[int, Images]) -> dict[int, Array]:

@@ -210,6 +210,28 @@ def test_a_fault_of_images_is_found_in_its_episode(name: str, sound: Evidence) -
     assert {each.episode for each in diagnosis.findings} == {BAD}
 
 
+def test_images_of_another_take_follow_the_state_of_another_episode(sound: Evidence) -> None:
+    shown = dict(sound.cameras["top"].episodes)
+    state = sound.by_number[BAD].state
+    assert state is not None
+    rows = np.minimum(np.arange(len(state)), len(shown[2].thumbnails) - 1)
+    shown[BAD] = as_images(shown[2].thumbnails[rows])
+    assert found(diagnose(replace(sound, cameras={"top": CameraImages(episodes=shown)})), "image_take") == {BAD}
+
+
+def test_an_episode_that_moves_where_no_other_does_shows_its_own_images(sound: Evidence) -> None:
+    far = 3
+    before = sound.by_number[far]
+    assert before.state is not None
+    assert before.action is not None
+    shift = np.array([-60.0, 0, 0, 0, 0])
+    moved = episode(far, before.state + shift, before.action + shift)
+    episodes = [moved if each.number == far else each for each in sound.episodes]
+    shown = {each.number: images_of(each.state, each.number) for each in episodes if each.state is not None}
+    diagnosis = diagnose(replace(sound, episodes=episodes, cameras={"top": CameraImages(episodes=shown)}))
+    assert found(diagnosis, "image_take") == set()
+
+
 def test_another_set_that_holds_the_same_episode(sound: Evidence) -> None:
     train = replace(sound, episodes=sound.episodes[:8], cameras={})
     held_out = replace(sound, episodes=sound.episodes[7:], cameras={}, earlier=(train,))

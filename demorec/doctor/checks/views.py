@@ -25,6 +25,11 @@ MIN_SHIFT = 1.5
 MIN_GAIN = 1.4
 """Times less variance that is left unexplained at an episode's own lag than at the usual one."""
 
+MIN_OTHER_RATIO = 0.5
+"""Share of what the state usually explains, from which the state of another episode explains the images."""
+MIN_OTHER_GAIN = 2.0
+"""Times less variance that the state of another episode leaves unexplained."""
+
 
 @check(
     family="images",
@@ -71,20 +76,21 @@ def _gain(fit: ViewFit, usual_lag: float) -> float:
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
 )
 def image_take(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes whose images the state does not explain at any lag, where it explains those of the others."""
+    """Find episodes whose images the state of another episode explains far better than their own, at any lag.
+
+    Images that no state explains are no evidence: the robot may be where no other episode was.
+    """
     for camera, fits in _judged(evidence):
-        best = {number: float(fit.explained.max()) for number, fit in fits.items()}
-        usual_best, spread = usual(list(best.values()), floor=0.05)
-        if float(np.quantile(list(best.values()), 0.2)) < 0.75 * usual_best:
-            continue  # the state explains the images of other episodes no better
-        for number, explained in best.items():
-            if explained < min(usual_best - 8 * spread, 0.25 * usual_best):
+        usual_best = float(np.median([fit.best for fit in fits.values()]))
+        for number, fit in fits.items():
+            gain = (1 - fit.best) / max(1 - fit.by_another, 1e-3)
+            if fit.by_another > MIN_OTHER_RATIO * usual_best and gain > MIN_OTHER_GAIN:
                 yield Fault(
                     severity="broken",
                     episode=number,
-                    value=f"{max(explained, 0):.0%}",
-                    message=f"{camera} does not show the motion of this episode: the state explains "
-                    f"{max(explained, 0):.0%} of its changes, usual are {usual_best:.0%}",
+                    value=f"{max(fit.best, 0):.0%}",
+                    message=f"{camera} does not show the motion of this episode: its state explains "
+                    f"{max(fit.best, 0):.0%} of the changes, that of another episode {fit.by_another:.0%}",
                 )
 
 
