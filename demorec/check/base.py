@@ -22,12 +22,13 @@ from demorec.core.geometry import Array
 Level = Literal["pass", "warn", "fail", "skip"]
 Form = Literal["simulated", "external", "run", "external run", "dataset"]
 """What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
-Group = Literal["file", "time", "images", "run", "dataset"]
+Group = Literal["file", "time", "images", "run", "import", "dataset"]
 ADVICE: Mapping[Group, tuple[str, str]] = {
     "file": ("The recording is damaged or incomplete.", "demorec recover {path}, or record it again"),
     "time": ("Streams are not where their frames are.", "record it again: the file was changed, or written wrongly"),
     "images": ("Images are missing or damaged.", "record it again, or leave it out"),
     "run": ("The run is not what its run.json states.", "run the command that began it again, or restore the files"),
+    "import": ("The run lacks what was lost, or has it at another time.", "look at it: demorec view {path}"),
     "dataset": ("The dataset is not what was exported.", "export it again"),
 }
 """Group -> why a fault matters, and what to do."""

@@ -12,7 +12,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from demorec.check.base import Form, Found, Measurement, counted, run_check
+from demorec.check.base import Form, Found, Measurement, check, counted, run_check
 from demorec.core.errors import DemorecError, resource_error
 from demorec.core.files import sha256_of
 from demorec.core.plain import to_plain
@@ -132,7 +132,7 @@ def _other_config(run: RunFile, info: EpisodeInfo) -> Iterator[str]:
         yield "versions"
 
 
-import_check = partial(run_check, on=("external run",), needs="a run that was imported", fail=math.inf)
+import_check = partial(check, group="import", on=("external run",), needs="a run that was imported", fail=math.inf)
 
 
 @import_check(measures="findings of the import about clocks and losses")

@@ -278,6 +278,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     (judged,) = [line for line in printed.splitlines() if "  import_findings  " in line]
     assert judged.lstrip().startswith("look")
     assert "gap, observation.state" in judged
+    assert f"-> look at it: demorec view {bag}" in printed
 
 
 @pytest.mark.parametrize(
