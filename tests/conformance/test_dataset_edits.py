@@ -149,8 +149,8 @@ def test_statistics_of_arrays_are_those_of_their_last_dimension(dataset: Path, t
         assert np.allclose(found["observation.grid"][quantity], value, rtol=1e-9), quantity
     depth = np.stack([item[DEPTH] for item in shown]).astype(np.float64)
     assert depth.mean() / 1000 == pytest.approx(np.ravel(found[DEPTH]["mean"])[0], rel=1e-5)  # LeRobot decodes to mm
-    results = {result.check: result.level for result in checked(tmp_path / "t", "dataset", images=False).results}
-    assert results["wrong_statistics"] == "pass"
+    results = {result.check: result for result in checked(tmp_path / "t", "dataset", images=False).results}
+    assert results["wrong_statistics"].level == "pass", results["wrong_statistics"]
 
 
 def statistics(root: Path) -> dict[str, Any]:

@@ -159,8 +159,11 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
         assert x.phase == y.phase
         assert [p.data for p in a.packets("front")] == [p.data for p in b.packets("front")]
         assert b.outcome == a.outcome
-    # Not over what is there, unless asked for; never over the source.
-    assert exit_code("replay", source, "--out", tmp_path / "out") == 2
+    # The same replay stays; another one does not replace it, unless asked for; nothing replaces the source.
+    replayed = (tmp_path / "out" / "e.mcap").read_bytes()
+    assert exit_code("replay", source, "--out", tmp_path / "out") == 0
+    assert exit_code("replay", source, "--out", tmp_path / "out", "--delay", "1") == 2
+    assert (tmp_path / "out" / "e.mcap").read_bytes() == replayed
     assert exit_code("replay", source, "--out", tmp_path / "out", "--overwrite") == 0
     assert exit_code("replay", source, "--out", tmp_path, "--overwrite") == 2
 
