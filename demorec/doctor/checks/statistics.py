@@ -98,7 +98,7 @@ def _of_episodes(evidence: Evidence, folder: LeRobotFolder, names: Sequence[str]
             values = _vectors(folder, name, episode.columns[name])
             if not np.isfinite(values).all():
                 continue
-            error, quantity = _largest_error(stored, values, len(values), ())
+            error, quantity = _largest_error(stored, values, len(episode.columns[name]), ())
             if error > MAX_ERROR:
                 yield Fault(
                     severity="look" if name in _COUNTED or quantity == "count" else _severity(error / 2, name),
