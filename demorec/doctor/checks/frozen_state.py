@@ -106,6 +106,8 @@ class _ElementTarget:
         """(N,) distance from the held state to its target in some frames, without what is beyond an end stop."""
         wanted = self.wanted[number][first : end + 1]
         found = wanted - (wanted[0] if self.kind == "increment" else held + self.offset)
+        if len(self.wanted) <= MIN_OTHERS:
+            return found  # too few to tell an end stop from the place where the reading froze
         lowest, highest = (bound[self.element] for bound in evidence.once(state_bounds))
         margin = MAX_END_STOP_RANGE * (highest - lowest)
         if held <= lowest + margin:
