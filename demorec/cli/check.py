@@ -19,7 +19,7 @@ from demorec.doctor.base import RANK
 
 if TYPE_CHECKING:
     from demorec.check.report import Subject, SubjectReport
-    from demorec.doctor.base import Check
+    from demorec.doctor.base import FaultCheck
     from demorec.doctor.diagnosis import Diagnosis
     from demorec.doctor.evidence import Evidence
     from demorec.replay.deep.check import DeepReport
@@ -112,7 +112,7 @@ class CheckCommand:
         tell_unfinished(self.paths)
         return 1 if bad or different else 0
 
-    def _diagnosed(self, reports: Sequence[SubjectReport], checks: Sequence[Check]) -> list[Diagnosis]:
+    def _diagnosed(self, reports: Sequence[SubjectReport], checks: Sequence[FaultCheck]) -> list[Diagnosis]:
         """Diagnose each path, and print it."""
         from demorec.doctor.from_dataset import ReadOptions
 

@@ -15,7 +15,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.registry import nearest_match
 
 if TYPE_CHECKING:
-    from demorec.doctor.base import Check
+    from demorec.doctor.base import FaultCheck
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +51,7 @@ def _row(name: str, text: str, width: int) -> Iterator[str]:
     yield from textwrap.wrap(text, width, initial_indent=f"{name:<7}", subsequent_indent=" " * 7)
 
 
-def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ...]]:
+def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[FaultCheck, ...]]:
     """Find the named checks: names of those of files' integrity, and those of the doctor; all of them without names.
 
     Raises:

@@ -16,7 +16,7 @@ UNKNOWN_ROBOT = "the robot's URDF is not known (name it: --urdf FILE)"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Arm:
+class StateJoints:
     """Joints of the state's D elements.
 
     Attributes:
@@ -31,7 +31,7 @@ class Arm:
     upper: Array
 
 
-def arm_of(evidence: Evidence) -> Arm:
+def arm_of(evidence: Evidence) -> StateJoints:
     """Match the state's elements to the joints of the URDF: as recorded, by their names, else by their order."""
     if not evidence.urdf or not evidence.elements:
         raise NotMeasuredError(UNKNOWN_ROBOT)
@@ -41,7 +41,7 @@ def arm_of(evidence: Evidence) -> Arm:
     found = [tree.get(joint) for joint in joints]
     if not any(found):
         raise NotMeasuredError("no element of the state has the name of a joint of the URDF")
-    return Arm(
+    return StateJoints(
         urdf=urdf,
         joints=joints,
         lower=np.array([-np.inf if joint is None else joint.lower for joint in found]),

@@ -48,7 +48,7 @@ class Fault:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding(Fault):
+class DiagnosedFault(Fault):
     """A fault with the name of its check and its reasons.
 
     Attributes:
@@ -61,7 +61,7 @@ class Finding(Fault):
 
 
 @dataclass(frozen=True, kw_only=True)
-class Check:
+class FaultCheck:
     """One check.
 
     Attributes:
@@ -87,13 +87,13 @@ class Check:
         """Its explanation, for people."""
         return inspect.cleandoc(self.find.__doc__ or "")
 
-    def run(self, evidence: Evidence) -> tuple[list[Finding], str | None]:
+    def run(self, evidence: Evidence) -> tuple[list[DiagnosedFault], str | None]:
         """Return what it finds, and why it could not be made: "" if it could, None if it does not apply.
 
         Raises:
             ResourceError: This machine cannot measure it, which says nothing about the data.
         """
-        found: list[Finding] = []
+        found: list[DiagnosedFault] = []
         try:
             found += (self._finding(fault, evidence) for fault in self.find(evidence))
         except NotApplicableError:
@@ -110,22 +110,22 @@ class Check:
             return found, f"the data are such that it cannot be computed ({type(error).__name__})"
         return found, ""
 
-    def _finding(self, fault: Fault, evidence: Evidence) -> Finding:
+    def _finding(self, fault: Fault, evidence: Evidence) -> DiagnosedFault:
         number = "" if fault.episode is None else str(fault.episode)
         do = (fault.do or self.do).format(path=evidence.quoted_path, episode=number)
         if evidence.folder is None and "demorec dataset" in do:
             name = evidence.names.get(-1 if fault.episode is None else fault.episode, "the recordings")
             do = f"look at it: demorec view {evidence.quoted_path}; then leave {name} out, or record it again"
-        return Finding(**{**vars(fault), "do": do}, check=self.name, why=self.why)
+        return DiagnosedFault(**{**vars(fault), "do": do}, check=self.name, why=self.why)
 
 
 def check(
     *, family: Family, needs: str, measures: str, unit: str = "", why: str, do: str
-) -> Callable[[Callable[[Evidence], Iterator[Fault]]], Check]:
-    """Make a `Check` of a generator; its name is the function's."""
+) -> Callable[[Callable[[Evidence], Iterator[Fault]]], FaultCheck]:
+    """Make a `FaultCheck` of a generator; its name is the function's."""
 
-    def wrap(function: Callable[[Evidence], Iterator[Fault]]) -> Check:
-        return Check(
+    def wrap(function: Callable[[Evidence], Iterator[Fault]]) -> FaultCheck:
+        return FaultCheck(
             name=function.__name__,
             family=family,
             needs=needs,

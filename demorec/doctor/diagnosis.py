@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.doctor.base import RANK, Check, Finding, Verdict
+from demorec.doctor.base import RANK, DiagnosedFault, FaultCheck, Verdict
 from demorec.doctor.checks import FAMILIES, all_checks
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.scores import score_episodes
@@ -53,7 +53,7 @@ class Diagnosis:
 
     path: Path
     taken: Mapping[str, Role | None]
-    findings: tuple[Finding, ...]
+    findings: tuple[DiagnosedFault, ...]
     episodes: tuple[EpisodeVerdict, ...]
     not_measured: Mapping[str, str]
     num_checks: int = 0
@@ -96,7 +96,9 @@ class Diagnosis:
         }
 
 
-def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: Sequence[Finding] = ()) -> Diagnosis:
+def diagnose(
+    evidence: Evidence, checks: Sequence[FaultCheck] | None = None, extra: Sequence[DiagnosedFault] = ()
+) -> Diagnosis:
     """Make all checks, or some.
 
     Args:
@@ -132,7 +134,7 @@ def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: S
     )
 
 
-def _verdicts(evidence: Evidence, findings: Sequence[Finding]) -> tuple[EpisodeVerdict, ...]:
+def _verdicts(evidence: Evidence, findings: Sequence[DiagnosedFault]) -> tuple[EpisodeVerdict, ...]:
     """The verdict on each episode, the worst first."""
     found = []
     for number, score in score_episodes(evidence).items():

@@ -21,7 +21,7 @@ from demorec.episode.roles import Role, Roles
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.doctor.thumbnails import CameraImages
+    from demorec.doctor.thumbnails import CameraThumbnails
 
 Flags = NDArray[np.bool_]
 _HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
@@ -94,7 +94,7 @@ class Evidence:
     episodes: Sequence[EpisodeEvidence]
     unreadable: Mapping[int, str] = field(default_factory=dict)
     folder: LeRobotFolder | None = None
-    cameras: Mapping[str, CameraImages] = field(default_factory=dict)
+    cameras: Mapping[str, CameraThumbnails] = field(default_factory=dict)
     images_missing: str = ""
     urdf: str = ""
     robot_problem: str = ""
@@ -165,7 +165,7 @@ class Evidence:
             raise NotMeasuredError(f"no readable episode has {min_frames} frames")
         return found
 
-    def need_images(self) -> Mapping[str, CameraImages]:
+    def need_images(self) -> Mapping[str, CameraThumbnails]:
         """Return the cameras. Raises NotMeasuredError if there are none."""
         if self.images_missing:
             raise NotMeasuredError(self.images_missing)

@@ -18,7 +18,7 @@ from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
-from demorec.doctor.thumbnails import CameraImages, Images, Shrinker, frames_of
+from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
 from demorec.episode.features import STATE
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.robots.motors import Motors
@@ -155,22 +155,24 @@ def _why_no_images(folder: LeRobotFolder) -> str:
     return ""
 
 
-def _cameras(folder: LeRobotFolder) -> dict[str, CameraImages]:
+def _cameras(folder: LeRobotFolder) -> dict[str, CameraThumbnails]:
     found = {}
     for key, feature in folder.info.features.items():
         if feature.is_depth or not feature.is_camera or (feature.is_video and _is_absent(folder, key)):
             continue
-        episodes: dict[int, Images] = {}
+        episodes: dict[int, EpisodeThumbnails] = {}
         errors: dict[int, str] = {}
         if feature.is_video:
             _read_videos(folder, key, episodes, errors)
         else:
             _read_stored(folder, key, episodes, errors)
-        found[key] = CameraImages(episodes=episodes, errors=errors)
+        found[key] = CameraThumbnails(episodes=episodes, errors=errors)
     return found
 
 
-def _read_videos(folder: LeRobotFolder, key: str, episodes: dict[int, Images], errors: dict[int, str]) -> None:
+def _read_videos(
+    folder: LeRobotFolder, key: str, episodes: dict[int, EpisodeThumbnails], errors: dict[int, str]
+) -> None:
     """Decode a camera's videos, each file in one pass."""
     shrinker = Shrinker()
     for path, group in groupby(folder.listed, key=lambda place: place.videos[key][0]):
@@ -187,7 +189,9 @@ def _read_videos(folder: LeRobotFolder, key: str, episodes: dict[int, Images], e
             errors |= {place.episode_index: problems[0] for place in places if place.episode_index not in episodes}
 
 
-def _read_stored(folder: LeRobotFolder, key: str, episodes: dict[int, Images], errors: dict[int, str]) -> None:
+def _read_stored(
+    folder: LeRobotFolder, key: str, episodes: dict[int, EpisodeThumbnails], errors: dict[int, str]
+) -> None:
     shrinker = Shrinker()
     for place in folder.listed:
         problems: list[str] = []

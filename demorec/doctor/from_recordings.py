@@ -14,7 +14,7 @@ from demorec.core.errors import DemorecError, resource_error, without_path
 from demorec.core.geometry import Array
 from demorec.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
 from demorec.doctor.from_dataset import ReadOptions
-from demorec.doctor.thumbnails import CameraImages, Images, Shrinker, frames_of
+from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
 from demorec.episode.episode import NO_IMAGE, Outcome, Table
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import COUNTERS, Column, NamedRoles, Roles, find_roles, roles_of_recording
@@ -64,7 +64,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, op
     """
     episodes: list[EpisodeEvidence] = []
     unreadable: dict[int, str] = {}
-    images: dict[str, dict[int, Images]] = {}
+    images: dict[str, dict[int, EpisodeThumbnails]] = {}
     errors: dict[str, dict[int, str]] = {}
     first: EpisodeInfo | None = None
     roles: Roles | None = None
@@ -75,7 +75,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, op
                 own = roles_of_recording(recording.info, options.named)
                 if first is None or roles is None:
                     first, roles = recording.info, own
-                    urdf = urdf or (recording.info.urdf if first.simulation is None else recording.description())
+                    urdf = urdf or recording.info.urdf or recording.description()
                 table = recording.table()
                 episodes.append(_episode(number, file, recording, table, roles))
                 for camera in recording.cameras if options.images else ():
@@ -93,7 +93,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, op
         roles=_with_cameras(roles, images),
         episodes=episodes,
         unreadable=unreadable,
-        cameras={camera: CameraImages(episodes=images[camera], errors=errors[camera]) for camera in images},
+        cameras={camera: CameraThumbnails(episodes=images[camera], errors=errors[camera]) for camera in images},
         images_missing="" if options.images else "images are not decoded (--no-images)",
         urdf=urdf,
         arm_joints=joints if any(joints) else (),
@@ -146,7 +146,7 @@ def _read_images(
     recording: ReadableEpisode,
     table: Table,
     camera: str,
-    episodes: dict[int, Images],
+    episodes: dict[int, EpisodeThumbnails],
     errors: dict[int, str],
 ) -> None:
     """Decode the images of a camera; each belongs to the first frame that shows it."""

@@ -20,7 +20,7 @@ _MAX_SAMPLES = 96
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Images:
+class EpisodeThumbnails:
     """The N images of one camera in one episode.
 
     Attributes:
@@ -37,9 +37,9 @@ class Images:
     colour: Array
     frames: NDArray[np.intp]
 
-    def taken(self, numbers: NDArray[np.intp], frames: NDArray[np.intp]) -> Images:
+    def taken(self, numbers: NDArray[np.intp], frames: NDArray[np.intp]) -> EpisodeThumbnails:
         """Take some of the images, for these frames."""
-        return Images(
+        return EpisodeThumbnails(
             thumbnails=self.thumbnails[numbers],
             change=self.change[numbers],
             detail=self.detail[numbers],
@@ -60,7 +60,7 @@ class Images:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class CameraImages:
+class CameraThumbnails:
     """The images of one camera.
 
     Attributes:
@@ -68,7 +68,7 @@ class CameraImages:
         errors: Number of an episode -> why its images do not decode.
     """
 
-    episodes: Mapping[int, Images] = field(default_factory=dict)
+    episodes: Mapping[int, EpisodeThumbnails] = field(default_factory=dict)
     errors: Mapping[int, str] = field(default_factory=dict)
 
 
@@ -79,7 +79,7 @@ class Shrinker:
         self._reformatter = VideoReformatter()
         self._colours = VideoReformatter()
 
-    def shrink(self, images: Iterable[av.VideoFrame], frames: NDArray[np.intp] | None = None) -> Images:
+    def shrink(self, images: Iterable[av.VideoFrame], frames: NDArray[np.intp] | None = None) -> EpisodeThumbnails:
         """Read all images of an episode; `frames` are those that they belong to, by default one after the other."""
         thumbnails: list[NDArray[np.uint8]] = []
         changes: list[float] = []
@@ -97,7 +97,7 @@ class Shrinker:
                 tiny = self._colours.reformat(image, SIDE, SIDE, "rgb24", interpolation="AREA")
                 colours.append(tiny.to_ndarray().mean(axis=(0, 1)) / 255)
         count = len(thumbnails)
-        return Images(
+        return EpisodeThumbnails(
             thumbnails=np.stack(thumbnails) if count else np.zeros((0, SIDE, SIDE), dtype=np.uint8),
             change=np.array(changes, dtype=np.float32),
             detail=np.array(details, dtype=np.float32),

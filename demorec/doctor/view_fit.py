@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from demorec.core.geometry import Array
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.doctor.robust import finest
-from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.doctor.units import other_units
 
 MIN_EPISODES = 5
@@ -59,7 +59,7 @@ def view_fits(evidence: Evidence) -> Mapping[str, Mapping[int, ViewFit]]:
     return {camera: _fits(evidence, images) for camera, images in evidence.cameras.items()}
 
 
-def _fits(evidence: Evidence, images: CameraImages) -> Mapping[int, ViewFit]:
+def _fits(evidence: Evidence, images: CameraThumbnails) -> Mapping[int, ViewFit]:
     known = _known(evidence, images)
     known = {number: both for number, both in known.items() if len(both[1].frames) >= MIN_FRAMES}
     if len(known) < MIN_EPISODES:
@@ -130,7 +130,7 @@ def _features(state: Array) -> Array:
     return np.hstack(parts)
 
 
-def _outputs(images: Mapping[int, Images]) -> dict[int, Array]:
+def _outputs(images: Mapping[int, EpisodeThumbnails]) -> dict[int, Array]:
     """Episode -> (T, 8) principal components of the thumbnails, each episode around its own mean."""
     flat = {n: each.thumbnails.reshape(len(each.thumbnails), -1).astype(np.float32) for n, each in images.items()}
     centred = {number: each - each.mean(axis=0) for number, each in flat.items()}
@@ -153,7 +153,7 @@ def _explained(predicted: Array, shown: Array, lags: NDArray[np.intp]) -> Array:
     return np.array(shares)
 
 
-def _known(evidence: Evidence, camera: CameraImages) -> Mapping[int, tuple[EpisodeEvidence, Images]]:
+def _known(evidence: Evidence, camera: CameraThumbnails) -> Mapping[int, tuple[EpisodeEvidence, EpisodeThumbnails]]:
     """Episodes that have both numbers and images of every frame."""
     return {
         number: (episode, images)

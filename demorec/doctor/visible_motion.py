@@ -8,7 +8,7 @@ import numpy as np
 
 from demorec.core.geometry import Array
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
-from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.doctor.units import other_units
 
 MIN_FRAMES = 20
@@ -28,12 +28,12 @@ class VisibleMotion:
     weights: Array
     usual_change: float
 
-    def expected(self, evidence: Evidence, episode: EpisodeEvidence, images: Images) -> Array:
+    def expected(self, evidence: Evidence, episode: EpisodeEvidence, images: EpisodeThumbnails) -> Array:
         """(N - 1,) change from each image to the next that the motion lets expect, at most the usual one."""
         return np.asarray(np.minimum(_steps(evidence, episode, images) @ self.weights, 2 * self.usual_change))
 
 
-def visible_motion(evidence: Evidence, camera: CameraImages) -> VisibleMotion | None:
+def visible_motion(evidence: Evidence, camera: CameraThumbnails) -> VisibleMotion | None:
     """Fit the change of a camera's images to the joints' steps; None where nothing moves or changes."""
     steps: list[Array] = []
     changes: list[Array] = []
@@ -63,7 +63,7 @@ def _non_negative_fit(squares: Array, products: Array) -> Array:
     return weights
 
 
-def _steps(evidence: Evidence, episode: EpisodeEvidence, images: Images) -> Array:
+def _steps(evidence: Evidence, episode: EpisodeEvidence, images: EpisodeThumbnails) -> Array:
     """(N - 1, D) size of each element's step between images, in units of its usual range."""
     assert episode.state is not None
     position = episode.state[np.minimum(images.frames, len(episode.state) - 1)]

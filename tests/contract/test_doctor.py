@@ -13,7 +13,7 @@ from demorec.core.geometry import Array
 from demorec.doctor.checks import all_checks
 from demorec.doctor.diagnosis import Diagnosis, diagnose
 from demorec.doctor.evidence import EpisodeEvidence, Evidence
-from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.episode.roles import NO_NAMES, Column, find_roles
 
 NAMES = ("pan.pos", "lift.pos", "elbow.pos", "wrist.pos", "gripper.pos")
@@ -38,7 +38,7 @@ def motion(number: int, count: int) -> tuple[Array, Array]:
     return state + rng.normal(0, 0.03, state.shape), target + rng.normal(0, 0.03, target.shape)
 
 
-def images_of(state: Array, number: int) -> Images:
+def images_of(state: Array, number: int) -> EpisodeThumbnails:
     """A bright blob that follows the first two joints over a textured table."""
     rng = np.random.default_rng(number)
     table = np.random.default_rng(0).uniform(40, 120, (16, 16))
@@ -49,10 +49,10 @@ def images_of(state: Array, number: int) -> Images:
     return as_images(shown)
 
 
-def as_images(shown: np.ndarray) -> Images:  # type: ignore[type-arg]
+def as_images(shown: np.ndarray) -> EpisodeThumbnails:  # type: ignore[type-arg]
     change = np.abs(np.diff(shown.astype(float), axis=0, prepend=shown[:1])).mean(axis=(1, 2))
     detail = np.abs(np.diff(shown.astype(float), axis=2)).mean(axis=(1, 2))
-    return Images(
+    return EpisodeThumbnails(
         thumbnails=shown,
         change=change.astype(np.float32),
         detail=detail.astype(np.float32),
@@ -79,7 +79,7 @@ def sound() -> Evidence:
         fps=FPS,
         roles=ROLES,
         episodes=[episode(number, *both) for number, both in enumerate(motions)],
-        cameras={"top": CameraImages(episodes=shown)},
+        cameras={"top": CameraThumbnails(episodes=shown)},
     )
 
 
@@ -205,7 +205,7 @@ def test_a_fault_of_images_is_found_in_its_episode(name: str, sound: Evidence) -
     change, check = IMAGES[name]
     shown = dict(sound.cameras["top"].episodes)
     shown[BAD] = as_images(np.ascontiguousarray(change(shown[BAD].thumbnails)))
-    diagnosis = diagnose(replace(sound, cameras={"top": CameraImages(episodes=shown)}))
+    diagnosis = diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)}))
     assert found(diagnosis, check) == {BAD}
     assert {each.episode for each in diagnosis.findings} == {BAD}
 
@@ -216,7 +216,7 @@ def test_images_of_another_take_follow_the_state_of_another_episode(sound: Evide
     assert state is not None
     rows = np.minimum(np.arange(len(state)), len(shown[2].thumbnails) - 1)
     shown[BAD] = as_images(shown[2].thumbnails[rows])
-    assert found(diagnose(replace(sound, cameras={"top": CameraImages(episodes=shown)})), "image_take") == {BAD}
+    assert found(diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)})), "image_take") == {BAD}
 
 
 def test_an_episode_that_moves_where_no_other_does_shows_its_own_images(sound: Evidence) -> None:
@@ -228,7 +228,7 @@ def test_an_episode_that_moves_where_no_other_does_shows_its_own_images(sound: E
     moved = episode(far, before.state + shift, before.action + shift)
     episodes = [moved if each.number == far else each for each in sound.episodes]
     shown = {each.number: images_of(each.state, each.number) for each in episodes if each.state is not None}
-    diagnosis = diagnose(replace(sound, episodes=episodes, cameras={"top": CameraImages(episodes=shown)}))
+    diagnosis = diagnose(replace(sound, episodes=episodes, cameras={"top": CameraThumbnails(episodes=shown)}))
     assert found(diagnosis, "image_take") == set()
 
 

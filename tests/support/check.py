@@ -23,7 +23,7 @@ from demorec.check.report import CheckOptions, Subject, SubjectReport, check_sub
 from demorec.cli.explain import split_checks
 from demorec.cli.shared.diagnoses import examine
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.doctor.base import Check
+from demorec.doctor.base import FaultCheck
 from demorec.doctor.from_dataset import ReadOptions
 from demorec.episode.episode import CameraImages, Event, Frame, Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
@@ -96,7 +96,7 @@ def checked(
     return SubjectReport(**vars(subject), results=found)
 
 
-def _of_doctor(path: Path, checks: Sequence[Check], options: ReadOptions) -> Iterator[Result]:
+def _of_doctor(path: Path, checks: Sequence[FaultCheck], options: ReadOptions) -> Iterator[Result]:
     """A result for each check of the doctor that applies: its worst finding."""
     diagnosis, _ = examine(path, options, checks=checks)
     levels: dict[str, Level] = {"look": "warn", "broken": "fail"}

@@ -10,7 +10,7 @@ import pytest
 from support.commands import exit_code
 from support.export import export
 
-from demorec.doctor.base import Finding
+from demorec.doctor.base import DiagnosedFault
 from demorec.doctor.checks import lerobot_opens
 from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
 
@@ -19,7 +19,7 @@ _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_
 """What LeRobot 0.6.1 ends with where a file of the dataset is missing: it asks the Hub for it."""
 
 
-def opened(dataset: Path) -> list[Finding]:
+def opened(dataset: Path) -> list[DiagnosedFault]:
     """What is found when LeRobot opens it."""
     evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
     return lerobot_opens.lerobot_opens.run(evidence)[0]

@@ -13,7 +13,7 @@ from demorec.cli.shared.output import counted
 if TYPE_CHECKING:
     from demorec.check.base import Result
     from demorec.check.report import SubjectReport
-    from demorec.doctor.base import Check, Finding
+    from demorec.doctor.base import DiagnosedFault, FaultCheck
     from demorec.doctor.diagnosis import Diagnosis
     from demorec.doctor.evidence import Evidence
     from demorec.doctor.from_dataset import ReadOptions
@@ -32,7 +32,7 @@ def examine(
     options: ReadOptions,
     *,
     reports: Sequence[SubjectReport] = (),
-    checks: Sequence[Check] | None = None,
+    checks: Sequence[FaultCheck] | None = None,
     earlier: Sequence[Evidence] = (),
 ) -> tuple[Diagnosis, Evidence | None]:
     """Diagnose a dataset, a run, or recordings; returns the evidence too, None where nothing can be opened.
@@ -78,7 +78,7 @@ def _evidence(path: Path, options: ReadOptions) -> Evidence:
     return evidence_of_recordings(path, (*found.recordings, *rollouts), open_recording, options)
 
 
-def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[Check]) -> Diagnosis:
+def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[FaultCheck]) -> Diagnosis:
     """Add the findings about the files of a run's own dataset; its numbers and images are those of the recordings."""
     from demorec.core.errors import ExportError
     from demorec.doctor.diagnosis import diagnose
@@ -101,14 +101,14 @@ def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen:
     return replace(diagnosis, findings=(*found, *diagnosis.findings), not_measured={**unmade, **files.not_measured})
 
 
-def _of(finding: Finding) -> str:
+def _of(finding: DiagnosedFault) -> str:
     return "" if finding.episode is None else f"episode {finding.episode}: "
 
 
-def _unopened(error: Exception, path: Path) -> Finding:
-    from demorec.doctor.base import Finding
+def _unopened(error: Exception, path: Path) -> DiagnosedFault:
+    from demorec.doctor.base import DiagnosedFault
 
-    return Finding(
+    return DiagnosedFault(
         check="unreadable_episodes",
         severity="broken",
         message=str(error).removesuffix(f": {path}"),
@@ -117,9 +117,9 @@ def _unopened(error: Exception, path: Path) -> Finding:
     )
 
 
-def _integrity_findings(reports: Iterable[SubjectReport]) -> Iterator[Finding]:
+def _integrity_findings(reports: Iterable[SubjectReport]) -> Iterator[DiagnosedFault]:
     """What the checks of files found, as findings; those of a recording belong to its episode."""
-    from demorec.doctor.base import Finding
+    from demorec.doctor.base import DiagnosedFault
 
     recordings = [report.path for report in reports if report.kind == "recording"]
     for report in reports:
@@ -127,7 +127,7 @@ def _integrity_findings(reports: Iterable[SubjectReport]) -> Iterator[Finding]:
         for result in report.results:
             if result.level in ("warn", "fail"):
                 value = "" if result.value is None else f"{result.value:.4g} {result.unit}".strip()
-                yield Finding(
+                yield DiagnosedFault(
                     check=result.check,
                     severity="broken" if result.level == "fail" else "look",
                     episode=number,
@@ -190,16 +190,16 @@ def _by_reason(not_measured: Mapping[str, str]) -> dict[str, list[str]]:
     return found
 
 
-def _folded(findings: Sequence[Finding]) -> Iterator[list[Finding]]:
+def _folded(findings: Sequence[DiagnosedFault]) -> Iterator[list[DiagnosedFault]]:
     """Findings of one check and severity together, in order; those of the whole set by themselves."""
-    groups: dict[tuple[str, str, str], list[Finding]] = {}
+    groups: dict[tuple[str, str, str], list[DiagnosedFault]] = {}
     for finding in findings:
         own = finding.message if finding.episode is None else ""
         groups.setdefault((finding.check, finding.severity, own), []).append(finding)
     yield from groups.values()
 
 
-def _finding(same: Sequence[Finding]) -> Iterator[str]:
+def _finding(same: Sequence[DiagnosedFault]) -> Iterator[str]:
     worst = same[0]
     numbers = list(dict.fromkeys(each.episode for each in same if each.episode is not None))
     where = ""
@@ -238,7 +238,7 @@ def results_of(path: Path, options: ReadOptions) -> list[EpisodeResult]:
     return found
 
 
-def _as_result(name: str, finding: Finding) -> Result:
+def _as_result(name: str, finding: DiagnosedFault) -> Result:
     from demorec.check.base import Result
 
     return Result(

@@ -12,7 +12,7 @@ from demorec.doctor.base import DROP, Fault, check
 from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence
 from demorec.doctor.robust import runs
-from demorec.doctor.thumbnails import CameraImages, Images
+from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.doctor.visible_motion import visible_motion
 
 MIN_OTHERS = 3
@@ -107,7 +107,7 @@ def blank_images(evidence: Evidence) -> Iterator[Fault]:
                 )
 
 
-def _spread(images: Images) -> Array:
+def _spread(images: EpisodeThumbnails) -> Array:
     """(N,) standard deviation of each thumbnail."""
     return np.asarray(images.thumbnails.std(axis=(1, 2), dtype=np.float64))
 
@@ -188,7 +188,9 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
                 )
 
 
-def _rests(evidence: Evidence, number: int, images: Images, camera: CameraImages) -> list[tuple[float, int, int]]:
+def _rests(
+    evidence: Evidence, number: int, images: EpisodeThumbnails, camera: CameraThumbnails
+) -> list[tuple[float, int, int]]:
     """(images' worth of change that is missing, first frame, last frame) of each run of repeated images."""
     visible = evidence.once(visible_motion, camera)
     episode = evidence.by_number.get(number)
@@ -206,7 +208,7 @@ def _rests(evidence: Evidence, number: int, images: Images, camera: CameraImages
     ]
 
 
-def _repeats(images: Images, usual_change: float) -> NDArray[np.bool_]:
+def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_]:
     """(N - 1,) whether each image repeats the one before: neither its pixels nor its thumbnail change."""
     pixels = images.change[1:] <= FROZEN_RATIO * usual_change
     return np.asarray(pixels | ((images.steps == 0) & (images.change[1:] <= 3 * FROZEN_RATIO * usual_change)))
@@ -306,7 +308,7 @@ def camera_views(evidence: Evidence) -> Iterator[Fault]:
                 )
 
 
-def _view(images: CameraImages) -> Array:
+def _view(images: CameraThumbnails) -> Array:
     """(16, 16) median over the episodes of their mean images."""
     means = [each.mean for each in images.episodes.values() if len(each.thumbnails)]
     return np.asarray(np.median(np.stack(means), axis=0)) if means else np.zeros((16, 16))
@@ -357,7 +359,7 @@ def doubled_cameras(evidence: Evidence) -> Iterator[Fault]:
                 )
 
 
-def _are_the_same(one: Images, two: Images) -> bool:
+def _are_the_same(one: EpisodeThumbnails, two: EpisodeThumbnails) -> bool:
     if len(one.thumbnails) != len(two.thumbnails) or not len(one.thumbnails) or _spread(one).max() < MAX_BLANK_SPREAD:
         return False
     error = np.abs(one.thumbnails.astype(np.int16) - two.thumbnails.astype(np.int16)).mean(axis=(1, 2))
