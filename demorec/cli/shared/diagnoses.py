@@ -61,8 +61,11 @@ def examine(
     diagnosis = diagnose(evidence, chosen, extra)
     if found.kind == "run" and evidence.folder is None:
         diagnosis = _with_dataset(diagnosis, path, options, chosen)
-    unmade = {r.check: r.detail for report in reports for r in report.results if _is_unmade(r)}
-    return replace(diagnosis, not_measured={**diagnosis.not_measured, **unmade}), evidence
+    integrity = [result for report in reports for result in report.results]
+    unmade = {result.check: result.detail for result in integrity if _is_unmade(result)}
+    passed = {result.check for result in integrity if result.level == "pass"}
+    not_measured = {**diagnosis.not_measured, **unmade}
+    return replace(diagnosis, not_measured=not_measured, num_checks=diagnosis.num_checks + len(passed)), evidence
 
 
 def _evidence(path: Path, options: ReadOptions) -> Evidence:
