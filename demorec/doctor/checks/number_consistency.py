@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from demorec.doctor.arm import arm_of
 from demorec.doctor.base import DROP, Fault, check
 from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.doctor.evidence import Evidence, joined, quaternion_places
-from demorec.doctor.robust import without_gaps
+from demorec.doctor.robust import usual, without_gaps
 
 VELOCITY_WINDOW_S = 0.3
 """Time over which velocities are integrated: filters of drivers are 20 to 100 ms late, which cancels over longer."""
@@ -52,7 +52,8 @@ def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
     known_ratios = {number: both for number, both in found.items() if np.isfinite(both[0]).any()}
     if not known_ratios:
         raise NotMeasuredError("nothing moves long enough to compare it with its velocity")
-    by_element, agreed = (np.nanmedian(np.stack([each[k] for each in known_ratios.values()]), axis=0) for k in (0, 1))
+    by_element = _median_by_element([ratios for ratios, _ in known_ratios.values()])
+    agreed = _median_by_element([agreement for _, agreement in known_ratios.values()])
     names = [evidence.elements[element] for element in elements]
     wrong = [k for k in range(len(names)) if abs(by_element[k] - 1) > MAX_VELOCITY_ERROR or agreed[k] < MIN_AGREED]
     if wrong:
@@ -73,6 +74,11 @@ def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
                 message=f"its state moves {ratio:.2f} times as far as its velocities say",
                 do=DROP,
             )
+
+
+def _median_by_element(values: Sequence[Array]) -> Array:
+    """(K,) median of each element over episodes, from N times (K,); NaN where no episode has a number."""
+    return np.array([usual(element)[0] for element in np.stack(values).T])
 
 
 def _velocity_ratios(state: Array, steps: Array, window: int) -> tuple[Array, Array]:
