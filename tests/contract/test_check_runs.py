@@ -197,10 +197,10 @@ def test_one_bad_recording_leaves_the_reports_of_the_others(workers: int, run: P
 
 
 def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def broken(self: Evidence) -> None:
+    def broken(evidence: Evidence) -> None:
         raise IndexError("list index out of range")
 
-    monkeypatch.setattr(Evidence, "arm", property(broken))
+    monkeypatch.setattr("demorec.doctor.checks.kinematics.arm_of", broken)
     results = {result.check: result for result in checked(good / "episodes" / "episode_000000.mcap").results}
     assert results["joint_limits"].level == "skip"
     assert "cannot be computed" in results["joint_limits"].detail
