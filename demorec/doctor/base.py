@@ -103,6 +103,8 @@ class FaultCheck:
         except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
+            if isinstance(error, DemorecError) and self.family == "files":  # a file that cannot be read is a fault
+                return [*found, self._finding(Fault(severity="broken", message=str(error)), evidence)], ""
             if isinstance(error, DemorecError):
                 return found, str(error)
             # Data that break one check in an unforeseen way must not hide the findings of the others.

@@ -243,7 +243,7 @@ def test_tasks_with_things_of_their_own_refuse_shelves(tmp_path: Path, capsys: p
         episode(task="pick_anything", objects=("houshold",))
     (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')
     words = ("evaluate", "--policy", tmp_path, "--action", "joint", "--workers", "1", "--out", tmp_path / "out")
-    assert exit_code(*words, "--object-split", "eval") == 1
+    assert exit_code(*words, "--object-split", "eval") == 2
     assert "--object-split was given, but the task 'pick_place'" in capsys.readouterr().err
     assert exit_code(*words, "--task", "pick_anything", "--objects", "houshold") == 2
     assert "Unknown shelf 'houshold'" in capsys.readouterr().err
