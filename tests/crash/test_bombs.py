@@ -151,7 +151,7 @@ def test_fifos_in_a_dataset(name: str, good: Path, commands: LimitedCommands, tm
     export([good], dataset)
     (dataset / name).unlink()
     os.mkfifo(dataset / name)
-    checks = ["--only", "unreadable_episodes", "wrong_statistics"]
+    checks = ["--only", "unreadable_episodes", "contradicting_counts", "wrong_statistics"]
     assert "it is a FIFO" in commands.refused("check", dataset, *checks)
     commands.refused("export", "lerobot", good, "--out", dataset, "--append", "--no-verify")
 
