@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
-from demorec.core.errors import DemorecError, resource_error
+from demorec.core.errors import DemorecError, ExportError, resource_error
 from demorec.doctor.errors import NotApplicableError, NotMeasuredError
 
 if TYPE_CHECKING:
@@ -103,7 +103,7 @@ class FaultCheck:
         except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
-            if isinstance(error, DemorecError) and self.family == "files":  # a file that cannot be read is a fault
+            if isinstance(error, ExportError) and self.family == "files":  # a file that cannot be read is a fault
                 return [*found, self._finding(Fault(severity="broken", message=str(error)), evidence)], ""
             if isinstance(error, DemorecError):
                 return found, str(error)

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import zstandard
+from support.commands import exit_code
 from support.export import export
 from support.fuzz import LimitedCommands, problem_of
 from support.mcap import chunk_record, message_record, record, rewritten
@@ -154,6 +155,14 @@ def test_fifos_in_a_dataset(name: str, good: Path, commands: LimitedCommands, tm
     checks = ["--only", "unreadable_episodes", "contradicting_counts", "wrong_statistics"]
     assert "it is a FIFO" in commands.refused("check", dataset, *checks)
     commands.refused("export", "lerobot", good, "--out", dataset, "--append", "--no-verify")
+
+
+def test_a_missing_lerobot_is_no_fault_of_a_dataset(
+    good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    export([good], tmp_path / "dataset")
+    monkeypatch.setattr("demorec.doctor.checks.lerobot_opens.lerobot_is_installed", lambda: False)
+    assert exit_code("check", tmp_path / "dataset", "--only", "lerobot_opens", "--lerobot") == 0
 
 
 @pytest.mark.parametrize(
