@@ -45,6 +45,12 @@ def pytest_runtest_call() -> Iterator[None]:
         return (yield)
 
 
+@pytest.fixture(autouse=True)
+def no_allowed_models(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a command of another test was allowed is forgotten."""
+    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
+
+
 @pytest.fixture
 def without_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
     """Exports are not verified and `lerobot_opens` is left out: a process of LeRobot takes seconds to start."""

@@ -7,6 +7,7 @@ a module only if the user has allowed it.
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import hashlib
 import importlib.util
@@ -170,7 +171,7 @@ def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...])
         yield data_folder() / relative
         folders = [folder]
     else:
-        folders = [Path.cwd(), *(module_file(module).parent for module in sorted(_modules_with_models))]
+        folders = [Path.cwd(), *_allowed_folders()]
         if not Path(relative).is_absolute() and ".." not in Path(relative).parts:
             yield from (place / relative for place in (*folders, data_folder()))
     if not parts or ".." in parts:
@@ -180,6 +181,13 @@ def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...])
             yield above.joinpath(*parts)
             yield above.joinpath(*parts[1:])  # a repository that is not called as its package is
     yield from (package.joinpath(*parts[1:]) for package in _ros_packages(parts[0]))
+
+
+def _allowed_folders() -> Iterator[Path]:
+    """The folders of the modules that the user has allowed; one that does not exist here has no meshes to find."""
+    for module in sorted(_modules_with_models):
+        with contextlib.suppress(ConfigError):
+            yield module_file(module).parent
 
 
 def _package_path(scheme: str, path: str) -> tuple[str, ...]:

@@ -180,7 +180,6 @@ def test_it_makes_and_checks_a_dataset_with_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(FOLDER)
-    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
     monkeypatch.setattr(sys, "path", list(sys.path))
     monkeypatch.delitem(sys.modules, "my_arms", raising=False)
     out = tmp_path / "run"

@@ -43,7 +43,6 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     monkeypatch.chdir(folder)
     before = list(sys.path)
     sys.path[:] = [entry for entry in sys.path if entry not in ("", str(folder))]
-    monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
     forget("my_robots")
     yield folder
     sys.path[:] = before
