@@ -26,9 +26,9 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import SceneError
 from demorec.core.geometry import Array
 from demorec.core.tables import ROBOTS, TASKS
-from demorec.doctor.checks.kinematics import matrices
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body
+from demorec.extensions.doctor.checks.kinematics import matrices
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.loop.prepare import PreparedEpisode
 

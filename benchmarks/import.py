@@ -109,7 +109,7 @@ def make_bag(path: Path, seconds: float, images: str, gop: int) -> Path:
 
 def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
     """The bags to a run, and with `exports` on to a LeRobot dataset."""
-    from demorec.sources.import_run import import_bags
+    from demorec.extensions.imports.import_run import import_bags
 
     import_bags(bags_, mapping, out / "run")
     if exports:
@@ -124,14 +124,14 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
     import av
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
-    from demorec.sources.bag import open_bag
-    from demorec.sources.decoding import BagDecoder
-    from demorec.sources.fields import image_bytes
-    from demorec.sources.image_messages import decode_image
-    from demorec.sources.mapping_file import read_mapping
-    from demorec.sources.planning import windows
-    from demorec.sources.rows import Timelines
-    from demorec.sources.streams import read_streams
+    from demorec.extensions.imports.bag import open_bag
+    from demorec.extensions.imports.decoding import BagDecoder
+    from demorec.extensions.imports.fields import image_bytes
+    from demorec.extensions.imports.image_messages import decode_image
+    from demorec.extensions.imports.mapping_file import read_mapping
+    from demorec.extensions.imports.planning import windows
+    from demorec.extensions.imports.rows import Timelines
+    from demorec.extensions.imports.streams import read_streams
 
     known = read_mapping(mapping)
     opened = open_bag(bag)
@@ -173,10 +173,10 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
 def decoding_and_coding(bag: Path) -> None:
     """Every image of the bag decoded and coded once as the export codes it, and nothing else."""
     from demorec.core.config import VideoConfig
+    from demorec.extensions.imports.bag import open_bag
+    from demorec.extensions.imports.decoding import BagDecoder
+    from demorec.extensions.imports.image_messages import decode_image
     from demorec.mcap.video import make_encoder
-    from demorec.sources.bag import open_bag
-    from demorec.sources.decoding import BagDecoder
-    from demorec.sources.image_messages import decode_image
 
     decoder = BagDecoder()
     encoders = {topic: make_encoder(video=VideoConfig(), width=WIDTH, height=HEIGHT, fps=FPS) for topic in CAMERAS}

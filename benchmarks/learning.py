@@ -215,8 +215,8 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
 def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
     """One row of the table."""
     from demorec.core.config import GenerateConfig
-    from demorec.learn.evaluate.rollouts import evaluate, settings_for
-    from demorec.learn.evaluate.statistics import Rate
+    from demorec.extensions.policies.rollouts import evaluate, settings_for
+    from demorec.extensions.policies.statistics import Rate
 
     variant = VARIANTS[name]
     dataset = make_dataset(variant, args)

@@ -19,7 +19,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.geometry import Array, Pose
 from demorec.core.tables import TASKS
 from demorec.episode.episode import Action
-from demorec.learn.evaluate.statistics import Rate
+from demorec.extensions.policies.statistics import Rate
 from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.sim.world import World
 from demorec.tasks.script import ExpertFailure

@@ -19,13 +19,13 @@ from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.drive import replay_all
+from demorec.extensions.remake.options import RerenderOptions
+from demorec.extensions.remake.rerender import rerender
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.render.painter import WarmRenderer
-from demorec.replay.demonstration import ReplayOptions, open_file
-from demorec.replay.drive import replay_all
-from demorec.replay.options import RerenderOptions
-from demorec.replay.rerender import rerender
 
 
 def generate(path: Path, config: GenerateConfig, index: int, simulators: SimulatorCache) -> None:

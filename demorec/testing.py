@@ -28,10 +28,10 @@ from demorec.core.tables import load_robot
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
+from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.drive import replay_all
 from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.mcap import EpisodeWriter
-from demorec.replay.demonstration import ReplayOptions, open_file
-from demorec.replay.drive import replay_all
 from demorec.robots.assets import allow_models, asset_path
 from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.robots.spec_check import spec_problems

@@ -21,7 +21,7 @@ from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
 
 if TYPE_CHECKING:
-    from demorec.sources.import_file import ImportFile
+    from demorec.extensions.imports.import_file import ImportFile
 
 _MAX_LISTED = 5
 _ANY_RUN: tuple[Form, ...] = ("run", "external run")
@@ -63,7 +63,7 @@ class CheckedRun:
     @property
     def import_file(self) -> ImportFile | None:
         """The findings of its import; None where there are none."""
-        from demorec.sources.import_file import load_import_file
+        from demorec.extensions.imports.import_file import load_import_file
 
         return load_import_file(self.path)
 

@@ -42,7 +42,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
         What was found, for the closing table, and one line for each check that failed.
     """
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
-    from demorec.replay.deep.check import deep_checks
+    from demorec.extensions.remake.deep.check import deep_checks
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]

@@ -79,7 +79,7 @@ def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]
 
 def _bag_or_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
     """A bag, or each one of a folder of bags."""
-    from demorec.sources.bag import bags_in
+    from demorec.extensions.imports.bag import bags_in
 
     found = [_bag(bag) for bag in bags_in(path)]
     if len(found) == 1:
@@ -92,7 +92,7 @@ def _bag_or_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.sources.bag import summarize_bag
+    from demorec.extensions.imports.bag import summarize_bag
 
     plain = summarize_bag(path)
     length = f"{plain['seconds']:.2f} s, {counted(plain['messages'], 'message')}"
@@ -267,7 +267,7 @@ def _external_run_lines(path: Path, run: RunFile, roles: Roles | None) -> list[s
 
 def _left_out(path: Path) -> list[dict[str, str]]:
     """What an import did not take into the run: episodes that it dropped and bags that it skipped, each with why."""
-    from demorec.sources.import_file import load_import_file
+    from demorec.extensions.imports.import_file import load_import_file
 
     if (imported := load_import_file(path)) is None:
         return []

@@ -35,7 +35,7 @@ class ListRows:
         from demorec.core import tables
 
         if self.what == "checks":
-            from demorec.cli.explain import check_rows
+            from demorec.extensions.doctor.explain_command import check_rows
 
             rows = list(check_rows())
         else:

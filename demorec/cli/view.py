@@ -156,8 +156,8 @@ class View:
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
         """The worst first; and what is wrong with them."""
-        from demorec.doctor.diagnosis import diagnose
-        from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
+        from demorec.extensions.doctor.diagnosis import diagnose
+        from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
         from demorec.runs.find import find
 
         if others := [path for path in self.paths if find(path).kind != "dataset"]:

@@ -88,7 +88,7 @@ RENDERERS: Registry[type[Renderer]] = Registry(
 
 EXPORTERS: Registry[Exporter[Any]] = Registry(
     kind="format",
-    rows={"lerobot": "demorec.datasets.lerobot.options:LEROBOT", "hdf5": "demorec.datasets.hdf5.options:HDF5"},
+    rows={"lerobot": "demorec.datasets.lerobot.options:LEROBOT", "hdf5": "demorec.extensions.hdf5.options:HDF5"},
 )
 
 CHECKS: Registry[Check] = Registry(

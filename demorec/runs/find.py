@@ -55,7 +55,7 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
 }
 """What each kind is called, and what to do where it was not expected."""
 IMPORT_WORDS: dict[PathKind, str] = {"dataset": "lerobot", "hdf5": "hdf5"}
-"""The word after `demorec import` by which each kind is imported that is no bag (`demorec.sources.formats`)."""
+"""Kind of path -> the word after `demorec import` that imports it; bags need none."""
 ROSBAG2 = "metadata.yaml"
 """In a folder that is a bag of rosbag2."""
 BAG_SUFFIXES = (".db3", ".bag", ".mcap.zstd", ".db3.zstd")

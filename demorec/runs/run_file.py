@@ -28,7 +28,7 @@ EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dat
 _EXTERNAL = "collected"
 """The "kind" that run.json has where the episodes are external; see `demorec.runs.external`."""
 IMPORT_NAME = "import.json"
-"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.sources.import_file`)."""
+"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.extensions.imports.import_file`)."""
 STARTING = "starting"
 """What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
 

@@ -18,7 +18,7 @@ from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 
 from demorec.episode import features
-from demorec.gym_env import DemorecEnv, env_id
+from demorec.extensions.policies.gym_env import DemorecEnv, env_id
 
 __all__ = ["DemorecEnvConfig"]
 
@@ -78,7 +78,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `demorec.gym_env.DemorecEnv` beside the task."""
+        """Arguments of `demorec.extensions.policies.gym_env.DemorecEnv` beside the task."""
         return {name: getattr(self, name) for name in _AS_THEY_ARE} | {
             "seed": self.scene_seed,
             "cameras": tuple(self.cameras),

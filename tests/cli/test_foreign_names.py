@@ -184,7 +184,7 @@ def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys: pyt
 
 
 def test_a_policy_sees_cameras_that_the_user_names(tmp_path: Path) -> None:
-    from demorec.learn.evaluate.rollouts import settings_for
+    from demorec.extensions.policies.rollouts import settings_for
 
     shape = {"type": "VISUAL", "shape": [3, 48, 64]}
     inputs = {f"observation.images.{name}": shape for name in ("front", "corner")}
@@ -197,7 +197,7 @@ def test_a_policy_sees_cameras_that_the_user_names(tmp_path: Path) -> None:
 
 
 def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Path, marker: Path) -> None:
-    from demorec.learn.evaluate.rollouts import settings_for
+    from demorec.extensions.policies.rollouts import settings_for
 
     policy = tmp_path / "policy"
     policy.mkdir()

@@ -7,8 +7,8 @@ import unicodedata
 import pytest
 
 from demorec.cli import COMMANDS, generate_dataset_main, main
-from demorec.cli.dataset import DatasetCommand
 from demorec.core.tables import EXPORTERS
+from demorec.extensions.editing.commands import DatasetCommand
 
 PROGRAMS = (
     "demorec",

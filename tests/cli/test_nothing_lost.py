@@ -35,9 +35,9 @@ from demorec.core.replacing import (
 )
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.extensions.policies.evaluation import Evaluation, Settings, open_evaluation
 from demorec.generate import reproduce as reproducing
 from demorec.generate.options import RunResult
-from demorec.learn.evaluate.evaluation import Evaluation, Settings, open_evaluation
 from demorec.mcap import EpisodeWriter
 from demorec.runs.find import EVALUATION_NAME
 

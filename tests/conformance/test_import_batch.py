@@ -25,12 +25,12 @@ from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.tables import CHECKS
 from demorec.episode.info import Origin
+from demorec.extensions.imports import planning
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.import_file import BagReport
+from demorec.extensions.imports.import_run import import_bags
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources import planning
-from demorec.sources.bag_files import BagError
-from demorec.sources.import_file import BagReport
-from demorec.sources.import_run import import_bags
 
 pytestmark = pytest.mark.slow
 

@@ -25,12 +25,12 @@ from support.hdf5 import (
     write_robomimic,
 )
 
-from demorec.datasets.hdf5.foreign import Hdf5Error
+from demorec.extensions.imports.episode_writer import FramesImport
+from demorec.extensions.imports.hdf5_file import Hdf5Error
+from demorec.extensions.imports.hdf5_import import import_hdf5
+from demorec.extensions.imports.hdf5_suggest import suggested_hdf5_mapping
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources.episode_writer import FramesImport
-from demorec.sources.hdf5_import import import_hdf5
-from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
 
 DEMOS = ("demo_0", "demo_1", "demo_10")
 

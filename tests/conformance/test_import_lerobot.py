@@ -19,9 +19,9 @@ from support.commands import exit_code
 from support.export import data_table, export, make_run, recordings
 
 from demorec.core.errors import DemorecError
+from demorec.extensions.imports.dataset_import import import_lerobot
 from demorec.mcap import Recording
 from demorec.runs.run_file import load_any_run_file
-from demorec.sources.dataset_import import import_lerobot
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 LENGTHS = (14, 9, 11)

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from support import bags
 
-from demorec.sources.bag import open_bag
-from demorec.sources.import_run import import_bags
-from demorec.sources.mapping_file import read_mapping
-from demorec.sources.streams import read_streams
+from demorec.extensions.imports.bag import open_bag
+from demorec.extensions.imports.import_run import import_bags
+from demorec.extensions.imports.mapping_file import read_mapping
+from demorec.extensions.imports.streams import read_streams
 
 MAPPING = """
 [robot]

@@ -19,10 +19,10 @@ from support import bag_mappings, bags
 from support.commands import exit_code
 
 from demorec.core.errors import ConfigError
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.import_run import import_bags
+from demorec.extensions.imports.mapping_file import read_mapping
 from demorec.mcap import Recording
-from demorec.sources.bag_files import BagError
-from demorec.sources.import_run import import_bags
-from demorec.sources.mapping_file import read_mapping
 
 SECONDS = 1.5
 
@@ -234,7 +234,7 @@ def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tm
 
 @pytest.mark.parametrize("encoding", ["bgr8", "mono8", "bgra8", "bayer_rggb8"])
 def test_raw_images_of_other_encodings(encoding: str, tmp_path: Path) -> None:
-    from demorec.sources.image_messages import raw_image
+    from demorec.extensions.imports.image_messages import raw_image
 
     image = bags.image(bags.EPOCH_NS, 1)
     smooth = np.broadcast_to(np.linspace(0, 255, bags.WIDTH).astype(np.uint8)[:, None], (bags.HEIGHT, bags.WIDTH, 3))

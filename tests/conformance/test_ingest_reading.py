@@ -14,11 +14,11 @@ from rosbags.rosbag1 import Writer as Ros1Writer
 from rosbags.rosbag2 import CompressionMode, StoragePlugin
 from support import bags
 
+from demorec.extensions.imports.bag import Bag, bags_in, open_bag
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
+from demorec.extensions.imports.fields import stamp_of
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
-from demorec.sources.bag import Bag, bags_in, open_bag
-from demorec.sources.bag_files import BagError
-from demorec.sources.decoding import BagDecoder, UnknownEncodingError
-from demorec.sources.fields import stamp_of
 
 
 def _read(bag: Bag) -> tuple[list[tuple[str, int, dict[str, Any]]], list[str]]:

@@ -21,9 +21,9 @@ from support.export import episode_rows, export
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.datasets.lerobot.recording import DatasetRecording
+from demorec.extensions.imports.dataset_import import import_lerobot
+from demorec.extensions.imports.import_run import import_bags
 from demorec.mcap import Recording
-from demorec.sources.dataset_import import import_lerobot
-from demorec.sources.import_run import import_bags
 from demorec.view.from_dataset import open_dataset_episode
 
 TOPIC, KEY = "/cameras/cam_high/image", "observation.images.high"

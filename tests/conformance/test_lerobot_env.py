@@ -15,9 +15,9 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.learn.evaluate.evaluation import load_evaluation
-from demorec.learn.evaluate.policy import find_checkpoint, trained_action
-from demorec.learn.evaluate.rollouts import evaluate, settings_for
+from demorec.extensions.policies.evaluation import load_evaluation
+from demorec.extensions.policies.policy import find_checkpoint, trained_action
+from demorec.extensions.policies.rollouts import evaluate, settings_for
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.mcap import EpisodeWriter, Recording
 

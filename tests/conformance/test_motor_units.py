@@ -20,7 +20,7 @@ from support.commands import exit_code
 from support.export import data_table, export, info
 
 from demorec.core.errors import ConfigError
-from demorec.learn.evaluate.policy import trained_action
+from demorec.extensions.policies.policy import trained_action
 from demorec.mcap import EpisodeWriter, Recording, open_recording, recover
 from demorec.robots.motors import CALIBRATIONS, MotorUnits
 from demorec.robots.so101 import SO101_FOLLOWER

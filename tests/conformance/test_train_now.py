@@ -11,7 +11,7 @@ import pytest
 from support.docs import ROOT
 
 from demorec.core.errors import MissingDependencyError
-from demorec.learn.evaluate.policy import Policy
+from demorec.extensions.policies.policy import Policy
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 

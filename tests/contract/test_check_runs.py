@@ -18,7 +18,7 @@ from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import Evidence
 
 
 @pytest.fixture(scope="module")
@@ -200,7 +200,7 @@ def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.Monke
     def broken(evidence: Evidence) -> None:
         raise IndexError("list index out of range")
 
-    monkeypatch.setattr("demorec.doctor.checks.number_consistency.arm_of", broken)
+    monkeypatch.setattr("demorec.extensions.doctor.checks.number_consistency.arm_of", broken)
     results = {result.check: result for result in checked(good / "episodes" / "episode_000000.mcap").results}
     assert results["joint_limits"].level == "skip"
     assert "cannot be computed" in results["joint_limits"].detail

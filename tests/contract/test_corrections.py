@@ -20,18 +20,18 @@ from demorec.core.plain import to_plain
 from demorec.core.tables import EXPORTERS
 from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation
 from demorec.episode.features import ActionKind
+from demorec.extensions.policies import TakeOver, rollouts
+from demorec.extensions.policies.evaluation import Evaluation, Settings
+from demorec.extensions.policies.gym_env import DemorecEnv, Situation
+from demorec.extensions.policies.rollouts import make_rollout
+from demorec.extensions.policies.turns import Turns, read_takeover
+from demorec.extensions.policies.watch import Watch
+from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.drive import replay_all
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
-from demorec.gym_env import DemorecEnv, Situation
-from demorec.learn.evaluate import TakeOver, rollouts
-from demorec.learn.evaluate.evaluation import Evaluation, Settings
-from demorec.learn.evaluate.rollouts import make_rollout
-from demorec.learn.evaluate.turns import Turns, read_takeover
-from demorec.learn.evaluate.watch import Watch
 from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.mcap import Recording
-from demorec.replay.demonstration import ReplayOptions, open_file
-from demorec.replay.drive import replay_all
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import Attempt
 

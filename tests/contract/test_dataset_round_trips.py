@@ -11,12 +11,12 @@ import pytest
 from support.export import export, make_run
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.editing.diff import diff
-from demorec.datasets.editing.merge import merge
-from demorec.datasets.editing.operations import rename, reorder, shuffle, split, trim
-from demorec.datasets.editing.plan import Plan
-from demorec.datasets.editing.write import write_plan
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.extensions.editing.diff import diff
+from demorec.extensions.editing.merge import merge
+from demorec.extensions.editing.operations import rename, reorder, shuffle, split, trim
+from demorec.extensions.editing.plan import Plan
+from demorec.extensions.editing.write import write_plan
 
 pytestmark = pytest.mark.slow
 

@@ -20,15 +20,15 @@ from support.mcap import rewritten
 
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
+from demorec.extensions.remake.deep.check import DeepReport, deep_check, deep_checks
+from demorec.extensions.remake.deep.contents import Contents, content_differences
+from demorec.extensions.remake.options import RerenderOptions
+from demorec.extensions.remake.rerender import rerender
 from demorec.generate.options import RunResult
 from demorec.loop import SimulatorCache
 from demorec.mcap import Recording, recover
 from demorec.mcap.metadata import EPISODE, OUTCOME
 from demorec.mcap.ros2 import DEFINITIONS
-from demorec.replay.deep.check import DeepReport, deep_check, deep_checks
-from demorec.replay.deep.contents import Contents, content_differences
-from demorec.replay.options import RerenderOptions
-from demorec.replay.rerender import rerender
 from demorec.runs.run_file import load_run_file
 
 FPS = 10

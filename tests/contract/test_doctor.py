@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from demorec.core.geometry import Array
-from demorec.doctor.checks import all_checks
-from demorec.doctor.diagnosis import Diagnosis, diagnose
-from demorec.doctor.evidence import EpisodeEvidence, Evidence
-from demorec.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.episode.roles import NO_NAMES, Column, find_roles
+from demorec.extensions.doctor.checks import all_checks
+from demorec.extensions.doctor.diagnosis import Diagnosis, diagnose
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 
 NAMES = ("pan.pos", "lift.pos", "elbow.pos", "wrist.pos", "gripper.pos")
 FPS, LAG, EPISODES, BAD = 30, 3, 12, 5

@@ -30,8 +30,8 @@ from support.external import TOP, make_external, write_external
 from support.foreign_dataset import write_foreign
 
 from demorec import cli
+from demorec.extensions.imports import import_run
 from demorec.mcap import open_recording
-from demorec.sources import import_run
 
 COMMANDS = {name: ON_A_PATH[name] for name in ON_EVERYTHING} | {
     "export hdf5": "export hdf5 PATH --out NEW.hdf5",

@@ -25,7 +25,7 @@ from demorec.episode import features
 from demorec.episode.episode import Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.observation_rows import ObservationRows
-from demorec.gym_env import DemorecEnv, env_id
+from demorec.extensions.policies.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
 from demorec.mcap import Recording
@@ -246,7 +246,9 @@ def test_render_shows_the_world() -> None:
 
 @pytest.mark.parametrize("vector", [SyncVectorEnv, pytest.param(AsyncVectorEnv, marks=pytest.mark.slow)])
 def test_vectors_of_environments_give_what_single_ones_give(vector: type) -> None:
-    fns = [functools.partial(gymnasium.make, "demorec.gym_env:demorec/PickPlace-v0", split="all")] * 2
+    fns = [
+        functools.partial(gymnasium.make, "demorec.extensions.policies.gym_env:demorec/PickPlace-v0", split="all")
+    ] * 2
     options = {} if vector is SyncVectorEnv else {"context": "spawn"}
     envs = vector(fns, **options)
     single = make(split="all")

@@ -12,13 +12,13 @@ from support.bag_faults import ACTION, FAULTS, FRONT, STATE, hurt
 
 from demorec.check.run import CheckedRun
 from demorec.core.tables import CHECKS
-from demorec.sources.bag import open_bag
-from demorec.sources.bag_files import BagError
-from demorec.sources.bag_findings import all_findings
-from demorec.sources.import_run import import_bags
-from demorec.sources.mapping_file import read_mapping
-from demorec.sources.rows import Timelines
-from demorec.sources.streams import read_streams
+from demorec.extensions.imports.bag import open_bag
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.bag_findings import all_findings
+from demorec.extensions.imports.import_run import import_bags
+from demorec.extensions.imports.mapping_file import read_mapping
+from demorec.extensions.imports.rows import Timelines
+from demorec.extensions.imports.streams import read_streams
 
 MAPPING = bag_mappings.SO101.replace('field = "position"', 'field = "position"\nunit = "rad"', 1)
 

@@ -9,9 +9,9 @@ import pytest
 from support.check import checked, simulate
 
 from demorec.core.tables import ROBOTS
+from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.drive import replay_all
 from demorec.mcap import Recording
-from demorec.replay.demonstration import ReplayOptions, open_file
-from demorec.replay.drive import replay_all
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
 

@@ -20,9 +20,9 @@ from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import Event
 from demorec.episode.simulated import with_simulation
+from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.drive import ReplayReport, replay_all
 from demorec.mcap import EpisodeWriter, Recording
-from demorec.replay.demonstration import ReplayOptions, open_file
-from demorec.replay.drive import ReplayReport, replay_all
 
 
 @pytest.fixture(scope="session")
@@ -200,7 +200,7 @@ def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 )
 def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path: Path) -> None:
     export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
-    from demorec.cli.replay import demonstrations
+    from demorec.extensions.remake.replay_command import demonstrations
 
     found = [
         report

@@ -10,11 +10,11 @@ import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
 
+from demorec.extensions.remake.deep.check import deep_check
+from demorec.extensions.remake.options import RerenderOptions
+from demorec.extensions.remake.rerender import rerender
 from demorec.mcap import Recording
 from demorec.render.painter import WarmRenderer
-from demorec.replay.deep.check import deep_check
-from demorec.replay.options import RerenderOptions
-from demorec.replay.rerender import rerender
 
 pytestmark = pytest.mark.slow
 

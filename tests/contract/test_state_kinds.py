@@ -17,9 +17,9 @@ from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.features import Vectors
-from demorec.gym_env import DemorecEnv
-from demorec.learn.evaluate.policy import CONFIG_NAME
-from demorec.learn.evaluate.rollouts import settings_for
+from demorec.extensions.policies.gym_env import DemorecEnv
+from demorec.extensions.policies.policy import CONFIG_NAME
+from demorec.extensions.policies.rollouts import settings_for
 from demorec.mcap import Recording
 
 STATE = "observation.state"

@@ -29,7 +29,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 @pytest.fixture(scope="module")
 def commands() -> Iterator[LimitedCommands]:
-    with LimitedCommands(("demorec.sources.suggest", "demorec.sources.import_run")) as process:
+    with LimitedCommands(("demorec.extensions.imports.suggest", "demorec.extensions.imports.import_run")) as process:
         yield process
 
 

@@ -161,7 +161,7 @@ def test_a_missing_lerobot_is_no_fault_of_a_dataset(
     good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export([good], tmp_path / "dataset")
-    monkeypatch.setattr("demorec.doctor.checks.lerobot_opens.lerobot_is_installed", lambda: False)
+    monkeypatch.setattr("demorec.extensions.doctor.checks.lerobot_opens.lerobot_is_installed", lambda: False)
     assert exit_code("check", tmp_path / "dataset", "--only", "lerobot_opens", "--lerobot") == 0
 
 

@@ -27,9 +27,9 @@ pytestmark = pytest.mark.slow
 
 _MODULES = (
     "demorec.check.run",
-    "demorec.sources.dataset_import",
-    "demorec.sources.hdf5_import",
-    "demorec.report.gather",
+    "demorec.extensions.imports.dataset_import",
+    "demorec.extensions.imports.hdf5_import",
+    "demorec.extensions.report.gather",
 )
 
 

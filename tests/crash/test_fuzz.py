@@ -14,10 +14,12 @@ KINDS: dict[str, Callable[[Path], Fuzzed]] = {"bags": FuzzedBags, "data": Fuzzed
 COUNTS = {"bags": 220, "data": 100}
 """Kind -> cases of the quick test."""
 _MODULES = (
-    "demorec.check.run", "demorec.sources.suggest", "demorec.sources.import_run", "demorec.sources.dataset_import",
-    "demorec.sources.hdf5_import", "demorec.sources.hdf5_suggest", "demorec.datasets.lerobot.inspect",
-    "demorec.datasets.lerobot.export", "demorec.datasets.hdf5.export", "demorec.report.gather",
-    "demorec.learn.evaluate.rollouts", "ruamel.yaml", "google.protobuf.descriptor_pool",
+    "demorec.check.run", "demorec.extensions.imports.suggest", "demorec.extensions.imports.import_run",
+    "demorec.extensions.imports.dataset_import",
+    "demorec.extensions.imports.hdf5_import", "demorec.extensions.imports.hdf5_suggest",
+    "demorec.datasets.lerobot.inspect",
+    "demorec.datasets.lerobot.export", "demorec.extensions.hdf5.export", "demorec.extensions.report.gather",
+    "demorec.extensions.policies.rollouts", "ruamel.yaml", "google.protobuf.descriptor_pool",
 )  # fmt: skip
 
 

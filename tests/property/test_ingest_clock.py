@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation, Slerp
 
-from demorec.sources.clock import MISSING, ChosenSamples, choose, sampled
+from demorec.extensions.imports.clock import MISSING, ChosenSamples, choose, sampled
 
 TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).map(sorted)
 ROWS = st.lists(st.integers(-10, 10**6 + 10), min_size=1, max_size=30, unique=True).map(sorted)

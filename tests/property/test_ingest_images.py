@@ -14,12 +14,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from demorec.sources.bag_findings import all_findings, row_findings
-from demorec.sources.fields import reader_of
-from demorec.sources.image_messages import ImageHead, ImageHeads
-from demorec.sources.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
-from demorec.sources.rows import EpisodeRows, Timelines, Window
-from demorec.sources.streams import BagStreams, Stream
+from demorec.extensions.imports.bag_findings import all_findings, row_findings
+from demorec.extensions.imports.fields import reader_of
+from demorec.extensions.imports.image_messages import ImageHead, ImageHeads
+from demorec.extensions.imports.mapping import CameraSource, Clock, Robot, Source, SourceMapping, TaskText
+from demorec.extensions.imports.rows import EpisodeRows, Timelines, Window
+from demorec.extensions.imports.streams import BagStreams, Stream
 
 NS = 1_000_000_000
 COUNT = 60

@@ -20,13 +20,13 @@ import pytest
 
 from demorec.check.base import Level, Result
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
-from demorec.cli.explain import split_checks
-from demorec.cli.shared.diagnoses import examine
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.doctor.base import FaultCheck
-from demorec.doctor.from_dataset import ReadOptions
 from demorec.episode.episode import CameraImages, Event, Frame, Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
+from demorec.extensions.doctor.base import FaultCheck
+from demorec.extensions.doctor.examine import examine
+from demorec.extensions.doctor.explain_command import split_checks
+from demorec.extensions.doctor.from_dataset import ReadOptions
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import EpisodeWriter, Recording
 from demorec.mcap.container import Container

@@ -75,7 +75,7 @@ def _run(words: str, *, needs: tuple[str, ...] = (), surprise: str = "new/episod
 
 def with_stand_in_policy(words: list[str]) -> None:
     """Evaluate or correct a policy that needs neither LeRobot nor PyTorch."""
-    from demorec.learn.evaluate import rollouts
+    from demorec.extensions.policies import rollouts
 
     rollouts.MAKE_ROLLOUT = "support.policies:make_rollout"
     main(words)
@@ -259,7 +259,7 @@ def _cut(folder: Path, name: str, episode: int) -> None:
 
 
 def _hdf5(folder: Path) -> None:
-    from demorec.sources.hdf5_suggest import suggested_hdf5_mapping
+    from demorec.extensions.imports.hdf5_suggest import suggested_hdf5_mapping
     from support.hdf5 import write_robomimic
 
     (folder / HDF5).write_text("\n".join(suggested_hdf5_mapping(write_robomimic(folder / "demo.hdf5"), print)))

@@ -18,7 +18,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot import export as lerobot_export
 from demorec.datasets.options import ExportReport
-from demorec.doctor.checks import lerobot_opens
+from demorec.extensions.doctor.checks import lerobot_opens
 from support.recording import write_episode
 
 

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 from demorec.core.config import GenerateConfig
 from demorec.core.plain import to_plain
 from demorec.core.tables import CHECKS
-from demorec.learn.evaluate.evaluation import Evaluation, Settings
+from demorec.extensions.policies.evaluation import Evaluation, Settings
 from demorec.mcap import Recording
 from demorec.render.raster.renderer import warm_up
 from support import hdf5

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from demorec.core.config import EpisodePlan
-from demorec.learn.evaluate import rollouts
+from demorec.extensions.policies import rollouts
 from demorec.runs.run_file import Attempt
 
 

@@ -10,9 +10,9 @@ import pytest
 from support.commands import exit_code
 from support.export import export
 
-from demorec.doctor.base import DiagnosedFault
-from demorec.doctor.checks import lerobot_opens
-from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
+from demorec.extensions.doctor.base import DiagnosedFault
+from demorec.extensions.doctor.checks import lerobot_opens
+from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_HUB_OFFLINE` environment variable."

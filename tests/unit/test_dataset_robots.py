@@ -21,8 +21,8 @@ from support.external import TOP, URDF, Episode, make_external, write_external
 from demorec.core.errors import MissingDependencyError
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.robots import portable_urdf, read_robot
+from demorec.extensions.imports.dataset_import import import_lerobot
 from demorec.mcap import Recording
-from demorec.sources.dataset_import import import_lerobot
 from demorec.view import bodies as played_robot
 from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.save import save

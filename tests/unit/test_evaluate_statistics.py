@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from demorec.learn.evaluate.statistics import Rate, cells, compare, sign_test
+from demorec.extensions.policies.statistics import Rate, cells, compare, sign_test
 
 
 @given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))

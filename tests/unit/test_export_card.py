@@ -13,8 +13,8 @@ from support.external import TOP, make_external, write_external
 from support.mcap import rewritten
 from support.recording import write_episode
 
+from demorec.extensions.imports import import_run
 from demorec.mcap import Recording
-from demorec.sources import import_run
 
 
 def test_a_card_names_the_command_that_makes_the_dataset_again(tmp_path: Path) -> None:

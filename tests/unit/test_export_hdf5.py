@@ -99,7 +99,7 @@ def test_masks_divide_the_episodes(run: Path, tmp_path: Path, share: float, vali
 def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
     import gymnasium
 
-    import demorec.gym_env  # noqa: F401  (registers the environments)
+    import demorec.extensions.policies.gym_env  # noqa: F401  (registers the environments)
 
     # Environments have images of one size, the recordings of this run have two.
     features = ("observation.velocity", "observation.images.wrist")

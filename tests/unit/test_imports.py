@@ -24,9 +24,9 @@ HOMES = {
     "rerun": "demorec.view",
     "tyro": "demorec.cli",
     "tqdm": "demorec.cli",
-    "h5py": "demorec.datasets.hdf5",
-    "rosbags": "demorec.sources",
-    "ruamel": "demorec.sources",
+    "h5py": "demorec.extensions.hdf5",
+    "rosbags": "demorec.extensions.imports",
+    "ruamel": "demorec.extensions.imports",
     "ray": "demorec.generate.on_ray",
 }
 """Heavy library -> the folder or module of demorec that alone imports it (CONTRIBUTING.md)."""
@@ -92,5 +92,5 @@ def test_every_folder_stands_in_a_rule_of_its_own() -> None:
     placed: set[str] = set()
     for rule in _rules():
         placed |= {f"demorec.{layer.strip('()')}" for layer in rule.get("layers", ())}
-        placed |= set(rule.get("source_modules", ()))
+        placed |= {*rule.get("source_modules", ()), *rule.get("containers", ())}
     assert set(_folders()) - placed == {NEW_FOLDER}

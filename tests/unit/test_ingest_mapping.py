@@ -10,9 +10,9 @@ import pytest
 from support import bag_mappings, bags
 from support.commands import exit_code
 
-from demorec.sources.bag import open_bag
-from demorec.sources.bag_files import BagError
-from demorec.sources.fields import (
+from demorec.extensions.imports.bag import open_bag
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.fields import (
     FieldError,
     OtherPublisherError,
     converted,
@@ -20,10 +20,10 @@ from demorec.sources.fields import (
     parse_path,
     reader_of,
 )
-from demorec.sources.mapping import Source
-from demorec.sources.mapping_file import read_mapping
-from demorec.sources.streams import read_streams
-from demorec.sources.words import task_in_name
+from demorec.extensions.imports.mapping import Source
+from demorec.extensions.imports.mapping_file import read_mapping
+from demorec.extensions.imports.streams import read_streams
+from demorec.extensions.imports.words import task_in_name
 
 WRONG = [
     ('fps = 30', 'fpss = 30', r"unknown key 'fpss' in clock. Did you mean 'fps'\?"),

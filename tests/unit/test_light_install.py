@@ -16,9 +16,9 @@ from demorec.core.errors import ExportError, MissingDependencyError
 from demorec.datasets.lerobot.export import export_lerobot, push_to_hub
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.verify import LEROBOT
-from demorec.doctor.checks.lerobot_opens import lerobot_opens
-from demorec.doctor.from_dataset import ReadOptions, evidence_of_dataset
-from demorec.learn.evaluate.policy import Policy
+from demorec.extensions.doctor.checks.lerobot_opens import lerobot_opens
+from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
+from demorec.extensions.policies.policy import Policy
 
 ROOT = Path(__file__).parents[2]
 ABSENT = ("lerobot", "torch", "torchvision", "torchcodec", "datasets", "pandas", "huggingface_hub", "accelerate")

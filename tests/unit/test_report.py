@@ -24,16 +24,16 @@ from support.recording import frame_number, write_episode
 
 from demorec.check.report import CheckOptions
 from demorec.episode.roles import NO_NAMES, Column, find_roles
+from demorec.extensions.report.charts import distribution
+from demorec.extensions.report.content import Report, motion_components
+from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, strip_budget
+from demorec.extensions.report.gather import gather
+from demorec.extensions.report.page import page
 from demorec.mcap import Recording
-from demorec.report.charts import distribution
-from demorec.report.content import Report, motion_components
-from demorec.report.filmstrip import MAX_SHOWN, Filmstrip, strip_budget
-from demorec.report.gather import gather
-from demorec.report.page import page
 
 HOSTILE = "</p><script>document.title = 'taken'</script><img src=x onerror=alert(1)>\"'&\u202e"
 MOST_BYTES = 30_000_000
-TEMPLATES = Path(__file__).parents[2] / "demorec" / "report" / "templates"
+TEMPLATES = Path(__file__).parents[2] / "demorec" / "extensions" / "report" / "templates"
 VOID = ("img", "meta", "input", "br")
 
 

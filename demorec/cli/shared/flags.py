@@ -23,7 +23,9 @@ from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
 
 import tyro
-from tyro.conf import UseAppendAction, arg
+from tyro.conf import Positional as Positional
+from tyro.conf import UseAppendAction
+from tyro.conf import arg as arg
 from tyro.constructors import (
     MISSING_NONPROP,
     ConstructorRegistry,

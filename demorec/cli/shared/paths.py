@@ -14,9 +14,9 @@ from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.processes import terminate_as_interrupt
 from demorec.core.replacing import json_object, use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
+from demorec.extensions.imports.formats import FORMATS, import_kind, opened
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED, load_any_run_file
-from demorec.sources.formats import FORMATS, import_kind, opened
 
 WHAT_IS_READ = (
     f"recordings, runs, {', '.join(form.name for form in FORMATS.values())}, bags, folders of recordings or bags"
@@ -111,8 +111,8 @@ def reading(
 ) -> Iterator[tuple[Path, ...]]:
     """What to read in the place of each path; until the context is left, all output names the user's paths.
 
-    What is imported (`demorec.sources.formats`) is read through a temporary run. No line that is written names it: its
-    episodes are called "demo.hdf5: episode 3".
+    Imported files (`demorec.extensions.imports.formats`) are read through a temporary run. No output names that run:
+    its episodes are called "demo.hdf5: episode 3".
 
     Args:
         paths: As the user named them.

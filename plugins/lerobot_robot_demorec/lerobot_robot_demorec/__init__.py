@@ -24,7 +24,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Outcome
 from demorec.episode.features import state_names
-from demorec.gym_env import DemorecEnv
+from demorec.extensions.policies.gym_env import DemorecEnv
 from demorec.mcap import EpisodeWriter
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec

@@ -1,0 +1,228 @@
+"""`demorec check`: the integrity of files, the doctor, and what is made again."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import chain
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.output import counted, say, say_json
+from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
+from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
+from demorec.core.errors import ConfigError, describe_error
+from demorec.extensions.doctor.base import RANK
+from demorec.extensions.doctor.examine import as_json, examine, lines_of
+
+if TYPE_CHECKING:
+    from demorec.check.report import Subject, SubjectReport
+    from demorec.extensions.doctor.base import FaultCheck
+    from demorec.extensions.doctor.diagnosis import Diagnosis
+    from demorec.extensions.doctor.evidence import Evidence
+    from demorec.extensions.remake.deep.check import DeepReport
+
+
+_SHOWN = 12
+"""Differences of one recording that are printed: the first ones tell the most."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class CheckCommand:
+    """Judge datasets, runs and recordings before training: files, times, numbers, alignment, images, episodes.
+
+    Prints what each column was taken for, a verdict (good, look, broken), the worst findings with what to do, and the
+    episodes, worst first. Of several datasets, shared episodes are found too. Exit code 1: something is broken.
+
+    Examples:
+      demorec check datasets/cups
+      demorec check datasets/cups --state joint_angles --action joint_targets
+      demorec check datasets/train datasets/validation
+      demorec check datasets/cups --no-images --json
+      demorec check datasets/so101_cups --motor-units degrees --lerobot
+      demorec check monday.mcap --mapping robot.toml
+      demorec check recordings/cubes --deep
+    """
+
+    paths: Readable
+    mapping: MappingFile = None
+    images: bool = True
+    """Decode all images."""
+    only: tuple[str, ...] = ()
+    """Names of the checks to run (default: all)."""
+    urdf: Path | None = None
+    """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
+    their names, or by their order."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
+    roles: NamedByFlags = field(default_factory=RoleFlags)
+    strict: bool = False
+    """Exit with 1 where something is worth a look, too."""
+    lerobot: bool = False
+    """Also let the installed LeRobot open each dataset, which takes seconds."""
+    deep: bool = False
+    """Also make every recording, and every episode of a dataset, again from config and seed, and compare every number
+    and image; takes about as long as generating them."""
+    workers: int | None = None
+    """Processes that check the files of recordings (auto: one for each core, or one where starting them would take
+    longer than the checks)."""
+    all: bool = False
+    """Print all findings and all episodes."""
+    allow: Allow = ()
+    """With --deep: a module or package of your own that may be imported for the tasks, robots and cameras that the
+    files name, and beside which their models may be read."""
+    json: bool = False
+    """Print JSON."""
+
+    def run(self) -> int:
+        """Check and report."""
+        need_paths(self.paths, "check")
+        with reading(self.paths, self.mapping) as paths:
+            return replace(self, paths=paths)._check()
+
+    def _check(self) -> int:
+        from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
+        from demorec.core.processes import available_cores
+        from demorec.datasets.lerobot.files import leave_pandas_out
+        from demorec.extensions.doctor.explain_command import split_checks
+
+        leave_pandas_out()
+        integrity, chosen = split_checks(self.only)
+        subjects = find_subjects(self.paths)
+        files = subjects if integrity or not self.only else []
+        workers = self.workers
+        if workers is None:
+            workers = useful_workers(subjects, images=self.images, cores=available_cores())
+        options = CheckOptions(images=self.images, colours=bool(integrity), only=integrity, workers=workers)
+        options.validate()
+        with ProgressBar("checking files", total=len(files), unit="item", at_once=workers) as bar:
+            reports = []
+            for report in check_subjects(files, options):
+                reports.append(report)
+                bar.advance()
+        diagnoses = self._diagnosed(reports, chosen)
+        remade = list(self._remade(subjects, workers)) if self.deep else []
+        bad = [each for each in diagnoses if RANK[each.verdict] >= RANK["look" if self.strict else "broken"]]
+        different = [report for report in remade if report.level == "fail" or (self.strict and report.level == "warn")]
+        if self.json:
+            self._print_json(diagnoses, remade)
+        elif remade:
+            say(deep_summary(remade, different).strip())
+        tell_unfinished(self.paths)
+        return 1 if bad or different else 0
+
+    def _diagnosed(self, reports: Sequence[SubjectReport], checks: Sequence[FaultCheck]) -> list[Diagnosis]:
+        """Diagnose each path, and print it."""
+        from demorec.extensions.doctor.from_dataset import ReadOptions
+
+        options = ReadOptions(
+            images=self.images,
+            named=self.roles.named,
+            motors=self.motors.named,
+            urdf=self._description(),
+            lerobot=self.lerobot,
+        )
+        found: list[Diagnosis] = []
+        read: list[Evidence] = []
+        with ProgressBar("reading", total=len(self.paths), unit="item") as bar:
+            for path in self.paths:
+                own = [report for report in reports if report.path == path or path in report.path.parents]
+                diagnosis, evidence = examine(path, options, reports=own, checks=checks, earlier=tuple(read))
+                if evidence is not None and len(self.paths) > 1:
+                    read.append(evidence.without_images())
+                found.append(diagnosis)
+                bar.advance()
+                if not self.json:
+                    say(*lines_of(diagnosis, everything=self.all))
+        return found
+
+    def _print_json(self, diagnoses: Sequence[Diagnosis], remade: Sequence[DeepReport]) -> None:
+        deep = {"deep": [plain_deep(report) for report in remade]} if self.deep else {}
+        if len(diagnoses) == 1:
+            say_json({**as_json(self.paths[0], diagnoses[0]), **deep})
+        else:
+            both = zip(self.paths, diagnoses, strict=True)
+            say_json({"paths": [as_json(path, diagnosis) for path, diagnosis in both], **deep})
+
+    def _description(self) -> str:
+        """Text of the URDF that the user names, "" for none; ConfigError for what is none."""
+        if self.urdf is None:
+            return ""
+        from demorec.core.files import read_text_limited
+        from demorec.robots.urdf import MAX_BYTES, Urdf
+
+        try:
+            text = read_text_limited(self.urdf, MAX_BYTES)
+            Urdf.parse(text)
+        except (OSError, ValueError) as error:
+            raise ConfigError(f"--urdf is no robot's description ({describe_error(error)}): {self.urdf}") from error
+        return text
+
+    def _remade(self, subjects: Sequence[Subject], workers: int) -> Iterator[DeepReport]:
+        from demorec.extensions.remake.deep.check import deep_checks, deep_dataset_checks
+
+        allowed = allowed_modules(self.allow)
+        paths = [subject.path for subject in subjects if subject.kind == "recording"]
+        runs = [subject.path for subject in subjects if subject.kind == "run"]  # whose datasets hold the same episodes
+        datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
+        found = [deep_checks(paths, workers=workers, allowed=allowed)]
+        found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
+        with ProgressBar("making again", total=0 if datasets else len(paths)) as bar:
+            for report in chain.from_iterable(found):
+                bar.advance()
+                if not self.json:
+                    say(*deep_lines(report, verbose=self.all))
+                yield report
+
+
+def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
+    """One line about a recording, below it the versions that differ, then what differs, the first frames first."""
+    yield f"{report.level:<4}  made again {report.path}: {_verdict(report)}"
+    details = [f"Not provable here: {line}" for line in report.versions]
+    if report.error:
+        details.append(f"It cannot be made again: {report.error}")
+    shown = report.differences if verbose else report.differences[:_SHOWN]
+    details += [str(difference) for difference in shown]
+    if len(report.differences) > len(shown):
+        details.append(f"and {counted(len(report.differences) - len(shown), 'field')} more (--all shows them)")
+    if report.replay:
+        details.append(f"Replayed: {report.replay}")
+    yield from (f"      {detail}" for detail in details)
+
+
+def _verdict(report: DeepReport) -> str:
+    if report.error:
+        return "not possible"
+    if not report.differences:
+        aside = "; labels, phases and events are taken over in a derived recording" if report.is_derived else ""
+        return f"the same to the bit in all {report.num_frames} frames{aside}"
+    frames = {frame for difference in report.differences for frame in difference.frames}
+    count = len(report.differences)
+    amount = "1 field differs" if count == 1 else f"{count} fields differ"
+    return f"{amount}, in {len(frames)} of {report.num_frames} frames"
+
+
+def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) -> str:
+    """The end of the last line: how many were made again, how many of them differ, how many cannot be; "" for none.
+
+    Args:
+        remade: All that were tried.
+        different: Those among them that count as failed; what cannot be made again is one of them.
+    """
+    impossible = sum(bool(report.error) for report in remade)
+    made, differ = len(remade) - impossible, sum(not report.error for report in different)
+    warned = sum(report.level == "warn" for report in remade if not report.error)
+    aside = f" ({warned} with a warning)" if warned else ""
+    text = f" {made} made again{aside}, {differ} not as recorded." if made else ""
+    return text + (f" {impossible} could not be made again." if impossible else "")
+
+
+def plain_deep(report: DeepReport) -> dict[str, Any]:
+    """The same as plain data for JSON, with every frame that differs."""
+    from demorec.core.plain import to_plain
+
+    plain = to_plain(report)
+    return {"path": str(report.path), "kind": "deep", "level": report.level, "results": [
+        {name: value for name, value in plain.items() if name != "path"}
+    ]}  # fmt: skip

@@ -1,0 +1,20 @@
+"""The checks: every module of this folder adds those that it defines."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from functools import cache
+
+from demorec.extensions.doctor.base import Family, FaultCheck
+
+FAMILIES: tuple[Family, ...] = ("files", "time", "numbers", "alignment", "images", "set")
+
+
+@cache
+def all_checks() -> tuple[FaultCheck, ...]:
+    """All checks by family, in the order of their modules and of their lines."""
+    modules = sorted(module.name for module in pkgutil.iter_modules(__path__))
+    loaded = [importlib.import_module(f"{__name__}.{name}") for name in modules]
+    found = [value for module in loaded for value in vars(module).values() if isinstance(value, FaultCheck)]
+    return tuple(sorted(dict.fromkeys(found), key=lambda check: FAMILIES.index(check.family)))

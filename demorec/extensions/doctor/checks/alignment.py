@@ -1,0 +1,278 @@
+"""Checks of alignment: does the action belong to the state of its frame?"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.relation import ActionRelation, EpisodeLag, relation_of
+from demorec.extensions.doctor.robust import usual
+
+MIN_OTHERS = 3
+"""Episodes, at least, that one is compared with."""
+MIN_SHIFT = 0.7
+"""Frames by which the lag of an episode differs, at least: whole frames are lost or doubled, not parts."""
+MIN_GAIN = 0.7
+"""Natural logarithm of the factor by which an episode's own lag leaves less variance unexplained: two."""
+MIN_LEAD = 0.25
+"""Frames by which the state is ahead of its action from which the two are misaligned: a command is never late."""
+MAX_LAG_S = 0.35
+"""Time by which a state usually follows at most: hobby servos under teleoperation need 0.1 to 0.2 s."""
+EQUAL_RATIO = 1e-4
+"""Difference of action and state, as a share of the range, up to which they are the same number."""
+MIN_EQUAL_SHARE = 0.95
+"""Share of the moving frames with equal numbers from which the action is the state."""
+MIN_PAIR_GAIN = 4.0
+"""Times by which the other element explains an element's motion better where the two are exchanged."""
+
+
+@check(
+    family="alignment",
+    needs="state, action",
+    measures="actions that come late or early",
+    unit="frames",
+    why="A policy learns which action belongs to an observation: a shift of few frames makes it lag or oscillate.",
+    do="shift the action in the program that recorded it, or drop the episodes: " + DROP,
+)
+def action_lag(evidence: Evidence) -> Iterator[Fault]:
+    """Compare how far the state follows the action: over the whole set, and in each episode against the others.
+
+    The lag is where the action explains most of the state's motion, as a target or as an increment. The state may
+    follow by up to 0.35 s; it cannot be ahead. An episode is judged by the difference from the usual lag.
+    """
+    relation = evidence.once(relation_of)
+    usual_lag = relation.usual_lag
+    if usual_lag < -MIN_LEAD:
+        yield Fault(
+            severity="broken",
+            value=f"{-usual_lag:.1f} frames",
+            message=f"the state moves {-usual_lag:.1f} frames before its action: actions are late or states early",
+            do="shift the action by whole frames in the program that recorded it",
+        )
+    elif usual_lag > max(MAX_LAG_S * evidence.fps, 2.0):
+        yield Fault(
+            severity="look",
+            value=f"{evidence.seconds(usual_lag):.2f} s",
+            message=f"the state follows its action by {evidence.seconds(usual_lag):.2f} s",
+            do="compare the clocks of the two in the program that recorded them",
+        )
+    if len(relation.episodes) <= MIN_OTHERS:
+        return
+    _, spread = usual([episode.lag for episode in relation.episodes.values()], floor=0.1)
+    for number, episode in relation.episodes.items():
+        shift = episode.lag - usual_lag
+        if abs(shift) > max(MIN_SHIFT, 6 * spread) and _prefers(episode, relation, shift):
+            yield Fault(
+                severity="broken",
+                episode=number,
+                value=f"{shift:+.1f} frames",
+                message=f"its state follows the action by {episode.lag:+.1f} frames, in the others by {usual_lag:+.1f}",
+            )
+
+
+def _prefers(episode: EpisodeLag, relation: ActionRelation, shift: float) -> bool:
+    """Whether the episode's own lag explains clearly more than the usual one, in most of its elements."""
+    usual_place = int(np.argmin(np.abs(relation.lags - relation.usual_lag)))
+    gain = float(episode.curve[usual_place] - episode.curve.min())
+    same_side = np.sign(episode.element_lags - relation.usual_lag) == np.sign(shift)
+    shifted = np.abs(episode.element_lags - relation.usual_lag) > MIN_SHIFT / 2
+    return gain > MIN_GAIN and float((same_side & shifted).mean()) >= 2 / 3
+
+
+@check(
+    family="alignment",
+    needs="state, action",
+    measures="actions that are the state of the same frame",
+    unit="% of frames",
+    why="A policy learns to command where the arm already is: it stands still.",
+    do="record the command that was sent, or take the state of a later frame as the action",
+)
+def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
+    """Count the moving frames in which the action is the number of the state of the same frame.
+
+    Elements are paired by name. The arm alone counts: grippers rest on what they hold.
+    """
+    pairs = [
+        (element, column)
+        for element, column in enumerate(evidence.action_of)
+        if column is not None and not evidence.is_gripper[element]
+    ]
+    if not pairs:
+        raise NotMeasuredError("no element of the action has the name of an element of the state")
+    elements, columns = (list(part) for part in zip(*pairs, strict=True))
+    shares: dict[int, float] = {}
+    for episode, state in evidence.need_state():
+        if episode.action is None:
+            continue
+        moves = np.diff(state[:, elements], axis=0, prepend=state[:1, elements]) != 0
+        error = np.abs(episode.action[:, columns] - state[:, elements])
+        equal = error <= EQUAL_RATIO * np.maximum(evidence.ranges[elements], 1e-9)
+        if moves.sum() >= 10:
+            shares[episode.number] = float(equal[moves].mean())
+    if not shares:
+        raise NotMeasuredError("nothing moves, or there is no action")
+    bad = [number for number, share in shares.items() if share > MIN_EQUAL_SHARE]
+    if len(bad) > len(shares) / 2:
+        share = float(np.median(list(shares.values())))
+        yield Fault(
+            severity="broken",
+            value=f"{share:.0%} of frames",
+            message=f"the action is the state of the same frame in {len(bad)} of {len(shares)} episodes",
+        )
+        return
+    for number in bad:
+        yield Fault(
+            severity="broken",
+            episode=number,
+            value=f"{shares[number]:.0%} of frames",
+            message="its action is the state of the same frame, in the others it is not",
+            do=DROP,
+        )
+
+
+@check(
+    family="alignment",
+    needs="state, action",
+    measures="elements of the action in another's place",
+    why="The policy moves one joint where it should move another.",
+    do="give the columns their order in the program that wrote them, or drop the episodes: " + DROP,
+)
+def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
+    """Find two elements whose actions explain each other's motion several times better than their own."""
+    relation = evidence.once(relation_of)
+    if len(relation.elements) < 2:
+        raise NotMeasuredError("it needs two moving elements with actions")
+    place = round(relation.usual_lag)
+    matrices = {number: _unexplained_by_any(evidence, relation, number, place) for number in relation.episodes}
+    names = [evidence.elements[element] for element in relation.elements]
+    stacked = np.stack(list(matrices.values()))
+    whole = np.ones(stacked.shape[1:])
+    known = np.isfinite(stacked).any(axis=0)
+    whole[known] = np.nanmedian(stacked[:, known], axis=0)
+    swapped = _swaps(whole)
+    for one, two in swapped:
+        yield Fault(
+            severity="broken",
+            message=f"the action's {names[one]} moves the state's {names[two]}, and the other way round",
+            value=f"{whole[one, one]:.0%} against {whole[one, two]:.0%} unexplained",
+            do="give the columns their order in the program that wrote them",
+        )
+    for number, matrix in matrices.items() if len(matrices) > MIN_OTHERS else ():
+        for one, two in _swaps(matrix):
+            if (one, two) not in swapped:
+                yield Fault(
+                    severity="broken",
+                    episode=number,
+                    message=f"its action's {names[one]} moves the state's {names[two]}, and the other way round",
+                    value=f"{matrix[one, one]:.0%} against {matrix[one, two]:.0%} unexplained",
+                )
+
+
+def _unexplained_by_any(evidence: Evidence, relation: ActionRelation, number: int, lag: int) -> Array:
+    """(K, K) share of the variance of state i that action j leaves unexplained, NaN where one of them rests."""
+    episode = evidence.by_number[number]
+    assert episode.state is not None
+    assert episode.action is not None
+    state, action = episode.state[:, relation.elements], episode.action[:, relation.columns]
+    if relation.kind == "increment":
+        state = np.diff(state, axis=0, append=state[-1:])
+    first, last = max(lag, 0), len(state) + min(lag, 0)
+    one, two = state[first:last], action[first - lag : last - lag]
+    one, two = one - one.mean(axis=0), two - two.mean(axis=0)
+    sizes = np.outer((one**2).sum(axis=0), (two**2).sum(axis=0))
+    return np.where(sizes > 0, 1 - (one.T @ two) ** 2 / np.where(sizes > 0, sizes, 1.0), np.nan)
+
+
+def _swaps(matrix: Array) -> list[tuple[int, int]]:
+    """Pairs of elements that explain each other and not themselves."""
+    count = len(matrix)
+    return [
+        (one, two)
+        for one in range(count)
+        for two in range(one + 1, count)
+        if matrix[one, two] < 0.2
+        and matrix[two, one] < 0.2
+        and matrix[one, one] > MIN_PAIR_GAIN * max(matrix[one, two], 0.02)
+        and matrix[two, two] > MIN_PAIR_GAIN * max(matrix[two, one], 0.02)
+    ]
+
+
+@check(
+    family="alignment",
+    needs="gripper, action",
+    measures="grippers that ignore or invert their action",
+    unit="correlation",
+    why="A policy learns to open the hand where it must close it, or that commands do nothing.",
+    do=DROP,
+)
+def gripper_action(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the correlation of each gripper with its action in an episode with that in the others.
+
+    Conventions differ (1 may mean open or closed): the usual sign counts. A gripper that never follows in any episode
+    is a fault of the whole set.
+    """
+    grippers = [
+        (element, column)
+        for element, column in enumerate(evidence.action_of)
+        if column is not None and evidence.is_gripper[element]
+    ]
+    if not grippers:
+        raise NotMeasuredError("no gripper has an action of its name")
+    for element, column in grippers:
+        yield from _gripper_faults(evidence, element, column)
+
+
+def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[Fault]:
+    followed: dict[int, float] = {}
+    ignored: dict[int, float] = {}
+    commanded = usual([np.ptp(e.action[:, column]) for e, _ in evidence.with_state() if e.action is not None])[0]
+    for episode, state in evidence.with_state(10):
+        if episode.action is None:
+            continue
+        opening, command = state[:, element], episode.action[:, column]
+        if np.ptp(command) < 0.5 * commanded or np.ptp(command) == 0:
+            continue
+        if np.ptp(opening) < 0.02 * evidence.ranges[element] or np.ptp(opening) == 0:
+            ignored[episode.number] = float(np.ptp(command))
+        else:
+            followed[episode.number] = _best_correlation(opening, command, max(3, round(0.7 * evidence.fps)))
+    name = evidence.elements[element]
+    if ignored and not followed:
+        yield Fault(
+            severity="broken",
+            value="0",
+            message=f"{name} never moves although its action does",
+            do="record the gripper's own position",
+        )
+        return
+    for number in ignored if len(followed) >= MIN_OTHERS else ():
+        yield Fault(
+            severity="broken", episode=number, value="0", message=f"{name} stays where it is although its action moves"
+        )
+    if len(followed) <= MIN_OTHERS:
+        return
+    usual_correlation = float(np.median(list(followed.values())))
+    for number, correlation in followed.items():
+        if abs(usual_correlation) > 0.6 and correlation * np.sign(usual_correlation) < -0.5:
+            yield Fault(
+                severity="broken",
+                episode=number,
+                value=f"{correlation:+.2f}",
+                message=f"{name} moves against its action (correlation {correlation:+.2f}, usual "
+                f"{usual_correlation:+.2f})",
+            )
+
+
+def _best_correlation(values: Array, others: Array, reach: int) -> float:
+    """The correlation of largest size with the action some frames before."""
+    found = []
+    for lag in range(min(reach, len(values) - 8) + 1):
+        one, two = values[lag:], others[: len(others) - lag]
+        if np.ptp(one) > 0 and np.ptp(two) > 0:
+            found.append(float(np.corrcoef(one, two)[0, 1]))
+    return max(found, key=abs, default=0.0)

@@ -1,0 +1,177 @@
+"""Checks of copies: whole episodes and pieces that occur twice, within a set and between two."""
+
+from __future__ import annotations
+
+import hashlib
+from collections import defaultdict
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+
+PIECE_S = 1.0
+"""Duration of a shared piece, at least."""
+MIN_PIECE = 8
+"""Frames of a shared piece, at least: as many moving readings of all elements do not repeat by chance."""
+_MOMENTS = 32
+MAX_DISTANCE = 1e-3
+"""Root mean square difference of two motions, as a share of the usual range, up to which one is a copy: encoders have
+steps of this size, people never repeat a motion so closely."""
+
+
+@check(
+    family="set",
+    needs="state",
+    measures="episodes that are copies of another",
+    unit="episodes",
+    why="A copy counts twice in training, and in a validation split it hides overfitting.",
+    do=DROP,
+)
+def copied_episodes(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the states of all episodes of equal length at 32 moments each; all copies are named."""
+    episodes = evidence.need_state(MIN_PIECE)
+    if len(episodes) < 2:
+        raise NotMeasuredError("it needs two episodes")
+    for later, earlier in copies(episodes, episodes, evidence.ranges):
+        yield Fault(
+            severity="broken",
+            episode=later.number,
+            value=f"copy of episode {earlier.number}",
+            message=f"it has the motion of episode {earlier.number}",
+        )
+
+
+def copies(
+    later: Sequence[tuple[EpisodeEvidence, Array]], earlier: Sequence[tuple[EpisodeEvidence, Array]], ranges: Array
+) -> Iterator[tuple[EpisodeEvidence, EpisodeEvidence]]:
+    """Yield (episode, the first one that it is a copy of); of one set, each is compared with those before it."""
+    alive = ranges > 0
+    by_length: dict[int, list[tuple[EpisodeEvidence, Array]]] = defaultdict(list)
+    for episode, state in earlier:
+        by_length[len(state)].append((episode, _moments(state, ranges, alive)))
+    same = later is earlier
+    for episode, state in later:
+        if not np.ptp(state, axis=0).any():
+            continue  # one that rests has no motion to copy
+        own = _moments(state, ranges, alive)
+        for other, vector in by_length.get(len(state), ()):
+            if same and other.number >= episode.number:
+                break
+            if np.sqrt(((own - vector) ** 2).mean()) <= MAX_DISTANCE:
+                yield episode, other
+                break
+
+
+def _moments(state: Array, ranges: Array, alive: NDArray[np.bool_]) -> Array:
+    moments = np.linspace(0, len(state) - 1, _MOMENTS).round().astype(int)
+    return np.asarray(state[moments][:, alive] / ranges[alive])
+
+
+@check(
+    family="set",
+    needs="state",
+    measures="pieces that two episodes share",
+    unit="frames",
+    why="A piece was written twice: one of the episodes has frames that are not its own.",
+    do=DROP,
+)
+def shared_pieces(evidence: Evidence) -> Iterator[Fault]:
+    """Find runs of moving frames whose state and action are equal to the last bit in two episodes, or twice in one."""
+    episodes = evidence.need_state(MIN_PIECE)
+    size = max(MIN_PIECE, round(PIECE_S * evidence.fps / 2))
+    whole = {later.number for later, _ in copies(episodes, episodes, evidence.ranges)}
+    first_seen: dict[bytes, tuple[int, int]] = {}
+    for episode, _ in episodes:
+        if episode.number in whole:
+            continue
+        shared = _shared(episode, size, first_seen)
+        for other, frames in shared.items():
+            if len(frames) + size - 1 >= PIECE_S * evidence.fps or len(frames) > 1:
+                first, last = frames[0], frames[-1] + size - 1
+                where = "twice" if other == episode.number else f"in episode {other} too"
+                yield Fault(
+                    severity="broken",
+                    episode=episode.number,
+                    frames=(first, last),
+                    value=f"{last - first + 1} frames",
+                    message=f"frames {first} to {last} occur {where}, to the last bit",
+                )
+
+
+def _shared(episode: EpisodeEvidence, size: int, first_seen: dict[bytes, tuple[int, int]]) -> Mapping[int, list[int]]:
+    """Earlier episode, or this one -> first frames of the windows that both have; new windows are noted."""
+    rows = _digests(episode)
+    found: dict[int, list[int]] = defaultdict(list)
+    moving = np.flatnonzero([one != two for one, two in pairwise(rows)])
+    is_moving = np.zeros(len(rows), dtype=np.int64)
+    is_moving[moving + 1] = 1
+    counts = np.concatenate([[0], np.cumsum(is_moving)])
+    for first in range(len(rows) - size + 1):
+        if counts[first + size] - counts[first + 1] < size - 1:
+            continue  # part of it rests
+        window = b"".join(rows[first : first + size])
+        key = hashlib.blake2b(window, digest_size=12).digest()
+        seen = first_seen.setdefault(key, (episode.number, first))
+        if seen != (episode.number, first):
+            found[seen[0]].append(first)
+    return found
+
+
+def _digests(episode: EpisodeEvidence) -> list[bytes]:
+    """The bytes of state and action of each frame."""
+    assert episode.state is not None
+    parts = [episode.state] if episode.action is None else [episode.state, episode.action]
+    table = np.ascontiguousarray(np.hstack(parts).astype(np.float32))
+    return [row.tobytes() for row in table]
+
+
+@check(
+    family="set",
+    needs="two datasets with states",
+    measures="episodes that two datasets share (check A B)",
+    unit="episodes",
+    why="What was trained on cannot validate: the score looks better than the policy is.",
+    do="drop them from one of the two: " + DROP,
+)
+def leakage(evidence: Evidence) -> Iterator[Fault]:
+    """Find the episodes and pieces of every dataset of the command in those that were named before it."""
+    if not evidence.earlier:
+        raise NotApplicableError("it compares two datasets: demorec check TRAIN VAL")
+    for other in evidence.earlier:
+        yield from _leaks(other, evidence)
+
+
+def _leaks(train: Evidence, other: Evidence) -> Iterator[Fault]:
+    ours, theirs = train.with_state(MIN_PIECE), other.with_state(MIN_PIECE)
+    if not ours or not theirs or len(train.ranges) != len(other.ranges):
+        return
+    copied: set[int] = set()
+    for later, earlier in copies(theirs, ours, train.ranges):
+        copied.add(later.number)
+        yield Fault(
+            severity="broken",
+            episode=later.number,
+            value=f"episode {earlier.number}",
+            message=f"it is episode {earlier.number} of {train.path}",
+        )
+    size = max(MIN_PIECE, round(PIECE_S * train.fps / 2))
+    first_seen: dict[bytes, tuple[int, int]] = {}
+    for episode, _ in ours:
+        _shared(episode, size, first_seen)
+    for episode, _ in theirs:
+        shared = {} if episode.number in copied else _shared(episode, size, dict(first_seen))
+        for owner, frames in list(shared.items())[:1]:
+            first, last = frames[0], frames[-1] + size - 1
+            yield Fault(
+                severity="broken",
+                episode=episode.number,
+                frames=(first, last),
+                value=f"{last - first + 1} frames",
+                message=f"its frames {first} to {last} are in episode {owner} of {train.path}",
+            )

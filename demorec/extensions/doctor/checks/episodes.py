@@ -1,0 +1,177 @@
+"""Checks of episodes against each other: cut off, never ended, idle, and unusual ones."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.robust import usual
+from demorec.extensions.doctor.scores import score_episodes
+from demorec.extensions.doctor.units import other_units
+
+MIN_OTHERS = 7
+"""Episodes, at least, that one is compared with: with fewer, "usual" says little."""
+MAX_UNUSUAL_SPREADS = 10.0
+"""Usual spreads from which a quantity of an episode is worth a look."""
+MAX_UNUSUAL_SHARE = 0.1
+"""Share of episodes up to which a quantity far from the median is unusual, not another way to do the task."""
+MIN_END_SPEED = 0.8
+"""Speed at the end, as a share of the episode's root mean square, from which it ends amid the motion."""
+MAX_REST_SPEED = 0.3
+"""The same share up to which an episode ends at rest."""
+MIN_RESTING_SHARE = 0.8
+"""Share of the other episodes that end at rest, from which one that does not is cut off."""
+END_S = 0.2
+MIN_IDLE_S = 3.0
+"""Idle time at an end, seconds, from which it is worth trimming."""
+IDLE_TIMES = 4.0
+"""Times the usual idle time."""
+IDLE_RATIO = 0.02
+"""Step of an element, as a share of its usual range, up to which it rests."""
+MIN_RETURN = 0.08
+"""Share of the range by which an arm is away from its start before it jumps back."""
+MIN_LENGTH_TIMES = 3.0
+"""Times the usual length from which an episode holds several."""
+
+
+@check(
+    family="set",
+    needs="state, eight episodes",
+    measures="episodes that are cut off",
+    unit="% of usual speed",
+    why="The end of the task is missing: the policy does not learn to finish.",
+    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+)
+def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
+    """Find episodes that end amid the motion, where nearly all others end at rest."""
+    speeds: dict[int, float] = {}
+    count = max(2, round(END_S * evidence.fps))
+    for episode, state in evidence.need_state(3 * count):
+        speed = _arm_speed(evidence, state)
+        size = float(np.sqrt((speed**2).mean()))
+        if size > 0:
+            speeds[episode.number] = float(speed[-count:].mean()) / size
+    if len(speeds) <= MIN_OTHERS:
+        raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
+    at_rest = np.mean([each < MAX_REST_SPEED for each in speeds.values()])
+    for number, end_speed in speeds.items() if at_rest >= MIN_RESTING_SHARE else ():
+        if end_speed > MIN_END_SPEED:
+            yield Fault(
+                severity="look",
+                episode=number,
+                value=f"{end_speed:.0%}",
+                message=f"it ends while the arm moves at {end_speed:.0%} of its speed; {at_rest:.0%} end at rest",
+            )
+
+
+def _arm_speed(evidence: Evidence, state: Array) -> Array:
+    """(T - 1,) speed of the arm in units of the elements' ranges."""
+    arm = ~evidence.is_gripper & (evidence.ranges > 0)
+    return np.asarray(np.linalg.norm(np.diff(state[:, arm], axis=0) / evidence.ranges[arm], axis=1))
+
+
+@check(
+    family="set",
+    needs="state, eight episodes",
+    measures="episodes that hold several",
+    unit="times the length",
+    why="Nothing marks where one attempt ends and the next begins: the policy learns to start over.",
+    do="split it where the arm returns to its start, in the program that recorded it, or drop it: " + DROP,
+)
+def joined_episodes(evidence: Evidence) -> Iterator[Fault]:
+    """Find episodes several times as long as the others that return to their start again and again."""
+    episodes = evidence.need_state(8)
+    lengths = [len(state) for _, state in episodes]
+    length, _ = usual(lengths)
+    for episode, state in episodes:
+        returns = _returns(evidence, state)
+        is_long = len(episodes) > MIN_OTHERS and len(state) > MIN_LENGTH_TIMES * length
+        if returns >= 2 and (is_long or len(episodes) == 1):
+            yield Fault(
+                severity="broken" if is_long else "look",
+                episode=episode.number,
+                value=f"{len(state) / length:.1f} times" if is_long else f"{returns + 1} attempts",
+                message=f"it seems to hold {returns + 1} episodes: it jumps back to its start {returns} times",
+            )
+
+
+def _returns(evidence: Evidence, state: Array) -> int:
+    """How often the arm is back at its first position within one frame, and rests before and after it."""
+    span = np.ptp(state, axis=0)
+    alive = (span > 0) & ~evidence.is_gripper
+    if not alive.any():
+        return 0
+    away = (np.abs((state - state[0])[:, alive]) / span[alive]).max(axis=1)
+    steps = (np.abs(np.diff(state[:, alive], axis=0)) / span[alive]).max(axis=1)
+    is_jump = (steps[1:-1] > MIN_RETURN) & (np.maximum(steps[:-2], steps[2:]) < 0.3 * steps[1:-1])
+    return int((is_jump & (away[2:-1] < MIN_RETURN / 2)).sum())
+
+
+@check(
+    family="set",
+    needs="state",
+    measures="idle time at the start or the end",
+    unit="s",
+    why="The policy learns to do nothing at the start, and may never begin.",
+    do="demorec dataset trim {path} --idle --out NEW",
+)
+def idle_ends(evidence: Evidence) -> Iterator[Fault]:
+    """Find episodes that rest for seconds before the first motion or after the last, far longer than the others."""
+    times: dict[int, tuple[float, float]] = {}
+    for episode, state in evidence.need_state(8):
+        alive = evidence.ranges > 0
+        moved = (np.abs(np.diff(state[:, alive], axis=0)) > IDLE_RATIO * evidence.ranges[alive]).any(axis=1)
+        moving = np.flatnonzero(moved)
+        if len(moving):
+            times[episode.number] = (
+                evidence.seconds(float(moving[0])),
+                evidence.seconds(float(len(moved) - 1 - moving[-1])),
+            )
+    for place, words in enumerate(("starts", "ends")):
+        typical, _ = usual([each[place] for each in times.values()])
+        for number, each in times.items():
+            idle, length = each[place], evidence.seconds(evidence.by_number[number].length)
+            if idle > max(MIN_IDLE_S, IDLE_TIMES * typical) and idle > 0.2 * length:
+                yield Fault(
+                    severity="look",
+                    episode=number,
+                    value=f"{idle:.1f} s",
+                    message=f"it {words} with {idle:.1f} s in which nothing moves, usual are {typical:.1f} s",
+                )
+
+
+@check(
+    family="set",
+    needs="state, eight episodes",
+    measures="episodes unlike the others of their task",
+    unit="usual spreads",
+    why="Detours, pauses and shaking are learned like everything else.",
+    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+)
+def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
+    """Compare duration, pauses, detours, shaking and switches of the gripper with those of the other episodes.
+
+    These are the reasons of the score; one is worth a look from ten usual spreads on.
+    """
+    evidence.need_state(8)
+    if len(evidence.episodes) <= MIN_OTHERS:
+        raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
+    scores = score_episodes(evidence)
+    far = Counter(r.kind for score in scores.values() for r in score.reasons if r.spreads > MAX_UNUSUAL_SPREADS)
+    rare = {kind for kind, count in far.items() if count <= max(1, MAX_UNUSUAL_SHARE * len(scores))}
+    for number, score in scores.items():
+        for reason in score.reasons if number not in evidence.once(other_units) else ():
+            if reason.kind in rare - {"flaw", "lag"} and reason.spreads > MAX_UNUSUAL_SPREADS:
+                yield Fault(
+                    severity="look",
+                    episode=number,
+                    frames=(reason.first, reason.last),
+                    value=f"{reason.spreads:.0f} spreads",
+                    message=f"it {reason.text}" if not reason.text.startswith("the ") else reason.text,
+                )

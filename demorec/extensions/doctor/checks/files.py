@@ -1,0 +1,369 @@
+"""Checks of a LeRobot dataset's files: tables and videos against each other and against info.json."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from demorec.datasets.lerobot.files import open_table, read_table, tables_in
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
+from demorec.datasets.lerobot.videos import opened_video
+from demorec.extensions.doctor.base import DROP, Fault, Severity, check
+from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
+from demorec.extensions.doctor.evidence import Evidence
+
+_TYPES = {
+    "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
+}  # fmt: skip
+_PRECISE = ("timestamp", "float64")
+"""A counter that may be more precise than LeRobot's own."""
+_RATE_TOLERANCE = 0.01
+"""Files that were put together have rates that are a little different."""
+
+
+def folder_of(evidence: Evidence) -> LeRobotFolder:
+    """Return the open dataset. Raises NotMeasuredError for recordings."""
+    if evidence.folder is None:
+        raise NotApplicableError("recordings have files of another kind, whose integrity is checked by itself")
+    return evidence.folder
+
+
+@check(
+    family="files",
+    needs="a LeRobot dataset",
+    measures="episodes whose rows cannot be read",
+    unit="episodes",
+    why="Training ends with an error, or the rows of another episode are taken.",
+    do="download or record it again, or drop the episode: " + DROP,
+)
+def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
+    """Read every row of every episode, and prove by its own numbers that it belongs there."""
+    folder = folder_of(evidence)
+    reasons: dict[str, list[int]] = {}
+    for number, reason in evidence.unreadable.items():
+        reasons.setdefault(reason, []).append(number)
+    for reason, numbers in reasons.items():
+        for number in numbers:
+            yield Fault(severity="broken", episode=number, message=reason, value="1 episode")
+    if evidence.robot_problem:
+        yield Fault(severity="broken", message=evidence.robot_problem, do="restore the folder demorec/robots")
+    for number, note in enumerate(folder.notes):
+        # Without the table of episodes LeRobot opens nothing, by a wrong one it takes other rows.
+        severity: Severity = "broken" if number == 0 and folder.is_found_by_rows else "look"
+        yield Fault(severity=severity, message=note, do="demorec dataset repair {path} --out NEW")
+    if missing := folder.missing:
+        yield Fault(severity="broken", message=missing.partition(": /")[0], do="complete the recording or the download")
+    if not folder.listed:
+        yield Fault(
+            severity="broken", message="the table of episodes is empty", do="finalize the recording: dataset.finalize()"
+        )
+
+
+@check(
+    family="files",
+    needs="a LeRobot dataset",
+    measures="counters and indices that contradict",
+    unit="contradictions",
+    why="LeRobot takes rows and images by these numbers: it finds others, or none.",
+    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW numbers them again; otherwise record it again",
+)
+def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
+    """Compare totals with the tables; indices count up without a gap, and tasks are those of the episodes' table."""
+    folder = folder_of(evidence)
+    info = folder.info
+    totals = {
+        "total_episodes": (info.total_episodes, len(folder.listed)),
+        "total_frames": (info.total_frames, sum(place.length for place in folder.listed)),
+        "total_tasks": (info.total_tasks, len(folder.tasks)),
+    }
+    for name, (stated, found) in totals.items():
+        if stated != found:
+            yield Fault(severity="broken", value=str(found), message=f"info.json states {name} {stated}, found {found}")
+    start = 0
+    for number, place in enumerate(folder.listed):
+        if place.episode_index != number or place.from_index != start:
+            yield Fault(
+                severity="broken",
+                episode=place.episode_index,
+                message=f"the table of episodes has it at row {place.from_index}, expected {start}",
+            )
+        if (episode := evidence.by_number.get(place.episode_index)) is not None:
+            absent = [name for name in ("index", "episode_index", "frame_index") if name not in episode.columns]
+            if absent:
+                yield Fault(severity="look", episode=number, message=f"its rows have no {', '.join(absent)}")
+            wrong = _wrong_indices(episode.columns, number, start)
+            if wrong:
+                yield Fault(severity="broken", episode=number, message=f"its {', '.join(wrong)} does not count up")
+            if (fault := _wrong_task(folder, place.tasks, episode.columns, number)) is not None:
+                yield fault
+        start += place.length
+    if not info.is_old:
+        numbers = read_table(evidence.path / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
+        if numbers != list(range(len(numbers))):  # LeRobot takes the row of a number, whatever number is in it
+            yield Fault(severity="broken", message="the tasks' numbers do not count up in meta/tasks.parquet")
+        yield from _wrong_ranges(folder)
+        yield from _surplus_rows(folder)
+
+
+def _wrong_indices(columns: Mapping[str, Any], number: int, start: int) -> list[str]:
+    length = len(next(iter(columns.values())))
+    count = np.arange(length)
+    expected = {"index": start + count, "episode_index": np.full(length, number), "frame_index": count}
+    return [
+        name
+        for name, values in expected.items()
+        if name in columns and not np.array_equal(columns[name].reshape(-1), values)
+    ]
+
+
+def _wrong_task(folder: LeRobotFolder, tasks: tuple[str, ...], columns: Mapping[str, Any], number: int) -> Fault | None:
+    if "task_index" not in columns:
+        return Fault(severity="broken", episode=number, message="its rows have no task_index")
+    used = {int(index) for index in columns["task_index"].reshape(-1)}
+    names = {folder.tasks[index] if 0 <= index < len(folder.tasks) else f"number {index}" for index in used}
+    if names == set(tasks):
+        return None
+    stated, found = (", ".join(map(repr, sorted(each))) for each in (tasks, names))
+    return Fault(
+        severity="broken",
+        episode=number,
+        message=f"its rows have the task {found[:120]}, the table of episodes {stated[:120]}",
+    )
+
+
+def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
+    """Where the episodes' table says that things are: rows of the dataset, and seconds of each video."""
+    ends = [f"videos/{key}/to_timestamp" for key in folder.info.video_keys]
+    for path in tables_in(folder.root, "meta/episodes"):
+        columns = open_table(path).schema_arrow.names
+        names = [name for name in ("dataset_to_index", *ends) if name in columns]
+        begins = [name.replace("to_", "from_") for name in names]
+        for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
+            for begin, end in zip(begins, names, strict=True):
+                unit = 1 if end == "dataset_to_index" else folder.info.fps
+                if not abs((row[end] - row[begin]) * unit - row["length"]) < 0.5:
+                    yield Fault(
+                        severity="broken",
+                        episode=row["episode_index"],
+                        message=f"{end} of the table of episodes does not fit its {row['length']} frames",
+                    )
+
+
+def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
+    """Rows of the data files that belong to no episode."""
+    for file in tables_in(folder.root, "data"):
+        found, listed = open_table(file).metadata.num_rows, folder.num_rows.get(file, 0)
+        if listed != found:
+            yield Fault(
+                severity="broken",
+                value=f"{found - listed} rows",
+                message=f"{file.name} has {found} rows, {listed} of them belong to episodes",
+                do="finalize the recording, or write the dataset again",
+            )
+
+
+@check(
+    family="files",
+    needs="a LeRobot dataset",
+    measures="columns that differ from info.json",
+    unit="columns",
+    why="Readers convert or refuse what is not as stated: numbers lose digits, or training does not begin.",
+    do="correct meta/info.json, or write the column in the stated type",
+)
+def table_schema(evidence: Evidence) -> Iterator[Fault]:
+    """Compare columns, types and shapes of the data files with info.json, and the counters with LeRobot's own."""
+    folder = folder_of(evidence)
+    features = {name: feature for name, feature in folder.info.features.items() if not feature.is_video}
+    for name, fixed in AUTOMATIC_FEATURES.items():
+        found = features.get(name)
+        if found is None:
+            yield Fault(severity="look", message=f"{name} is not in info.json, where LeRobot expects it")
+        elif found.shape != fixed.shape or (found.dtype != fixed.dtype and (name, found.dtype) != _PRECISE):
+            yield Fault(severity="broken", message=f"{name} is not stated as {fixed.dtype} of shape {fixed.shape}")
+    seen: set[str] = set()
+    for path in tables_in(folder.root, "data"):
+        for severity, message in _column_faults(path, features):
+            if message not in seen:
+                seen.add(message)
+                yield Fault(severity=severity, message=f"{message} ({path.name})")  # type: ignore[arg-type]
+
+
+def _column_faults(path: Path, features: Mapping[str, DatasetFeature]) -> Iterator[tuple[str, str]]:
+    schema = open_table(path).schema_arrow
+    columns = set(schema.names)
+    for name in sorted(features.keys() - columns):
+        yield "broken", f"the column {name} is missing"
+    for name in sorted(columns - features.keys()):
+        yield "look", f"the column {name} is not in info.json"
+    for name in sorted(columns & features.keys()):
+        kind, feature = schema.field(name).type, features[name]
+        fit = _fits(kind, feature)
+        if fit != "equal":
+            severity = "look" if fit == "converts" else "broken"
+            yield severity, f"{name} is {kind}, and info.json states {feature.dtype} of shape {feature.shape}"
+
+
+def _fits(found: pa.DataType, feature: DatasetFeature) -> str:
+    """ "equal", "converts" if readers convert it without loss of meaning, or "other"."""
+    if feature.dtype not in _TYPES:
+        return "equal"  # images in tables, which other writers have
+    size = None
+    while pa.types.is_list(found) or pa.types.is_fixed_size_list(found) or pa.types.is_large_list(found):
+        if pa.types.is_fixed_size_list(found):
+            size = (size or 1) * found.list_size
+        found = found.value_type
+    if size is not None and size != math.prod(feature.shape):
+        return "other"
+    wanted = _TYPES[feature.dtype]
+    if found == wanted or (feature.dtype == "string" and pa.types.is_large_string(found)):
+        return "equal"
+    both = (found, wanted)
+    are_kin = all(map(pa.types.is_floating, both)) or all(map(pa.types.is_integer, both))
+    return "converts" if are_kin else "other"
+
+
+@check(
+    family="files",
+    needs="videos",
+    measures="videos that differ from info.json",
+    unit="files",
+    why="Readers prepare for the stated size and rate: images are resized, shifted, or refused.",
+    do="correct meta/info.json, or encode the video as stated",
+)
+def video_format(evidence: Evidence) -> Iterator[Fault]:
+    """Compare size, rate, codec and sound of each video file with info.json, and info.json with itself."""
+    folder = folder_of(evidence)
+    if not folder.info.video_keys:
+        raise NotApplicableError("there are no videos")
+    for key in folder.info.video_keys:
+        feature = folder.info.features[key]
+        stated = _stated_format(feature)
+        for path in dict.fromkeys(place.videos[key][0] for place in folder.listed):
+            for quantity, value in _found_format(path, folder).items():
+                if quantity == "fps" and abs(value - folder.info.fps) > _RATE_TOLERANCE * folder.info.fps:
+                    yield Fault(
+                        severity="broken",
+                        message=f"{key}: {path.name} has {value:.4g} fps, info.json {folder.info.fps}",
+                    )
+                elif quantity in stated and stated[quantity] != value:
+                    yield Fault(
+                        severity="broken" if quantity in ("height", "width") else "look",
+                        message=f"{key}: {quantity} of {path.name} is {value}, info.json states {stated[quantity]}",
+                    )
+        yield from _info_against_itself(key, feature, folder)
+
+
+def _stated_format(feature: DatasetFeature) -> dict[str, Any]:
+    info = feature.info or {}
+    width, height = feature.image_size
+    found: dict[str, Any] = {"height": height, "width": width}
+    found |= {name: info[f"video.{name}"] for name in ("codec", "pix_fmt") if info.get(f"video.{name}")}
+    return found | ({"sound": info["has_audio"]} if isinstance(info.get("has_audio"), bool) else {})
+
+
+def _found_format(path: Path, folder: LeRobotFolder) -> dict[str, Any]:
+    """Quantity -> value of a video file; empty for one that cannot be read, which `undecodable_images` finds."""
+    found: dict[str, Any] = {}
+    with noted([], folder.root), opened_video(path) as (container, stream):
+        context = stream.codec_context
+        codec = {"libdav1d": "av1"}.get(context.name, context.name)
+        found = {"height": context.height, "width": context.width, "pix_fmt": context.pix_fmt, "codec": codec}
+        found["sound"] = bool(container.streams.audio)
+        found["fps"] = float(stream.average_rate or 0)
+    return found
+
+
+def _info_against_itself(key: str, feature: DatasetFeature, folder: LeRobotFolder) -> Iterator[Fault]:
+    info, (width, height) = feature.info or {}, feature.image_size
+    if feature.is_depth and feature.shape[2] != 1:
+        yield Fault(severity="broken", message=f"{key} is a depth map of {feature.shape[2]} channels in info.json")
+    for quantity, value in (("height", height), ("width", width), ("channels", feature.shape[2])):
+        if info.get(f"video.{quantity}", value) != value:
+            yield Fault(
+                severity="look",
+                message=f"{key}: info.json has video.{quantity} {info[f'video.{quantity}']} and the shape {value}",
+            )
+    if info.get("video.fps", folder.info.fps) != folder.info.fps:
+        yield Fault(
+            severity="look", message=f"{key}: info.json has video.fps {info['video.fps']}, fps {folder.info.fps}"
+        )
+
+
+@check(
+    family="files",
+    needs="videos",
+    measures="images before, between or after episodes",
+    unit="images",
+    why="Rows and images are counted by different hands: one of the two is shifted against the other.",
+    do="encode the videos of the episodes again from their images",
+)
+def video_places(evidence: Evidence) -> Iterator[Fault]:
+    """Find the encoded images of every episode in every camera's file, one after the other.
+
+    In front of an episode there may be images from the keyframe on that its first one needs.
+    """
+    folder = folder_of(evidence)
+    if not folder.info.video_keys:
+        raise NotApplicableError("there are no videos")
+    for key in folder.info.video_keys:
+        if evidence.cameras and key not in evidence.cameras and not folder.info.features[key].is_depth:
+            yield Fault(severity="look", message=f"no video of {key} is here", do="download it")
+            continue
+        ends: dict[Path, int] = {}
+        is_here = any(place.videos[key][0].exists() for place in folder.listed)
+        for place in folder.listed:
+            path, first = place.videos[key]
+            end, ends[path] = ends.get(path, 0), first + place.length
+            problems: list[str] = []
+            with noted(problems, evidence.path):
+                if first not in (end, end + folder.video(key, place).lead):
+                    yield Fault(
+                        severity="broken",
+                        episode=place.episode_index,
+                        value=f"{first - end:+d} images",
+                        message=f"{key} starts at image {first} of {path.name}, the episode before ends at {end}",
+                    )
+            if problems and not evidence.cameras and is_here:
+                yield Fault(severity="broken", episode=place.episode_index, message=f"{key}: {problems[0]}")
+
+
+@check(
+    family="files",
+    needs="a LeRobot dataset",
+    measures="files that nothing refers to",
+    unit="files",
+    why="They fill the disk and the download; merges, deleted episodes and renamed cameras leave them.",
+    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW copies what is used",
+)
+def unused_files(evidence: Evidence) -> Iterator[Fault]:
+    """Find video and data files that no episode uses."""
+    folder = folder_of(evidence)
+    used = {path for place in folder.listed for path, _ in place.videos.values()} | set(folder.num_rows)
+    found = {*(evidence.path / "videos").rglob("*.mp4"), *(evidence.path / "data").rglob("*.parquet")} - used
+    if found:
+        names = sorted(path.relative_to(evidence.path).as_posix() for path in found)
+        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
+        yield Fault(severity="look", value=f"{len(names)} files", message=f"no episode uses {names[0]}{more}")
+
+
+@check(
+    family="files",
+    needs="a LeRobot dataset of v3.0",
+    measures="statistics that are missing",
+    why="Training cannot normalise without them.",
+    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW writes them",
+)
+def missing_statistics(evidence: Evidence) -> Iterator[Fault]:
+    """Look for meta/stats.json."""
+    folder = folder_of(evidence)
+    if folder.info.is_old:
+        raise NotMeasuredError("before v3.0 each episode has its own statistics")
+    if not (evidence.path / STATS_PATH).exists():
+        yield Fault(severity="broken", message=f"{STATS_PATH} is missing")

@@ -1,0 +1,217 @@
+"""Check of readings of the state that stop changing while the robot moves."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.checks.numbers import MIN_OTHERS, element_name
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.relation import relation_of
+from demorec.extensions.doctor.robust import runs
+from demorec.extensions.doctor.units import state_bounds
+
+MIN_FROZEN_S = 0.4
+MIN_FROZEN_FRAMES = 5
+"""Frames, at least, of a frozen state."""
+MIN_FROZEN_RANGE = 0.3
+"""Share of the usual range that the action covers while an element of the state keeps one value to the last bit."""
+MIN_FROZEN_ERRORS = 2.0
+"""Times the usual distance between action and state, at least, by which the action leaves a frozen element: a hobby
+servo holds its joint for seconds while the difference is within its dead band and load."""
+MAX_END_STOP_RANGE = 0.02
+"""Share of the range of the whole set within which an element is at an end stop: further out it cannot follow."""
+
+
+@check(
+    family="numbers",
+    needs="state",
+    measures="readings of the state that stop changing",
+    unit="s",
+    why="The policy sees a robot that does not move while it acts.",
+    do=DROP,
+)
+def frozen_state(evidence: Evidence) -> Iterator[Fault]:
+    """Find elements that keep their value to the last bit while their action moves on, and whole states that do.
+
+    The action must leave the element by more than twice the distance that it usually has: servos hold a joint within
+    their dead band, under load, and at end stops. Without an action, a whole state counts as frozen where it continues
+    with a jump. An element that never changes in any episode while its action does is a fault of the whole set.
+    """
+    episodes = evidence.need_state(8)
+    yield from _never_moving(evidence, episodes)
+    targets = _targets(evidence, episodes)
+    needed = max(MIN_FROZEN_FRAMES, round(MIN_FROZEN_S * evidence.fps))
+    faults: list[Fault] = []
+    for episode, state in episodes:
+        fault = _frozen_element(evidence, targets, episode, state, needed) or _frozen_whole(
+            evidence, episode, state, needed
+        )
+        if fault is not None:
+            faults.append(fault)
+    if len(faults) > max(MIN_OTHERS, len(episodes) / 2):
+        yield Fault(
+            severity="look",
+            value=f"{len(faults)} of {len(episodes)} episodes",
+            message=f"{faults[0].message}; so in {len(faults)} of {len(episodes)} episodes",
+            do="compare the state with the command in the recorder: a blocked joint, or one that is not read",
+        )
+    else:
+        yield from faults
+
+
+def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:
+    for element, column in enumerate(evidence.action_of):
+        if column is None or evidence.is_gripper[element] or any(np.ptp(state[:, element]) for _, state in episodes):
+            continue
+        acting = [each.action for each, _ in episodes if each.action is not None]
+        if not acting:
+            return
+        spans = np.median(np.stack([np.ptp(action, axis=0) for action in acting]), axis=0)
+        usual_span = float(np.median(spans[spans > 0])) if (spans > 0).any() else 0.0
+        if spans[column] > 0.1 * usual_span:
+            yield Fault(
+                severity="broken",
+                value="0",
+                message=f"{element_name(evidence, element)} never changes although its action does",
+                do="record the joint's own position",
+            )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _ElementTarget:
+    """Where the action wants one element of the state, frame by frame.
+
+    Attributes:
+        element: Its place in the state.
+        kind: "increment": only changes of the target are known.
+        wanted: Episode number -> (T,) target, at the frames at which the state usually reaches it.
+        min_distance: Distance from the state that shows that the state does not follow.
+        offset: Usual difference between target and state.
+    """
+
+    element: int
+    kind: Literal["target", "increment"]
+    wanted: Mapping[int, Array]
+    min_distance: float
+    offset: float
+
+    def unfollowed(self, evidence: Evidence, number: int, held: float, first: int, end: int) -> Array:
+        """(N,) distance from the held state to its target in some frames, without what is beyond an end stop."""
+        wanted = self.wanted[number][first : end + 1]
+        found = wanted - (wanted[0] if self.kind == "increment" else held + self.offset)
+        if len(self.wanted) <= MIN_OTHERS:
+            return found  # too few to tell an end stop from the place where the reading froze
+        lowest, highest = (bound[self.element] for bound in evidence.once(state_bounds))
+        margin = MAX_END_STOP_RANGE * (highest - lowest)
+        if held <= lowest + margin:
+            found = np.maximum(found, 0.0)
+        if held >= highest - margin:
+            found = np.minimum(found, 0.0)
+        return found
+
+
+def _targets(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> list[_ElementTarget]:
+    """The targets of the elements of the arm; none where the state follows its action in no known way."""
+    try:
+        relation = evidence.once(relation_of)
+    except NotMeasuredError:
+        return []
+    lag = max(round(relation.usual_lag), 0)
+    found = []
+    for element, column in enumerate(evidence.action_of):
+        if column is None or evidence.is_gripper[element] or not evidence.ranges[element]:
+            continue
+        wanted = {each.number: each.action[:, column] for each, _ in episodes if each.action is not None}
+        errors: list[Array] = [np.zeros(1)]
+        if relation.kind == "increment":
+            gain = evidence.ranges[element] / max(_usual_sum(evidence, column), 1e-12)
+            wanted = {number: gain * np.cumsum(each) for number, each in wanted.items()}
+        wanted = {number: each[np.maximum(np.arange(len(each)) - lag, 0)] for number, each in wanted.items()}
+        if relation.kind == "target":
+            errors = _moving_errors(wanted, episodes, element) or errors
+        offset = float(np.median([np.median(each) for each in errors]))
+        usual_error = float(np.median([np.quantile(np.abs(each - offset), 0.99) for each in errors]))
+        found.append(
+            _ElementTarget(
+                element=element,
+                kind=relation.kind,
+                wanted=wanted,
+                min_distance=MIN_FROZEN_ERRORS * usual_error,
+                offset=offset,
+            )
+        )
+    return found
+
+
+def _moving_errors(
+    wanted: Mapping[int, Array], episodes: Sequence[tuple[EpisodeEvidence, Array]], element: int
+) -> list[Array]:
+    """Difference between target and state in each episode, in the frames from which the element moves on."""
+    found = []
+    for episode, state in episodes:
+        values = state[:, element]
+        moves = np.flatnonzero(values[1:] != values[:-1])
+        if episode.number in wanted and len(moves):
+            found.append(wanted[episode.number][moves] - values[moves])
+    return found
+
+
+def _usual_sum(evidence: Evidence, column: int) -> float:
+    spans = [np.ptp(np.cumsum(e.action[:, column])) for e in evidence.episodes if e.action is not None and e.length]
+    return float(np.median(spans))
+
+
+def _frozen_element(
+    evidence: Evidence, targets: Sequence[_ElementTarget], episode: EpisodeEvidence, state: Array, needed: int
+) -> Fault | None:
+    """The longest rest of an element of the arm that its action leaves further than usual."""
+    worst: Fault | None = None
+    longest = needed
+    for target in targets if episode.action is not None else ():
+        values = state[:, target.element]
+        min_motion = MIN_FROZEN_RANGE * evidence.ranges[target.element]
+        for first, end in runs(values[1:] == values[:-1]):
+            if end - first < longest:
+                continue
+            distance = target.unfollowed(evidence, episode.number, float(values[first]), first, end)
+            moved = float(np.ptp(distance))
+            if moved > min_motion and float(np.abs(distance).max()) > target.min_distance:
+                longest = end - first + 1
+                seconds = evidence.seconds(end - first)
+                worst = Fault(
+                    severity="broken",
+                    episode=episode.number,
+                    frames=(first, end),
+                    value=f"{seconds:.1f} s",
+                    message=f"{element_name(evidence, target.element)} keeps one value for {seconds:.1f} s "
+                    "while its action moves",
+                )
+    return worst
+
+
+def _frozen_whole(evidence: Evidence, episode: EpisodeEvidence, state: Array, needed: int) -> Fault | None:
+    """A rest of the whole state that ends with a jump, or in which the whole action moves."""
+    same = (state[1:] == state[:-1]).all(axis=1)
+    rests = [(first, end) for first, end in runs(np.asarray(same)) if end - first >= needed]
+    alive = evidence.ranges > 0
+    for first, end in rests:
+        if end >= len(state) - 1:
+            continue
+        steps = np.abs(np.diff(state[:, alive], axis=0))
+        jump = steps[end] > np.maximum(4 * np.quantile(steps, 0.95, axis=0), 0.1 * evidence.ranges[alive])
+        if jump.mean() >= 0.5:
+            return Fault(
+                severity="broken",
+                episode=episode.number,
+                frames=(first, end),
+                value=f"{evidence.seconds(end - first):.1f} s",
+                message=f"the whole state keeps its values for {evidence.seconds(end - first):.1f} s, then jumps",
+            )
+    return None

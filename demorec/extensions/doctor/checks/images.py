@@ -1,0 +1,366 @@
+"""Checks of images: they decode, show something, change with the robot, and belong to this camera and episode."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
+from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.robust import runs
+from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
+from demorec.extensions.doctor.visible_motion import visible_motion
+
+MIN_OTHERS = 3
+"""Episodes, at least, that one is compared with."""
+MAX_BLANK_SPREAD = 3.0
+"""Standard deviation of a thumbnail, of 255, up to which it shows nothing: noise alone averages out in it."""
+MIN_SHOWN_SPREAD = 10.0
+"""Usual standard deviation from which a camera shows something."""
+MAX_COVERED_RATIO = 0.3
+"""Contrast, as a share of the camera's usual one, up to which something is in front of it."""
+MIN_COVERED_S = 0.3
+FROZEN_RATIO = 0.08
+"""Change of an image, as a share of the usual change while the robot moves, up to which it repeats the one before."""
+MIN_MISSING_CHANGE = 4.0
+"""Change that the motion of the joints lets expect while images repeat, at least, in images that change as usual."""
+MIN_FROZEN_FRAMES = 3
+FROZEN_TIMES = 4.0
+"""Times the longest usual missing change: cameras that see the arm only now and then repeat images for long."""
+MIN_VISIBLE = 0.25
+"""Share of the usual change from which motion is visible in every new image."""
+MIN_GAPS = 8
+"""Times from one new image to the next, at least, by which the rate of a camera is judged."""
+MIN_REGULAR = 0.95
+"""Share of these times that are one frame or less from their mean where a camera has a rate of its own."""
+MIN_RATE_CHANGE = 1.5
+"""Usual change of images, of 255, from which they are judged closely: codecs leave smaller ones out of every second
+image."""
+MIN_REPEATED = 0.3
+"""Share of repeated images from which a camera is slower than the frames."""
+MIN_FIT = 0.8
+"""Correlation of an episode's mean image with that of another camera, or with it turned, from which they are the same
+view."""
+MIN_FIT_GAIN = 0.3
+"""By how much it is larger than the correlation with its own."""
+MAX_TWIN_DIFFERENCE = 1.0
+"""Mean difference of thumbnails, of 255, up to which two cameras show the same."""
+
+
+@check(
+    family="images",
+    needs="images",
+    measures="images that do not decode",
+    unit="episodes",
+    why="Training ends with an error when it comes to them.",
+    do="download or record them again, or drop the episode: " + DROP,
+)
+def undecodable_images(evidence: Evidence) -> Iterator[Fault]:
+    """Decode every image of every camera, depth left out."""
+    for camera, images in evidence.need_images().items():
+        if images.errors and not images.episodes:
+            number, error = next(iter(images.errors.items()))
+            yield Fault(
+                severity="broken",
+                value=f"{len(images.errors)} episodes",
+                message=f"no image of {camera} can be read (episode {number}: {error})",
+                do="download the videos again, or check tables alone: demorec check {path} --no-images",
+            )
+            continue
+        for number, error in images.errors.items():
+            yield Fault(severity="broken", episode=number, value="1 camera", message=f"{camera}: {error}")
+
+
+@check(
+    family="images",
+    needs="images",
+    measures="images that show nothing",
+    unit="frames",
+    why="The policy acts without seeing, and learns to ignore the camera.",
+    do=DROP,
+)
+def blank_images(evidence: Evidence) -> Iterator[Fault]:
+    """Find images of one brightness: black, grey, or of a lost signal."""
+    for camera, images in evidence.need_images().items():
+        blank = {number: _spread(each) < MAX_BLANK_SPREAD for number, each in images.episodes.items()}
+        if blank and np.mean([flags.mean() for flags in blank.values()]) > 0.9:
+            yield Fault(
+                severity="broken",
+                value="all frames",
+                message=f"{camera} shows nothing in any episode",
+                do="leave the camera out: demorec dataset drop-features {path} --features " + camera + " --out NEW",
+            )
+            continue
+        for number, flags in blank.items():
+            if flags.any():
+                first, last = _bounds(flags)
+                yield Fault(
+                    severity="broken",
+                    episode=number,
+                    frames=(first, last),
+                    value=f"{int(flags.sum())} frames",
+                    message=f"{camera} shows nothing in {int(flags.sum())} frames, first in frame {first}",
+                )
+
+
+def _spread(images: EpisodeThumbnails) -> Array:
+    """(N,) standard deviation of each thumbnail."""
+    return np.asarray(images.thumbnails.std(axis=(1, 2), dtype=np.float64))
+
+
+def _bounds(flags: NDArray[np.bool_]) -> tuple[int, int]:
+    places = np.flatnonzero(flags)
+    return int(places[0]), int(places[-1])
+
+
+@check(
+    family="images",
+    needs="images",
+    measures="a camera that is covered for a while",
+    unit="s",
+    why="The policy acts without seeing in these frames.",
+    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+)
+def covered_camera(evidence: Evidence) -> Iterator[Fault]:
+    """Find stretches whose contrast is far below that of the camera's other images, without being blank."""
+    for camera, images in evidence.need_images().items():
+        spreads = {number: _spread(each) for number, each in images.episodes.items()}
+        if not spreads:
+            continue
+        contrast = float(np.median([np.median(each) for each in spreads.values()]))
+        detail = float(np.median([np.median(each.detail) for each in images.episodes.values()]))
+        for number, spread in spreads.items():
+            if contrast < MIN_SHOWN_SPREAD:
+                break
+            dark = (spread < MAX_COVERED_RATIO * contrast) & (spread >= MAX_BLANK_SPREAD)
+            dark &= images.episodes[number].detail < MAX_COVERED_RATIO * detail
+            long = [(a, b) for a, b in runs(dark) if b - a >= max(2, MIN_COVERED_S * evidence.fps)]
+            if long:
+                first, end = max(long, key=lambda run: run[1] - run[0])
+                yield Fault(
+                    severity="look",
+                    episode=number,
+                    frames=(first, end - 1),
+                    value=f"{evidence.seconds(end - first):.1f} s",
+                    message=f"{camera} shows hardly anything for {evidence.seconds(end - first):.1f} s, as if covered",
+                )
+
+
+@check(
+    family="images",
+    needs="images, state",
+    measures="images that stay the same while the robot moves",
+    unit="s",
+    why="The policy learns actions for a scene that it does not see.",
+    do=DROP,
+)
+def frozen_images(evidence: Evidence) -> Iterator[Fault]:
+    """Find images that repeat while joints move whose motion usually changes them.
+
+    How much each joint changes a camera's images is fitted to all episodes. A camera that often shows the same while
+    the robot moves is judged by its own longest rests.
+    """
+    evidence.need_state()
+    for camera, images in evidence.need_images().items():
+        rests = {n: _rests(evidence, n, each, images) for n, each in images.episodes.items()}
+        visible = evidence.once(visible_motion, images)
+        if visible is None or (len(rests) <= MIN_OTHERS and visible.usual_change < MIN_RATE_CHANGE):
+            continue
+        longest = {number: max((missing for missing, _, _ in found), default=0.0) for number, found in rests.items()}
+        for number, found in rests.items():
+            others = [missing for other, missing in longest.items() if other != number]
+            least = MIN_MISSING_CHANGE if len(others) >= MIN_OTHERS else 3 * MIN_MISSING_CHANGE
+            limit = max(least, FROZEN_TIMES * float(np.median(others or [0.0])))
+            bad = [(missing, first, end) for missing, first, end in found if missing > limit]
+            bad = [each for each in bad if each[2] - each[1] >= MIN_FROZEN_FRAMES]
+            if bad:
+                _, first, end = max(bad)
+                yield Fault(
+                    severity="broken",
+                    episode=number,
+                    frames=(first, end),
+                    value=f"{evidence.seconds(end - first):.1f} s",
+                    message=f"{camera} shows one image for {evidence.seconds(end - first):.1f} s while the robot moves",
+                )
+
+
+def _rests(
+    evidence: Evidence, number: int, images: EpisodeThumbnails, camera: CameraThumbnails
+) -> list[tuple[float, int, int]]:
+    """(images' worth of change that is missing, first frame, last frame) of each run of repeated images."""
+    visible = evidence.once(visible_motion, camera)
+    episode = evidence.by_number.get(number)
+    if visible is None or episode is None or episode.state is None or len(images.frames) < 2:
+        return []
+    same = _repeats(images, visible.usual_change)
+    expected = np.concatenate([[0.0], np.cumsum(visible.expected(evidence, episode, images))])
+    return [
+        (
+            float(expected[end] - expected[first]) / visible.usual_change,
+            int(images.frames[first]),
+            int(images.frames[end]),
+        )
+        for first, end in runs(same)
+    ]
+
+
+def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_]:
+    """(N - 1,) whether each image repeats the one before: neither its pixels nor its thumbnail change."""
+    pixels = images.change[1:] <= FROZEN_RATIO * usual_change
+    return np.asarray(pixels | ((images.steps == 0) & (images.change[1:] <= 3 * FROZEN_RATIO * usual_change)))
+
+
+@check(
+    family="images",
+    needs="images, state",
+    measures="cameras slower than the frames",
+    unit="% of moving frames",
+    why="Every second image is old; the policy cannot see how fast things move.",
+    do="record at the camera's own rate, or accept it: the images are late by up to a period",
+)
+def repeated_images(evidence: Evidence) -> Iterator[Fault]:
+    """Find cameras whose images repeat regularly: short repeats in a third of the moving frames or more."""
+    evidence.need_state()
+    for camera, images in evidence.need_images().items():
+        shares: dict[int, float] = {}
+        visible = evidence.once(visible_motion, images)
+        for number, each in images.episodes.items():
+            episode = evidence.by_number.get(number)
+            if visible is None or episode is None or episode.state is None or len(each.frames) < 2:
+                continue
+            visibly = visible.expected(evidence, episode, each) > MIN_VISIBLE * visible.usual_change
+            changed = np.flatnonzero(~_repeats(each, visible.usual_change) & visibly)
+            gaps = np.diff(changed)[visibly[changed[1:] - 1]] if len(changed) > 1 else np.zeros(0, dtype=np.intp)
+            if len(gaps) >= MIN_GAPS and visible.usual_change >= MIN_RATE_CHANGE:
+                shares[number] = _share_repeated(gaps)
+        if not shares:
+            continue
+        slow = [number for number, share in shares.items() if share > MIN_REPEATED]
+        if len(slow) > len(shares) / 2:
+            share = float(np.median(list(shares.values())))
+            rate = evidence.fps * (1 - share)
+            yield Fault(
+                severity="look",
+                value=f"{share:.0%} of moving frames",
+                message=f"{camera} repeats {share:.0%} of its images: it gives about {rate:.0f} images a second, not "
+                f"{evidence.fps:g}",
+            )
+        elif float(np.median(list(shares.values()))) == 0:
+            for number in slow:
+                yield Fault(
+                    severity="look",
+                    episode=number,
+                    value=f"{shares[number]:.0%} of moving frames",
+                    message=f"{camera} repeats {shares[number]:.0%} of its images",
+                    do=DROP,
+                )
+
+
+def _share_repeated(gaps: NDArray[np.intp]) -> float:
+    """Share of repeated images where new ones come regularly, after n or n + 1 frames; 0 where they do not.
+
+    Slow motion, too, changes an image only now and then, but not regularly.
+    """
+    mean = float(np.mean(gaps))
+    regular = np.abs(gaps - mean) < 1.0
+    return 1 - 1 / mean if regular.mean() >= MIN_REGULAR else 0.0
+
+
+@check(
+    family="images",
+    needs="images of three episodes",
+    measures="cameras that are exchanged or turned",
+    unit="correlation",
+    why="The policy sees the wrong view under the name of the right one.",
+    do=DROP,
+)
+def camera_views(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the mean image of each episode with the usual ones of all cameras, upright, mirrored and turned.
+
+    The view of a camera that moves much from one episode to the next is not judged.
+    """
+    views = {camera: _view(images) for camera, images in evidence.need_images().items()}
+    if not any(len(images.episodes) > MIN_OTHERS - 1 for images in evidence.cameras.values()):
+        raise NotMeasuredError(f"it needs {MIN_OTHERS} episodes with images")
+    for camera, images in evidence.cameras.items():
+        if len(images.episodes) <= MIN_OTHERS - 1:
+            continue
+        fits = {number: _correlation(each.mean, views[camera]) for number, each in images.episodes.items()}
+        if np.median(list(fits.values())) < MIN_FIT:
+            continue
+        for number, fit in fits.items():
+            mean = images.episodes[number].mean
+            others = {
+                f"the view of {other}": _correlation(mean, view) for other, view in views.items() if other != camera
+            }
+            others |= {f"the view {words}": _correlation(turned, views[camera]) for words, turned in _turned(mean)}
+            name, best = max(others.items(), key=lambda item: item[1], default=("", 0.0))
+            if best > MIN_FIT and best - fit > MIN_FIT_GAIN:
+                yield Fault(
+                    severity="broken",
+                    episode=number,
+                    value=f"{fit:.2f}",
+                    message=f"{camera} shows {name} in this episode",
+                )
+
+
+def _view(images: CameraThumbnails) -> Array:
+    """(16, 16) median over the episodes of their mean images."""
+    means = [each.mean for each in images.episodes.values() if len(each.thumbnails)]
+    return np.asarray(np.median(np.stack(means), axis=0)) if means else np.zeros((16, 16))
+
+
+def _correlation(one: Array, two: Array) -> float:
+    one, two = one - one.mean(), two - two.mean()
+    size = float(np.sqrt((one**2).sum() * (two**2).sum()))
+    return float((one * two).sum()) / size if size > 0 else 0.0
+
+
+def _turned(image: Array) -> Iterator[tuple[str, Array]]:
+    yield "upside down", image[::-1, ::-1]
+    yield "mirrored", image[:, ::-1]
+    yield "flipped", image[::-1]
+    yield "turned by 90 degrees", np.rot90(image)
+    yield "turned by 90 degrees", np.rot90(image, 3)
+
+
+@check(
+    family="images",
+    needs="two cameras",
+    measures="two cameras that show the same",
+    unit="of 255",
+    why="One of the two views is lost; the policy has one eye where it believes to have two.",
+    do=DROP,
+)
+def doubled_cameras(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the thumbnails of each two cameras, frame by frame."""
+    cameras = list(evidence.need_images().items())
+    if len(cameras) < 2:
+        raise NotApplicableError("there is one camera")
+    for place, (name, images) in enumerate(cameras):
+        for other_name, other in cameras[place + 1 :]:
+            both = images.episodes.keys() & other.episodes.keys()
+            same = [n for n in sorted(both) if _are_the_same(images.episodes[n], other.episodes[n])]
+            if same and len(same) > len(both) / 2:
+                yield Fault(
+                    severity="broken",
+                    value=f"{len(same)} episodes",
+                    message=f"{name} and {other_name} show the same in {len(same)} of {len(both)} episodes",
+                    do="leave one out: demorec dataset drop-features {path} --features " + other_name + " --out NEW",
+                )
+                continue
+            for number in same:
+                yield Fault(
+                    severity="broken", episode=number, message=f"{name} and {other_name} show the same in this episode"
+                )
+
+
+def _are_the_same(one: EpisodeThumbnails, two: EpisodeThumbnails) -> bool:
+    if len(one.thumbnails) != len(two.thumbnails) or not len(one.thumbnails) or _spread(one).max() < MAX_BLANK_SPREAD:
+        return False
+    error = np.abs(one.thumbnails.astype(np.int16) - two.thumbnails.astype(np.int16)).mean(axis=(1, 2))
+    return float(np.quantile(error, 0.9)) < MAX_TWIN_DIFFERENCE

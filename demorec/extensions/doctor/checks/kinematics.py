@@ -1,0 +1,218 @@
+"""The recorded EE pose against forward kinematics of the joints, of all frames at once.
+
+Independent of `demorec.robots.kinematics` on purpose: that code made the recorded poses, this one judges them.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.episode.features import EE_POSE
+from demorec.extensions.doctor.arm import arm_of
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import Evidence
+from demorec.robots.urdf import Urdf, UrdfJoint
+
+KNOWN_ERROR_M = 0.05
+"""Error that hands and drivers have: they sag, and joints and pose are read at different times."""
+MIN_ORDER_ERROR_M = 0.002
+MAX_ORDER_RATIO = 0.2
+"""Error with the scalar first, as a share of that with the scalar last, from which it is first."""
+MAX_SIZE_RATIO = 2.0
+"""How many times as large as its model a robot may be built, or as small."""
+MIN_FRAMES = 30
+MAX_FITTED_EPISODES = 20
+MAX_FITTED_FRAMES = 60
+LEVER_M = 0.1
+"""Lever at which a rotation counts beside a distance."""
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+@check(
+    family="numbers",
+    needs="state, EE pose, the robot's URDF",
+    measures="poses that are not those of the joints",
+    unit="mm",
+    why="Joints or pose are wrong: exchanged, in another unit, with another zero or order of the quaternion.",
+    do="compare names, units and zero positions with the URDF",
+)
+def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the EE pose with forward kinematics of the joints, 0.1 m added for each rad of rotation.
+
+    A fixed base, a fixed tool and the robot's size are fitted to each episode, since nothing says which link the pose
+    is of; up to 20 episodes are judged. A hand may be 5 cm off.
+    """
+    poses = _pose_columns(evidence)
+    arm = evidence.once(arm_of)
+    episodes = evidence.need_state(MIN_FRAMES)
+    errors: dict[int, float] = {}
+    others: list[float] = []
+    for episode, state in episodes[:: max(1, len(episodes) // MAX_FITTED_EPISODES)]:
+        joints = {name: column for name, column in zip(arm.joints, state.T, strict=True) if name}
+        pose = _pose(episode.columns, poses)
+        frames = np.flatnonzero(np.isfinite(pose).all(axis=1))
+        if len(frames) >= MIN_FRAMES and np.ptp(pose[frames], axis=0).any():
+            error_m = _fitted_error(arm.urdf, {name: values[frames] for name, values in joints.items()}, pose[frames])
+            errors[episode.number] = float(np.quantile(error_m, 0.9))
+            if not others and errors[episode.number] > MIN_ORDER_ERROR_M:
+                turned = pose[frames][:, [0, 1, 2, 4, 5, 6, 3]]
+                other = _fitted_error(arm.urdf, {name: values[frames] for name, values in joints.items()}, turned)
+                others.append(float(np.quantile(other, 0.9)) / errors[episode.number])
+    if others and others[0] < MAX_ORDER_RATIO:
+        yield Fault(
+            severity="broken",
+            value="w first",
+            message="the quaternion of the EE pose has its scalar first, not last as its names say",
+        )
+        return
+    bad = {number: error for number, error in errors.items() if error > KNOWN_ERROR_M}
+    if len(bad) > len(errors) / 2:
+        error = float(np.median(list(bad.values())))
+        yield Fault(
+            severity="broken",
+            value=f"{1e3 * error:.0f} mm",
+            message=f"the EE pose is {1e3 * error:.0f} mm off the joints",
+        )
+        return
+    for number, error in bad.items():
+        yield Fault(
+            severity="broken",
+            episode=number,
+            value=f"{1e3 * error:.0f} mm",
+            message=f"its EE pose is {1e3 * error:.0f} mm off the joints",
+            do=DROP,
+        )
+
+
+def _pose_columns(evidence: Evidence) -> tuple[str, list[int]]:
+    """The feature with the EE pose, and the places of x, y, z, qx, qy, qz, qw in it."""
+    for feature in (EE_POSE, *evidence.roles.state):
+        names = evidence.roles.columns[feature].elements if feature in evidence.roles.columns else ()
+        words = [name.rpartition(".")[2].rpartition("_")[2] for name in names[-7:]]
+        if len(words) == 7 and set(words) == set(_POSE):
+            return feature, [len(names) - 7 + words.index(word) for word in _POSE]
+    raise NotMeasuredError("no column is known to be the pose of the hand")
+
+
+def _pose(columns: Mapping[str, NDArray[Any]], place: tuple[str, list[int]]) -> Array:
+    feature, order = place
+    return np.asarray(columns[feature].astype(np.float64)[:, order])
+
+
+def _fitted_error(urdf: Urdf, joints: Mapping[str, Array], poses: Array) -> Array:
+    """(T,) metres that are left after the best fit of a base, a tool and a size to some frames."""
+    last = [joint.child for joint in urdf.depth_first() if joint.name in joints][-1]
+    count = len(poses)
+    links = _LinkMatrices(urdf, joints, count)[last]
+    hands = matrices(poses)
+    rows = np.unique(np.linspace(0, count - 1, min(MAX_FITTED_FRAMES, count)).astype(int))
+    return _displacement(_placed(_fit(links[rows], hands[rows]), links), hands)
+
+
+def _transform(numbers: Array) -> Array:
+    """(4, 4) of a rotation vector and a position."""
+    from scipy.spatial.transform import Rotation
+
+    out = np.eye(4)
+    out[:3, :3] = Rotation.from_rotvec(numbers[:3]).as_matrix()
+    out[:3, 3] = numbers[3:]
+    return out
+
+
+def _placed(fit: Array, links: Array) -> Array:
+    """(N, 4, 4) poses of the hand by the links' (N, 4, 4): base, size, tool."""
+    sized = links.copy()
+    sized[:, :3, 3] *= MAX_SIZE_RATIO ** math.tanh(fit[12])
+    return np.asarray(_transform(fit[:6]) @ sized @ _transform(fit[6:12]))
+
+
+def _fit(links: Array, poses: Array) -> Array:
+    """(13,) the base X, the tool Y and the size that bring X @ links @ Y nearest to the poses, all (N, 4, 4)."""
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    def residual(fit: Array) -> Array:
+        error = _placed(fit, links) - poses
+        return np.asarray((error[:, :3] * [LEVER_M, LEVER_M, LEVER_M, 1.0]).reshape(-1))
+
+    best = None
+    for yaw in np.arange(4) * (math.pi / 2):  # from a base that is turned far away the fit may end elsewhere
+        base = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
+        tool = np.linalg.inv(_transform(base) @ links[0]) @ poses[0]
+        start = np.concatenate([base, Rotation.from_matrix(tool[:3, :3]).as_rotvec(), tool[:3, 3], [0.0]])
+        found = least_squares(residual, start)
+        best = found if best is None or found.cost < best.cost else best
+        if best.cost < 1e-3 * LEVER_M * len(links):
+            break
+    assert best is not None
+    return np.asarray(best.x)
+
+
+def matrices(poses: Array) -> Array:
+    """(T, 4, 4) of poses (T, 7): position, quaternion xyzw (need not be of unit length)."""
+    quat = poses[:, 3:] / np.maximum(np.linalg.norm(poses[:, 3:], axis=1, keepdims=True), 1e-12)
+    x, y, z, w = quat.T
+    out = np.zeros((len(poses), 4, 4))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
+    out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    out[:, :3, 3] = poses[:, :3]
+    out[:, 3, 3] = 1.0
+    return out
+
+
+class _LinkMatrices:
+    """Forward kinematics of some joint positions: each link's poses are computed once, when they are asked for.
+
+    Args:
+        urdf: The joint tree.
+        joint_position: Joint name -> (T,) positions, rad or m; joints left out are at 0.
+        count: T.
+    """
+
+    def __init__(self, urdf: Urdf, joint_position: Mapping[str, Array], count: int) -> None:
+        self._joint_position = joint_position
+        self._above = {joint.child: joint for joint in urdf.joints}
+        self._known = {urdf.root: np.broadcast_to(np.eye(4), (count, 4, 4))}
+
+    def __getitem__(self, link: str) -> Array:
+        """(T, 4, 4) base_from_link; KeyError when there is no such link."""
+        if link not in self._known:
+            joint = self._above[link]
+            self._known[link] = self[joint.parent] @ self._parent_from_child(joint)
+        return self._known[link]
+
+    def _parent_from_child(self, joint: UrdfJoint) -> Array:
+        """(T, 4, 4), or (4, 4) where a joint does not move."""
+        position = self._joint_position.get(joint.name)
+        if position is None or joint.kind == "fixed":
+            return joint.parent_from_joint.matrix()
+        return _joint_matrices(joint, position)
+
+
+def _joint_matrices(joint: UrdfJoint, position: Array) -> Array:
+    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m); turns are by Rodrigues' formula."""
+    at_zero, along = joint.parent_from_joint.matrix(), position[:, None, None]
+    x, y, z = joint.axis
+    if joint.kind == "prismatic":
+        way = np.zeros((4, 4))
+        way[:3, 3] = joint.axis
+        return np.asarray(at_zero + along * (at_zero @ way))
+    cross = np.array([[0, -z, y, 0], [z, 0, -x, 0], [-y, x, 0, 0], [0, 0, 0, 0]])
+    turned = at_zero @ cross
+    return np.asarray(at_zero + np.sin(along) * turned + (1 - np.cos(along)) * (turned @ cross))
+
+
+def _displacement(a: Array, b: Array) -> Array:
+    """(T,) metres between two transforms (T, 4, 4): of the origins, plus what the rotation moves at `LEVER_M`."""
+    # |R - S| (Frobenius) = 2 sqrt(2) sin(angle / 2): exact for small angles, unlike the arc cosine of the trace.
+    chord = np.sqrt(((a[:, :3, :3] - b[:, :3, :3]) ** 2).sum(axis=(1, 2)))
+    angle = 2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0))
+    return np.asarray(np.linalg.norm(a[:, :3, 3] - b[:, :3, 3], axis=1) + LEVER_M * angle)

@@ -1,0 +1,69 @@
+"""Checks of the other measured columns: velocities, efforts, forces, poses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.robust import runs
+
+MIN_LIVE_SHARE = 0.5
+"""Share of the moving frames outside the rest in which a sensor changes that is not allowed to rest."""
+MIN_REST_S = 0.3
+MIN_BROKEN_S = 1.0
+MIN_SPEED = 0.3
+"""Share of the root mean square speed above which the robot counts as moving."""
+
+
+@check(
+    family="numbers",
+    needs="state, other measured columns",
+    measures="sensors that stop changing",
+    unit="s",
+    why="The policy sees a force or a speed that is not there.",
+    do=DROP,
+)
+def frozen_sensors(evidence: Evidence) -> Iterator[Fault]:
+    """Find measured columns that repeat to the last bit while the robot moves, though they usually change.
+
+    A sensor may rest at zero, as a contact sensor does, or where it rests in half of the moving frames.
+    """
+    episodes = evidence.need_state(8)
+    measured = evidence.roles.having("sensor", "velocity", "pose")
+    names = [name for name in measured if name not in evidence.roles.state and evidence.roles.columns[name].is_vector]
+    if not names:
+        raise NotMeasuredError("there are no measured columns beside the state")
+    for episode, _ in episodes:
+        for name in names:
+            if name in episode.columns and (rest := _longest_rest(episode, episode.columns[name])) is not None:
+                first, end, moving = rest
+                seconds = evidence.seconds(moving)
+                if seconds > MIN_REST_S:
+                    yield Fault(
+                        severity="broken" if seconds > MIN_BROKEN_S else "look",
+                        episode=episode.number,
+                        frames=(first, end),
+                        value=f"{seconds:.1f} s",
+                        message=f"{name} keeps its values for {seconds:.1f} s while the robot moves",
+                    )
+
+
+def _longest_rest(episode: EpisodeEvidence, table: Array) -> tuple[int, int, int] | None:
+    """(first frame, last frame, moving frames) of the longest rest; None where the sensor often rests."""
+    speed = episode.speed
+    moves = speed > MIN_SPEED * np.sqrt((speed**2).mean()) if speed.any() else np.zeros(len(speed), dtype=np.bool_)
+    same = (table[1:] == table[:-1]).all(axis=1) & table[1:].any(axis=1)
+    counts = np.concatenate([[0], np.cumsum(same & moves)])
+    found = [(int(counts[end] - counts[first]), first, end) for first, end in runs(same | ~moves)]
+    moving, first, end = max(found, default=(0, 0, 0))
+    outside = np.ones(len(same), dtype=np.bool_)
+    outside[first:end] = False
+    changes = (table[1:] != table[:-1]).any(axis=1) & moves & outside
+    if not moving or changes.sum() < MIN_LIVE_SHARE * (moves & outside).sum():
+        return None
+    return first, end, moving

@@ -1,0 +1,254 @@
+"""Checks of a dataset's statistics, by which training normalises: of the whole dataset and of each episode."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.episode_records import OLD_STATS, episode_statistics
+from demorec.datasets.lerobot.files import open_table, rows_in
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import STATS_PATH
+from demorec.datasets.lerobot.stats import NAMES, QUANTILES
+from demorec.extensions.doctor.base import Fault, Severity, check
+from demorec.extensions.doctor.checks.files import folder_of
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import Evidence
+
+_RENUMBERED = ("index", "episode_index")
+"""Columns that LeRobot's delete, split and merge renumber without new statistics."""
+_COUNTED = (*_RENUMBERED, "task_index")
+MAX_ERROR = 0.02
+"""Error, in standard deviations, that statistics may have: histograms and sampling are a hundredth off."""
+MIN_BROKEN_ERROR = 0.2
+"""Error from which normalised values are wrong by a fifth of their spread."""
+MIN_DEVIATION = 1e-4
+"""Standard deviation by which an element that hardly moves is measured."""
+MAX_SUMMED = 4000
+"""Rows over which the roundings of a float32 sum add up: an episode of more than a minute at 60 fps."""
+FLOAT32_SUM = 0.25
+"""Error of a float32 sum of N equal values, in N roundings of its result: they round alike while the sum grows."""
+FLOAT32_VARIANCE = 3 * FLOAT32_SUM
+"""Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
+Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
+"""Episode -> feature -> quantity -> its numbers."""
+Ranges = Mapping[str, Array]
+"""Quantile -> (2, D) lowest and highest value that it may have."""
+
+
+@check(
+    family="files",
+    needs="a LeRobot dataset",
+    measures="statistics that are not those of the rows",
+    unit="standard deviations",
+    why="Training normalises by them: state and action are shifted and squeezed.",
+    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW computes them again",
+)
+def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
+    """Recompute minimum, maximum, mean, deviation, count and quantiles of every column, and of each episode.
+
+    A quantile may also be the mean of the episodes' quantiles, as LeRobot computes it, or between them, as its merge
+    leaves it. The deviation of a joint that is parked far from zero may have the rounding of LeRobot's float32.
+    """
+    folder = folder_of(evidence)
+    stats_path = OLD_STATS if folder.info.is_old else STATS_PATH
+    if not (evidence.path / stats_path).exists():
+        raise NotMeasuredError(f"{stats_path} is missing")
+    known = {} if folder.info.is_old else folder.statistics
+    unused = (*_RENUMBERED, *(name for name in evidence.roles.having("label") if name not in known))
+    names = [name for name, f in folder.info.features.items() if f.is_numeric and name not in unused]
+    yield from _of_episodes(evidence, folder, names)
+    if folder.info.is_old:
+        return  # training aggregates those of the episodes
+    if evidence.unreadable:
+        raise NotMeasuredError(f"the whole dataset's, since {len(evidence.unreadable)} of its episodes cannot be read")
+    stats = folder.statistics
+    for name in names:
+        episodes = [_vectors(folder, name, each.columns[name]) for each in evidence.episodes]
+        if not episodes or any(not np.isfinite(values).all() for values in episodes):
+            continue  # without these numbers there is nothing to compare, and `missing_numbers` names them
+        ranges = [_quantile_ranges(values) for values in episodes]
+        count = sum(len(each.columns[name]) for each in evidence.episodes)
+        error, quantity = _largest_error(stats.get(name), np.concatenate(episodes), count, ranges)
+        if error > MAX_ERROR:
+            yield Fault(
+                severity="look" if quantity == "count" else _severity(error, name),
+                value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
+                message=f"the {quantity} of {name} in {STATS_PATH} is not that of the rows",
+            )
+    if unknown := [name for name in stats if name not in folder.info.features]:
+        yield Fault(severity="look", message=f"{STATS_PATH} has {', '.join(unknown[:3])}, which is not a feature")
+    yield from _image_forms(folder)
+
+
+def _severity(error: float, name: str) -> Severity:
+    return "broken" if error > MIN_BROKEN_ERROR and name not in (*_COUNTED, "timestamp", "frame_index") else "look"
+
+
+def _of_episodes(evidence: Evidence, folder: LeRobotFolder, names: Sequence[str]) -> Iterator[Fault]:
+    """Compare the statistics of each episode, and yield the first error in each."""
+    entries = _old_entries(folder, names) if folder.info.is_old else _table_entries(folder, names)
+    place = OLD_STATS if folder.info.is_old else "the table of episodes"
+    for episode in evidence.episodes:
+        for name, stored in entries.get(episode.number, {}).items():
+            values = _vectors(folder, name, episode.columns[name])
+            if not np.isfinite(values).all():
+                continue
+            error, quantity = _largest_error(stored, values, len(episode.columns[name]), ())
+            if error > MAX_ERROR:
+                yield Fault(
+                    severity="look" if name in _COUNTED or quantity == "count" else _severity(error / 2, name),
+                    episode=episode.number,
+                    value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
+                    message=f"the {quantity} of {name} in {place} is not that of its rows",
+                )
+                break
+
+
+def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
+    """Read the statistics of the episodes before v3.0."""
+    found: dict[int, dict[str, Mapping[str, Any]]] = {}
+    for number, name, stored in episode_statistics(folder, names):
+        found.setdefault(number, {})[name] = stored
+    return found
+
+
+def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
+    """Read the statistics in the table of episodes, as far as it has them."""
+    tables = folder.episode_tables
+    there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
+    columns = {name: [q for q in NAMES if f"stats/{name}/{q}" in there] for name in names}
+    known = [f"stats/{name}/{quantity}" for name, quantities in columns.items() for quantity in quantities]
+    rows = rows_in(folder.root, "meta/episodes", known) if known else ()
+    return {
+        place.episode_index: {
+            name: {quantity: row[f"stats/{name}/{quantity}"] for quantity in quantities}
+            for name, quantities in columns.items()
+            if quantities
+        }
+        for place, row in zip(folder.listed, rows, strict=False)
+    }
+
+
+def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
+    """(N, D) rows; of arrays of several dimensions their last one, as LeRobot's statistics."""
+    return np.asarray(rows, dtype=np.float64).reshape(-1, folder.info.features[name].shape[-1])
+
+
+def _quantile_ranges(values: Array) -> Ranges:
+    """The values of the neighbouring ranks: LeRobot reads quantiles off a histogram, others interpolate."""
+    ordered, last = np.sort(values, axis=0), len(values) - 1
+    ranks = {name: share * last for name, share in QUANTILES.items()}
+    return {
+        name: ordered[[max(math.ceil(rank) - 1, 0), min(math.floor(rank) + 1, last)]] for name, rank in ranks.items()
+    }
+
+
+def _largest_error(
+    stored: Mapping[str, Any] | None, values: Array, count: int, episodes: Sequence[Ranges]
+) -> tuple[float, str]:
+    """The largest error of a feature's quantities in standard deviations, and its quantity.
+
+    Args:
+        stored: Quantity -> its numbers.
+        values: (N, D) rows.
+        count: Rows.
+        episodes: Quantiles of the episodes, between which those of the set may be.
+    """
+    if not stored:
+        return math.inf, "mean"
+    true = {quantity: getattr(values, quantity)(axis=0) for quantity in ("min", "max", "mean", "std")}
+    scale = np.maximum(true["std"], MIN_DEVIATION)
+    roundings = min(len(values), MAX_SUMMED) * float(np.finfo(np.float32).eps)
+    variance_error = FLOAT32_VARIANCE * roundings * (values**2).mean(axis=0)
+    between = {quantity: _between(quantity, values, episodes) for quantity in QUANTILES}
+    worst = (0.0, "")
+    for quantity in (*true, "count", *QUANTILES):
+        found = numbers_of(stored.get(quantity))
+        if quantity not in stored and quantity in QUANTILES:
+            continue  # older writers have no quantiles
+        if quantity == "count":
+            error = float(np.abs(found - count).max(initial=0.0)) if len(found) else math.inf
+        elif found.shape != scale.shape:
+            error = math.inf
+        elif quantity == "std":
+            low = np.sqrt(np.maximum(true["std"] ** 2 - variance_error, 0.0))
+            high = np.sqrt(true["std"] ** 2 + variance_error)
+            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
+        elif quantity in between:
+            low, high = between[quantity]
+            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
+        else:
+            steps = FLOAT32_SUM * roundings if quantity == "mean" else 4 * float(np.finfo(np.float32).eps)
+            slack = steps * np.abs(true[quantity])
+            error = float((np.maximum(np.abs(found - true[quantity]) - slack, 0.0) / scale).max())
+        worst = max(worst, (error, quantity))
+    return worst
+
+
+def _between(quantity: str, values: Array, episodes: Sequence[Ranges]) -> tuple[Array, Array]:
+    """(D,) lowest and highest value that a quantile may have."""
+    low, high = _quantile_ranges(values)[quantity]
+    width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
+    lows = [low, *(each[quantity][0] for each in episodes)]
+    highs = [high, *(each[quantity][1] for each in episodes)]
+    return np.min(lows, axis=0) - width, np.max(highs, axis=0) + width
+
+
+def numbers_of(value: Any) -> Array:
+    """(N,) numbers of an entry in the statistics, however nested; (0,) for anything else, text of numbers included."""
+    try:
+        found = np.asarray(value)
+    except (ValueError, OverflowError):
+        return np.zeros(0)
+    return found.reshape(-1).astype(np.float64) if found.dtype.kind in "biuf" else np.zeros(0)
+
+
+def _image_forms(folder: LeRobotFolder) -> Iterator[Fault]:
+    """Find statistics of cameras that are not finite numbers."""
+    for name, entry in folder.statistics.items():
+        if name in folder.info.features and folder.info.features[name].is_camera:
+            bad = [q for q in NAMES if q in entry and not _is_finite(entry[q])]
+            if bad:
+                yield Fault(severity="broken", message=f"{', '.join(bad)} of {name} in {STATS_PATH} is not a number")
+
+
+def _is_finite(value: Any) -> bool:
+    found = numbers_of(value)
+    return bool(len(found) and np.isfinite(found).all())
+
+
+@check(
+    family="files",
+    needs="images, a LeRobot dataset of v3.0",
+    measures="mean colours that are not those of the images",
+    unit="of 1",
+    why="Images are normalised by them.",
+    do="demorec dataset select {path} --where 'num_frames > 0' --decode --out NEW computes them again",
+)
+def wrong_colours(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the mean colour of each camera in meta/stats.json with that of the decoded images.
+
+    Writers sample images, so that 0.08 of the full range is allowed.
+    """
+    folder = folder_of(evidence)
+    cameras = evidence.need_images()
+    if folder.info.is_old or not (evidence.path / STATS_PATH).exists():
+        raise NotMeasuredError(f"there is no {STATS_PATH} of v3.0")
+    for camera, images in cameras.items():
+        stored = numbers_of(folder.statistics.get(camera, {}).get("mean"))
+        if not images.episodes or images.errors:
+            continue
+        weights = [len(each.frames) for each in images.episodes.values()]
+        true = np.average([each.colour for each in images.episodes.values()], axis=0, weights=weights)
+        error = float(np.abs(stored - true).max()) if stored.shape == true.shape else math.inf
+        if error > 0.08:
+            yield Fault(
+                severity="broken",
+                value=f"{error:.2f} of 1",
+                message=f"the mean colour of {camera} in {STATS_PATH} is {error:.2f} off that of the images",
+            )

@@ -1,0 +1,198 @@
+"""Checks of time: gaps, doubled and early timestamps, another rate than stated, old samples."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.base import DROP, Fault, check
+from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+
+MAX_GAP_PERIODS = 2.5
+"""Periods between two frames above which frames are missing between them; one late frame takes two."""
+MAX_RATE_ERROR = 0.1
+"""Difference of the measured rate from the stated one, as a share of it, above which motion has a wrong speed."""
+MIN_FRAMES = 5
+MAX_AGE_S = 0.2
+"""Age of a sample or an image, in seconds, above which a policy sees the past: people react in as much time."""
+
+
+def _timed(evidence: Evidence) -> Iterator[tuple[EpisodeEvidence, Array]]:
+    found = [(each, each.time_s) for each in evidence.episodes if each.time_s is not None and len(each.time_s) >= 2]
+    if not found:
+        raise NotMeasuredError("there are no timestamps")
+    yield from found
+
+
+@check(
+    family="time",
+    needs="timestamps",
+    measures="frames that are missing between others",
+    unit="s",
+    why="The arm moves on during the gap: the action of the frame before it seems to do more than it did.",
+    do="look at it: demorec view {path} --episodes {episode}; then cut or drop it: " + DROP,
+)
+def time_gaps(evidence: Evidence) -> Iterator[Fault]:
+    """Find the longest time between two frames of each episode, in periods of the stated rate."""
+    for episode, times in _timed(evidence):
+        steps = np.diff(times)
+        if _is_of_other_rate(steps, evidence.fps):
+            continue
+        gaps = np.flatnonzero(steps * evidence.fps > MAX_GAP_PERIODS)
+        if len(gaps):
+            longest = int(gaps[np.argmax(steps[gaps])])
+            yield Fault(
+                severity="broken",
+                episode=episode.number,
+                frames=(int(gaps[0]) + 1, int(gaps[-1]) + 1),
+                value=f"{steps[longest]:.2f} s",
+                message=f"{steps[longest]:.2f} s are missing before frame {longest + 1}"
+                + (f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""),
+            )
+
+
+def _is_of_other_rate(steps: Array, fps: float) -> bool:
+    return abs(float(np.median(steps)) * fps - 1) > 0.5
+
+
+@check(
+    family="time",
+    needs="timestamps",
+    measures="timestamps that repeat or run backwards",
+    unit="frames",
+    why="LeRobot finds images by the time of a row: the wrong ones, or none.",
+    do=DROP,
+)
+def time_order(evidence: Evidence) -> Iterator[Fault]:
+    """Count the frames whose timestamp is not after that of the frame before."""
+    for episode, times in _timed(evidence):
+        wrong = np.flatnonzero(np.diff(times) <= 0)
+        if len(wrong):
+            yield Fault(
+                severity="broken",
+                episode=episode.number,
+                frames=(int(wrong[0]) + 1, int(wrong[-1]) + 1),
+                value=f"{len(wrong)} frames",
+                message=f"the timestamps of {len(wrong)} frames repeat or run backwards, first at frame {wrong[0] + 1}",
+            )
+
+
+@check(
+    family="time",
+    needs="timestamps",
+    measures="another rate than the stated one",
+    unit="Hz",
+    why="Policies act at the stated rate: they replay the motion faster or slower than it was shown.",
+    do="set fps to the measured rate in the recorder, and record or convert again",
+)
+def frame_rate(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the median rate of the timestamps with the stated one, over the set and for each episode."""
+    rates = {e.number: 1 / step for e, t in _timed(evidence) if len(t) >= MIN_FRAMES and (step := _period(t)) > 0}
+    if not rates:
+        raise NotMeasuredError(f"no episode has {MIN_FRAMES} frames with timestamps")
+    wrong = {number: rate for number, rate in rates.items() if abs(rate / evidence.fps - 1) > MAX_RATE_ERROR}
+    if len(wrong) > len(rates) / 2:
+        rate = float(np.median(list(wrong.values())))
+        yield Fault(
+            severity="broken",
+            value=f"{rate:.3g} Hz",
+            message=f"the frames are {1 / rate:.3g} s apart, {rate:.3g} Hz; stated are {evidence.fps:g} Hz",
+        )
+        return
+    for number, rate in wrong.items():
+        yield Fault(
+            severity="broken",
+            episode=number,
+            value=f"{rate:.3g} Hz",
+            message=f"its frames come at {rate:.3g} Hz, {evidence.fps:g} Hz are stated",
+            do=DROP,
+        )
+
+
+def _period(times: Array) -> float:
+    return float(np.median(np.diff(times)))
+
+
+@check(
+    family="time",
+    needs="timestamps",
+    measures="measured timestamps off the grid of the rate",
+    unit="ms",
+    why="LeRobot refuses timestamps that are more than 0.1 ms off, and decodes the image of another moment.",
+    do="write frame_index / fps as the timestamp when converting; measured times belong in a column of their own",
+)
+def time_grid(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the timestamps of a dataset with frame_index / fps, as LeRobot does when it loads one."""
+    if evidence.folder is None:
+        raise NotApplicableError("recordings have times of their own")
+    from demorec.datasets.lerobot.episode_table import are_on_grid
+
+    worst: dict[int, float] = {}
+    for episode, times in _timed(evidence):
+        first = float(times[0])
+        if not are_on_grid(times, int(evidence.fps), first if evidence.folder.info.is_old else 0.0):
+            worst[episode.number] = float(np.abs(times - times[0] - np.arange(len(times)) / evidence.fps).max())
+            worst[episode.number] = max(worst[episode.number], abs(first))
+    if len(worst) > max(1, len(evidence.episodes) / 2):
+        largest = max(worst.values())
+        yield Fault(
+            severity="look",
+            value=f"{1000 * largest:.1f} ms",
+            message=f"timestamps of {len(worst)} episodes are off frame_index / fps by up to {1000 * largest:.1f} ms",
+        )
+        return
+    for number, error in worst.items():
+        yield Fault(
+            severity="broken",
+            episode=number,
+            value=f"{1000 * error:.1f} ms",
+            message=f"its timestamps are up to {1000 * error:.1f} ms off frame_index / fps",
+            do=DROP,
+        )
+
+
+@check(
+    family="time",
+    needs="timestamps of samples and images",
+    measures="samples and images older than their frame",
+    unit="s",
+    why="The policy sees the past: it reacts late, or to a scene that is gone.",
+    do=DROP,
+)
+def sample_age(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the timestamps of samples and images with those of their frames, stream by stream."""
+    if not any(episode.image_ages_s for episode in evidence.episodes):
+        raise NotApplicableError("samples have no timestamps of their own")
+    for episode in evidence.episodes:
+        for name, ages in episode.image_ages_s.items():
+            old = np.abs(ages) > MAX_AGE_S
+            if old.any():
+                frames = np.flatnonzero(old)
+                worst = float(np.nanmax(np.abs(ages)))
+                yield Fault(
+                    severity="broken" if old.mean() > 0.2 or worst > 5 * MAX_AGE_S else "look",
+                    episode=episode.number,
+                    frames=(int(frames[0]), int(frames[-1])),
+                    value=f"{worst:.2f} s",
+                    message=f"{name} is up to {worst:.2f} s away from its frame, in {len(frames)} frames",
+                )
+
+
+@check(
+    family="time",
+    needs="a recorder that counts its losses",
+    measures="frames and images lost while recording",
+    unit="frames",
+    why="The disk, the network or the camera was too slow: what is left is not at the stated rate.",
+    do="record at a lower rate or size, or on another disk",
+)
+def recording_losses(evidence: Evidence) -> Iterator[Fault]:
+    """Report the frames and images that the recorder itself counted as dropped."""
+    if evidence.folder is not None:
+        raise NotApplicableError("LeRobot datasets do not state what was lost")
+    for episode in evidence.episodes:
+        if episode.drops:
+            yield Fault(severity="look", episode=episode.number, value=episode.drops, message=f"lost: {episode.drops}")

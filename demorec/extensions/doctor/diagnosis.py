@@ -1,0 +1,152 @@
+"""The diagnosis of a set of episodes: findings, a verdict and a score for each episode, and what was not measured."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from demorec.episode.roles import Role
+from demorec.extensions.doctor.base import RANK, DiagnosedFault, FaultCheck, Verdict
+from demorec.extensions.doctor.checks import FAMILIES, all_checks
+from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.scores import score_episodes
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeVerdict:
+    """The verdict on one episode.
+
+    Attributes:
+        episode: Its number.
+        verdict: The worst of its findings.
+        score: 1 where nothing is unusual; 0 where it is broken.
+        reasons: Sentences, the worst first.
+    """
+
+    episode: int
+    verdict: Verdict
+    score: float
+    reasons: tuple[str, ...]
+
+    @property
+    def rank(self) -> tuple[int, float, int]:
+        """Key that sorts the worst first."""
+        return -RANK[self.verdict], self.score, self.episode
+
+
+@dataclass(frozen=True, kw_only=True)
+class Diagnosis:
+    """What the doctor found.
+
+    Attributes:
+        path: Of the set.
+        taken: Column -> the role that it was taken for.
+        findings: The worst first.
+        episodes: The worst first.
+        not_measured: Check -> why it could not be made.
+        num_checks: Checks that were made.
+        num_frames: Frames that were read.
+        cameras: Names of the cameras whose images were decoded.
+    """
+
+    path: Path
+    taken: Mapping[str, Role | None]
+    findings: tuple[DiagnosedFault, ...]
+    episodes: tuple[EpisodeVerdict, ...]
+    not_measured: Mapping[str, str]
+    num_checks: int = 0
+    num_frames: int = 0
+    cameras: tuple[str, ...] = ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """The worst of the findings."""
+        return max((finding.severity for finding in self.findings), key=RANK.__getitem__, default="good")
+
+    def to_json(self) -> dict[str, Any]:
+        """As docs/checks.md describes it."""
+        return {
+            "verdict": self.verdict,
+            "taken": dict(self.taken),
+            "findings": [
+                {
+                    "check": finding.check,
+                    "severity": finding.severity,
+                    "episode": finding.episode,
+                    "frames": None if finding.frames is None else list(finding.frames),
+                    "value": finding.value,
+                    "message": finding.message,
+                    "why": finding.why,
+                    "do": finding.do,
+                }
+                for finding in self.findings
+            ],
+            "episodes": [
+                {
+                    "episode": each.episode,
+                    "verdict": each.verdict,
+                    "score": round(each.score, 4),
+                    "reasons": list(each.reasons),
+                }
+                for each in self.episodes
+            ],
+            "not_measured": [{"check": name, "reason": reason} for name, reason in self.not_measured.items()],
+        }
+
+
+def diagnose(
+    evidence: Evidence, checks: Sequence[FaultCheck] | None = None, extra: Sequence[DiagnosedFault] = ()
+) -> Diagnosis:
+    """Make all checks, or some.
+
+    Args:
+        evidence: The set.
+        checks: Which ones are made; all by default.
+        extra: Findings of others about the same set, such as those of its files' integrity.
+
+    Raises:
+        ResourceError: This machine cannot make one.
+    """
+    findings = list(extra)
+    not_measured: dict[str, str] = {}
+    made = 0
+    for check in all_checks() if checks is None else checks:
+        found, reason = check.run(evidence)
+        findings += found
+        made += reason == ""
+        if reason:
+            not_measured[check.name] = reason
+    order = {check.name: FAMILIES.index(check.family) for check in all_checks()}
+    findings.sort(
+        key=lambda f: (-RANK[f.severity], order.get(f.check, 0), f.check, -1 if f.episode is None else f.episode)
+    )
+    return Diagnosis(
+        path=evidence.path,
+        taken=dict(evidence.taken()),
+        findings=tuple(findings),
+        episodes=_verdicts(evidence, findings),
+        not_measured=not_measured,
+        num_checks=made,
+        num_frames=sum(episode.length for episode in evidence.episodes),
+        cameras=tuple(evidence.cameras),
+    )
+
+
+def _verdicts(evidence: Evidence, findings: Sequence[DiagnosedFault]) -> tuple[EpisodeVerdict, ...]:
+    """The verdict on each episode, the worst first."""
+    found = []
+    for number, score in score_episodes(evidence).items():
+        own = [finding for finding in findings if finding.episode == number]
+        verdict: Verdict = max((finding.severity for finding in own), key=RANK.__getitem__, default="good")
+        reasons = [finding.message for finding in own] + [reason.text for reason in score.reasons]
+        found.append(
+            EpisodeVerdict(
+                episode=number,
+                verdict=verdict,
+                score=0.0 if verdict == "broken" else score.score,
+                reasons=tuple(dict.fromkeys(reasons)),
+            )
+        )
+    return tuple(sorted(found, key=lambda each: each.rank))

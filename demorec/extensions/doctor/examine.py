@@ -1,0 +1,232 @@
+"""Examination of a path: the sets that it holds, how each is read, and the diagnosis in words."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from demorec.cli.shared.output import counted
+
+if TYPE_CHECKING:
+    from demorec.check.base import Result
+    from demorec.check.report import SubjectReport
+    from demorec.extensions.doctor.base import DiagnosedFault, FaultCheck
+    from demorec.extensions.doctor.diagnosis import Diagnosis
+    from demorec.extensions.doctor.evidence import Evidence
+    from demorec.extensions.doctor.from_dataset import ReadOptions
+
+MAX_FINDINGS = 10
+"""Findings that are printed: the worst ones come first."""
+MAX_EPISODES = 20
+_MAX_NUMBERS = 12
+"""Episodes of one finding that are listed by number."""
+_WIDTH = 110
+
+
+def examine(
+    path: Path,
+    options: ReadOptions,
+    *,
+    reports: Sequence[SubjectReport] = (),
+    checks: Sequence[FaultCheck] | None = None,
+    earlier: Sequence[Evidence] = (),
+) -> tuple[Diagnosis, Evidence | None]:
+    """Diagnose a dataset, a run, or recordings; returns the evidence too, None where nothing can be opened.
+
+    Args:
+        path: What the user named.
+        options: How it is read.
+        reports: The integrity of its files, which becomes findings.
+        checks: Which ones are made; all by default.
+        earlier: Sets that the user named before it.
+    """
+    from demorec.core.errors import ExportError
+    from demorec.extensions.doctor.checks import all_checks
+    from demorec.extensions.doctor.diagnosis import Diagnosis, diagnose
+    from demorec.runs.find import find
+
+    chosen = all_checks() if checks is None else checks
+    extra = list(_integrity_findings(reports))
+    try:
+        evidence = _evidence(path, options)
+    except ExportError as error:
+        failed = Diagnosis(path=path, taken={}, findings=(_unopened(error, path), *extra), episodes=(), not_measured={})
+        return failed, None
+    evidence.earlier = earlier
+    found = find(path)
+    diagnosis = diagnose(evidence, chosen, extra)
+    if found.kind == "run" and evidence.folder is None:
+        diagnosis = _with_dataset(diagnosis, path, options, chosen)
+    integrity = [result for report in reports for result in report.results]
+    unmade = {result.check: result.detail for result in integrity if _is_unmade(result)}
+    passed = {result.check for result in integrity if result.level == "pass"}
+    not_measured = {**diagnosis.not_measured, **unmade}
+    return replace(diagnosis, not_measured=not_measured, num_checks=diagnosis.num_checks + len(passed)), evidence
+
+
+def _evidence(path: Path, options: ReadOptions) -> Evidence:
+    from demorec.extensions.doctor.from_dataset import evidence_of_dataset
+    from demorec.extensions.doctor.from_recordings import evidence_of_recordings
+    from demorec.mcap import open_recording
+    from demorec.runs.find import find
+
+    found = find(path)
+    if found.kind == "dataset":
+        return evidence_of_dataset(path, options)
+    rollouts = found.failed if found.kind == "evaluation" else ()  # whose failures are results, not rejects
+    return evidence_of_recordings(path, (*found.recordings, *rollouts), open_recording, options)
+
+
+def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[FaultCheck]) -> Diagnosis:
+    """Add the findings about the files of a run's own dataset; its numbers and images are those of the recordings."""
+    from demorec.core.errors import ExportError
+    from demorec.extensions.doctor.diagnosis import diagnose
+    from demorec.extensions.doctor.from_dataset import evidence_of_dataset
+    from demorec.runs.find import find
+    from demorec.runs.run_file import DATASET
+
+    path = run / DATASET
+    if find(path).kind != "dataset":
+        return diagnosis
+    try:
+        evidence = evidence_of_dataset(path, replace(options, images=False))
+    except ExportError as error:
+        return replace(diagnosis, findings=(_unopened(error, path), *diagnosis.findings))
+    about_files = [check for check in chosen if check.family == "files"]
+    files = diagnose(evidence, about_files)
+    names = {check.name for check in about_files}
+    unmade = {name: why for name, why in diagnosis.not_measured.items() if name not in names}
+    found = (replace(each, episode=None, message=f"{DATASET}: {_of(each)}{each.message}") for each in files.findings)
+    return replace(diagnosis, findings=(*found, *diagnosis.findings), not_measured={**unmade, **files.not_measured})
+
+
+def _of(finding: DiagnosedFault) -> str:
+    return "" if finding.episode is None else f"episode {finding.episode}: "
+
+
+def _unopened(error: Exception, path: Path) -> DiagnosedFault:
+    from demorec.extensions.doctor.base import DiagnosedFault
+
+    return DiagnosedFault(
+        check="unreadable_episodes",
+        severity="broken",
+        message=str(error).removesuffix(f": {path}"),
+        why="Nothing of it can be read.",
+        do="complete the recording or the download, or restore the file",
+    )
+
+
+def _integrity_findings(reports: Iterable[SubjectReport]) -> Iterator[DiagnosedFault]:
+    """What the checks of files found, as findings; those of a recording belong to its episode."""
+    from demorec.extensions.doctor.base import DiagnosedFault
+
+    recordings = [report.path for report in reports if report.kind == "recording"]
+    for report in reports:
+        number = recordings.index(report.path) if report.kind == "recording" else None
+        for result in report.results:
+            if result.level in ("warn", "fail"):
+                value = "" if result.value is None else f"{result.value:.4g} {result.unit}".strip()
+                yield DiagnosedFault(
+                    check=result.check,
+                    severity="broken" if result.level == "fail" else "look",
+                    episode=number,
+                    frames=None if result.frame is None else (result.frame, result.frame),
+                    value=value,
+                    message=f"{report.path.name}: {result.detail or value}",
+                    why=result.why,
+                    do=result.do.format(path=report.path),
+                )
+
+
+def _is_unmade(result: Result) -> bool:
+    from demorec.check.base import BLOCKED, NOTHING
+
+    return result.level == "skip" and result.detail not in (BLOCKED, NOTHING)
+
+
+def lines_of(diagnosis: Diagnosis, *, everything: bool = False) -> Iterator[str]:
+    """The diagnosis for people: roles, verdict, the worst findings with what to do, and the episodes, worst first."""
+    yield f"{diagnosis.path}: {_taken(diagnosis)}"
+    yield _verdict(diagnosis)
+    if diagnosis.not_measured:
+        yield "not measured: " + "; ".join(
+            f"{', '.join(names)} ({reason})" for reason, names in _by_reason(diagnosis.not_measured).items()
+        )
+    folded = list(_folded(diagnosis.findings))
+    for same in folded if everything else folded[:MAX_FINDINGS]:
+        yield from _finding(same)
+    if len(folded) > MAX_FINDINGS and not everything:
+        yield f"and {counted(len(folded) - MAX_FINDINGS, 'more finding')} (--all prints them)"
+    yield from _episodes(diagnosis, everything=everything)
+
+
+def _taken(diagnosis: Diagnosis) -> str:
+    """Which column was taken for what."""
+    roles: dict[str, list[str]] = {}
+    for column, role in diagnosis.taken.items():
+        roles.setdefault(role or "no role", []).append(column)
+    parts = [f"{role} {', '.join(columns)}" for role, columns in roles.items() if role != "no role"]
+    parts += [f"no {role}: --{role} COLUMN names it" for role in ("state", "action") if role not in roles]
+    if "no role" in roles:
+        parts.append(f"no role, so not looked at: {', '.join(roles['no role'])}")
+    return "; ".join(parts)
+
+
+def _verdict(diagnosis: Diagnosis) -> str:
+    count = len(diagnosis.episodes)
+    amount = f"{counted(count, 'episode')}, {counted(diagnosis.num_frames, 'frame')}"
+    amount += f", {counted(len(diagnosis.cameras), 'camera')}" if diagnosis.cameras else ""
+    if diagnosis.verdict == "good":
+        return f"good: {amount}; {counted(diagnosis.num_checks, 'check')} found nothing"
+    bad = {word: sum(each.verdict == word for each in diagnosis.episodes) for word in ("broken", "look", "good")}
+    return f"{diagnosis.verdict}: {amount}; " + ", ".join(f"{number} {word}" for word, number in bad.items() if number)
+
+
+def _by_reason(not_measured: Mapping[str, str]) -> dict[str, list[str]]:
+    found: dict[str, list[str]] = {}
+    for name, reason in not_measured.items():
+        found.setdefault(reason, []).append(name)
+    return found
+
+
+def _folded(findings: Sequence[DiagnosedFault]) -> Iterator[list[DiagnosedFault]]:
+    """Findings of one check and severity together, in order; those of the whole set by themselves."""
+    groups: dict[tuple[str, str, str], list[DiagnosedFault]] = {}
+    for finding in findings:
+        own = finding.message if finding.episode is None else ""
+        groups.setdefault((finding.check, finding.severity, own), []).append(finding)
+    yield from groups.values()
+
+
+def _finding(same: Sequence[DiagnosedFault]) -> Iterator[str]:
+    worst = same[0]
+    numbers = list(dict.fromkeys(each.episode for each in same if each.episode is not None))
+    where = ""
+    do = worst.do
+    if numbers:
+        where = f"episode {numbers[0]}: "
+        if len(numbers) > 1:
+            shown = ", ".join(map(str, numbers[:_MAX_NUMBERS])) + (", ..." if len(numbers) > _MAX_NUMBERS else "")
+            where = f"{len(numbers)} episodes ({shown}), for example {numbers[0]}: "
+            do = do.replace(f"--episodes {numbers[0]} ", f"--episodes {','.join(map(str, numbers))} ")
+    yield f"  {worst.severity:<6}  {worst.check}  {where}{worst.message}"
+    yield from textwrap.wrap(worst.why, _WIDTH, initial_indent=" " * 10, subsequent_indent=" " * 10)
+    yield f"{' ' * 10}-> {do}"
+
+
+def _episodes(diagnosis: Diagnosis, *, everything: bool) -> Iterator[str]:
+    listed = [each for each in diagnosis.episodes if everything or each.verdict != "good"]
+    for each in listed if everything else listed[:MAX_EPISODES]:
+        reasons = f": {each.reasons[0]}" if each.reasons else ""
+        more = f" (and {len(each.reasons) - 1} more)" if len(each.reasons) > 1 else ""
+        yield f"  {each.verdict:<6}  episode {each.episode}, score {each.score:.2f}{reasons}{more}"
+    if len(listed) > MAX_EPISODES and not everything:
+        yield f"  and {len(listed) - MAX_EPISODES} more episodes (--all prints them)"
+
+
+def as_json(path: Path, diagnosis: Diagnosis) -> dict[str, Any]:
+    """As docs/checks.md describes it, with the path."""
+    return {"path": str(path), **diagnosis.to_json()}

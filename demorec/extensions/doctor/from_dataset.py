@@ -1,0 +1,212 @@
+"""Read a LeRobot dataset into `Evidence`: each table and each image once."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import DemorecError, ExportError
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
+from demorec.datasets.lerobot.videos import opened_video
+from demorec.episode.features import STATE
+from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
+from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
+from demorec.robots.motors import Motors
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReadOptions:
+    """How evidence is read.
+
+    Attributes:
+        images: Whether images are decoded.
+        named: Features whose role the user names.
+        motors: The servos whose values state and action are, if the user says so.
+        urdf: Text of the robot's description that the user names, "" for none.
+        lerobot: Whether the installed LeRobot opens the dataset.
+    """
+
+    images: bool = True
+    named: NamedRoles = NO_NAMES
+    motors: Motors | None = None
+    urdf: str = ""
+    lerobot: bool = False
+
+
+def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
+    """Read a dataset; what cannot be read of an episode spoils that episode alone.
+
+    Raises:
+        ConfigError: The dataset lacks a feature that the user names.
+        ExportError: info.json or the table of episodes cannot be read.
+    """
+    folder = LeRobotFolder(root, named=options.named)
+    roles = folder.roles
+    readable: list[EpisodeEvidence] = []
+    unreadable: dict[int, str] = {}
+    elements = roles.elements(roles.state) if roles.state else ()
+    acted = roles.elements(roles.action) if roles.action else ()
+    robot_problems: list[str] = []
+    robot: DatasetRobot | None = None
+    with noted(robot_problems, root):
+        robot = _robot(folder, options, elements)
+    joints = _joints(robot, folder, elements)
+    in_si = robot is not None and not options.urdf
+    reader = folder.rows([name for name in folder.columns if folder.info.features[name].dtype != "image"])
+    for place in folder.listed:
+        problems: list[str] = []
+        columns: Mapping[str, NDArray[Any]] = {}
+        with noted(problems, root):
+            columns = reader.numbers(place)
+            _refuse_empty(place, columns, folder)
+        if problems:
+            unreadable[place.episode_index] = problems[0]
+            continue
+        in_units = _in_si(columns, robot, roles.state, roles.action) if in_si else columns
+        readable.append(
+            EpisodeEvidence(
+                number=place.episode_index,
+                instruction="; ".join(place.tasks),
+                columns=columns,
+                state=continuous(joined(roles.state, in_units), elements),
+                action=continuous(joined(roles.action, in_units), acted),
+                time_s=columns["timestamp"][:, 0].astype(np.float64) if "timestamp" in columns else None,
+            )
+        )
+    return Evidence(
+        path=root,
+        fps=float(folder.info.fps),
+        roles=roles,
+        episodes=readable,
+        unreadable=unreadable,
+        folder=folder,
+        cameras=_cameras(folder) if options.images else {},
+        images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
+        urdf=options.urdf or ("" if robot is None else robot.urdf),
+        robot_problem="; ".join(robot_problems),
+        arm_joints=joints,
+        opens_lerobot=options.lerobot,
+    )
+
+
+def _refuse_empty(place: EpisodePlace, columns: Mapping[str, NDArray[Any]], folder: LeRobotFolder) -> None:
+    """Raise ExportError for an episode without frames, or without whole numbers where info.json has them."""
+    if place.length == 0:
+        raise ExportError(f"Episode {place.episode_index} has no frames: {folder.root}")
+    for name, values in columns.items():
+        if folder.info.features[name].dtype in ("int64", "bool") and values.dtype.kind not in "iub":
+            raise ExportError(f"Episode {place.episode_index} lacks values of {name}: {folder.root}")
+
+
+def _robot(folder: LeRobotFolder, options: ReadOptions, elements: tuple[str, ...]) -> DatasetRobot | None:
+    """The robot that the user names by its servos, the sidecar describes, or the elements' names imply."""
+    if options.motors is not None and elements == options.motors.names:
+        return robot_of_motors(options.motors)
+    digests = {row["robot_digest"] for row in folder.sidecar(["robot_digest"])} - {None}
+    if len(digests) == 1:
+        return folder.robot(digests.pop())
+    return recognised_robot(elements) if elements else None
+
+
+def _joints(robot: DatasetRobot | None, folder: LeRobotFolder, elements: tuple[str, ...]) -> tuple[str, ...]:
+    if robot is None:
+        return ()
+    state = folder.roles.state
+    known = robot.record.joints.get(state[0], robot.record.joints.get(STATE, ())) if len(state) == 1 else ()
+    return known if len(known) == len(elements) else ()
+
+
+def _in_si(
+    columns: Mapping[str, NDArray[Any]], robot: DatasetRobot | None, *parts: tuple[str, ...]
+) -> Mapping[str, NDArray[Any]]:
+    """The columns with state and action in rad and m, by the units that the robot's record states."""
+    assert robot is not None
+    from demorec.episode.info import Feature
+
+    found = dict(columns)
+    for name in (name for part in parts for name in part):
+        width = columns[name].shape[1]
+        usual_name = "action" if name in parts[1] else STATE
+        feature = robot.record.described(Feature(name=name, names=tuple(map(str, range(width)))), usual_name)
+        found[name] = feature.in_si(columns[name])
+    return found
+
+
+def _is_absent(folder: LeRobotFolder, key: str) -> bool:
+    """Whether none of a camera's video files is here, as after a download of the tables alone."""
+    return not any(place.videos[key][0].exists() for place in folder.listed)
+
+
+def _why_no_images(folder: LeRobotFolder) -> str:
+    """Why no image is looked at: no video file is here; "" if there are some, or no cameras."""
+    keys = folder.info.video_keys
+    if keys and all(_is_absent(folder, key) for key in keys):
+        return f"no video of {', '.join(keys)} is here; download them"
+    return ""
+
+
+def _cameras(folder: LeRobotFolder) -> dict[str, CameraThumbnails]:
+    found = {}
+    for key, feature in folder.info.features.items():
+        if feature.is_depth or not feature.is_camera or (feature.is_video and _is_absent(folder, key)):
+            continue
+        episodes: dict[int, EpisodeThumbnails] = {}
+        errors: dict[int, str] = {}
+        if feature.is_video:
+            _read_videos(folder, key, episodes, errors)
+        else:
+            _read_stored(folder, key, episodes, errors)
+        found[key] = CameraThumbnails(episodes=episodes, errors=errors)
+    return found
+
+
+def _read_videos(
+    folder: LeRobotFolder, key: str, episodes: dict[int, EpisodeThumbnails], errors: dict[int, str]
+) -> None:
+    """Decode a camera's videos, each file in one pass."""
+    shrinker = Shrinker()
+    for path, group in groupby(folder.listed, key=lambda place: place.videos[key][0]):
+        places = list(group)
+        problems: list[str] = []
+        with noted(problems, folder.root), opened_video(path) as opened:
+            for place in places:
+                own: list[str] = []
+                with noted(own, folder.root):
+                    episodes[place.episode_index] = shrinker.shrink(folder.video(key, place).decoded(opened=opened))
+                if own:
+                    errors[place.episode_index] = own[0]
+        if problems:
+            errors |= {place.episode_index: problems[0] for place in places if place.episode_index not in episodes}
+
+
+def _read_stored(
+    folder: LeRobotFolder, key: str, episodes: dict[int, EpisodeThumbnails], errors: dict[int, str]
+) -> None:
+    shrinker = Shrinker()
+    for place in folder.listed:
+        problems: list[str] = []
+        with noted(problems, folder.root):
+            episodes[place.episode_index] = shrinker.shrink(frames_of(folder.stored_images[key].read(place)))
+        if problems:
+            errors[place.episode_index] = problems[0]
+
+
+def why_unreadable(root: Path, named: NamedRoles) -> str:
+    """Why a dataset cannot be opened at all, "" if it can."""
+    try:
+        folder = LeRobotFolder(root, named=named)
+        folder.roles  # noqa: B018
+        folder.listed  # noqa: B018
+    except DemorecError as error:
+        return str(error)
+    return ""

@@ -1,0 +1,144 @@
+"""How the state follows the action: as a target or an increment, by how many frames, and which element by which."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.robust import finest
+
+MAX_LAG_S = 0.7
+"""Range of the lags that are tried, to both sides: a hobby servo under teleoperation needs 0.1 to 0.3 s."""
+MIN_LAGS = 3
+"""Frames to each side, at least."""
+MAX_UNEXPLAINED = 0.4
+"""Share of an element's variance that its action leaves unexplained, up to which the lag can be judged by it."""
+MIN_MOTION = 0.2
+"""Share of its usual range by which an element moves in an episode that is judged by it."""
+_SMALL = 1e-6
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeLag:
+    """How an episode's state follows its action.
+
+    Attributes:
+        lag: Frames by which it follows; fractions are interpolated.
+        curve: (L,) mean logarithm of the unexplained variance at each lag, over the judged elements.
+        element_lags: (J,) the lag of each judged element.
+    """
+
+    lag: float
+    curve: Array
+    element_lags: Array
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ActionRelation:
+    """How the state follows the action in a set of episodes.
+
+    Attributes:
+        kind: "target": the action is where the state goes; "increment": by how much it changes until the next frame.
+        lags: (L,) tried lags, frames.
+        elements, columns: (K,) elements of the arm in the state, and the same ones in the action.
+        episodes: Number of an episode -> its lag, of those that move enough.
+    """
+
+    kind: Literal["target", "increment"]
+    lags: NDArray[np.intp]
+    elements: NDArray[np.intp]
+    columns: NDArray[np.intp]
+    episodes: Mapping[int, EpisodeLag]
+
+    @property
+    def usual_lag(self) -> float:
+        """Median over the episodes."""
+        return float(np.median([episode.lag for episode in self.episodes.values()]))
+
+
+def relation_of(evidence: Evidence) -> ActionRelation:
+    """Find how the state follows the action. Raises NotMeasuredError where it follows in no known way."""
+    episodes = [each for each, _ in evidence.need_state() if each.action is not None]
+    if not evidence.roles.action or not episodes:
+        raise NotMeasuredError("no column is known to be the action (name it: --action COLUMN)")
+    pairs = [
+        (element, column)
+        for element, column in enumerate(evidence.action_of)
+        if column is not None and not evidence.is_gripper[element] and evidence.ranges[element] > _SMALL
+    ]
+    if not pairs:
+        raise NotMeasuredError("no element of the action has the name of a moving element of the state")
+    elements, columns = (np.array(part, dtype=np.intp) for part in zip(*pairs, strict=True))
+    reach = max(MIN_LAGS, round(MAX_LAG_S * evidence.fps))
+    long = [each for each in episodes if each.length >= 3 * reach + 4]
+    if not long:
+        raise NotMeasuredError("the episodes are too short to tell whether state or action is first")
+    lags = np.arange(-reach, reach + 1)  # not before: a stated rate of 2**31 would fill the memory
+    best: ActionRelation | None = None
+    fit = MAX_UNEXPLAINED
+    for kind in ("target", "increment"):
+        curves = {each.number: _curves(each, kind, elements, columns, lags, evidence) for each in long}
+        unexplained = _usual_minimum(list(curves.values()))
+        if unexplained < fit:
+            fit = unexplained
+            found = {number: _lag(curve, lags) for number, curve in curves.items()}
+            known = {number: lag for number, lag in found.items() if lag is not None}
+            best = ActionRelation(kind=kind, lags=lags, elements=elements, columns=columns, episodes=known)
+    if best is None or not best.episodes:
+        raise NotMeasuredError("the state follows the action neither as a target nor as an increment")
+    return best
+
+
+def _curves(
+    episode: EpisodeEvidence,
+    kind: str,
+    elements: NDArray[np.intp],
+    columns: NDArray[np.intp],
+    lags: NDArray[np.intp],
+    evidence: Evidence,
+) -> Array:
+    """(L, K) share of each element's variance that its action leaves unexplained at each lag; NaN where it rests."""
+    assert episode.state is not None
+    assert episode.action is not None
+    state = episode.state[:, elements]
+    moved = np.ptp(state, axis=0) >= MIN_MOTION * evidence.ranges[elements]
+    follows = state if kind == "target" else np.diff(state, axis=0, append=state[-1:])
+    reach = int(lags[-1])
+    core = follows[reach : len(follows) - reach]
+    action = episode.action[:, columns]
+    rows = [_unexplained(core, action[reach - lag : len(action) - reach - lag]) for lag in lags]
+    return np.where(moved & (np.ptp(action, axis=0) > 0), np.array(rows), np.nan)
+
+
+def _unexplained(values: Array, others: Array) -> Array:
+    """(K,) one minus the squared correlation of columns, 1 where one of them rests."""
+    one, two = values - values.mean(axis=0), others - others.mean(axis=0)
+    size = (one**2).sum(axis=0) * (two**2).sum(axis=0)
+    squared = (one * two).sum(axis=0) ** 2 / np.where(size > 0, size, 1.0)
+    return np.where(size > 0, np.maximum(1 - squared, 1e-9), 1.0)
+
+
+def _usual_minimum(curves: list[Array]) -> float:
+    """Median over episodes and moving elements of the least unexplained share."""
+    lowest = np.concatenate([curve.min(axis=0) for curve in curves])
+    known = lowest[np.isfinite(lowest)]
+    return float(np.median(known)) if len(known) else 1.0
+
+
+def _lag(curve: Array, lags: NDArray[np.intp]) -> EpisodeLag | None:
+    judged = np.asarray(np.isfinite(curve).all(axis=0))
+    judged[judged] &= curve[:, judged].min(axis=0) < MAX_UNEXPLAINED
+    if not judged.any():
+        return None
+    logs = np.log(curve[:, judged])
+    whole = logs.mean(axis=1)
+    numbers = lags.tolist()
+    each = np.array([finest(numbers, column) for column in logs.T])
+    return EpisodeLag(lag=finest(numbers, whole), curve=whole, element_lags=each)

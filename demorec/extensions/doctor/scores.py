@@ -1,0 +1,233 @@
+"""Score each episode by how far its quantities are from those of the other episodes of its instruction.
+
+The distance counts in usual spreads: a robust standard deviation over these episodes, at least the least spread of
+`_QUANTITIES`, below which differences do not matter. Most episodes lose nothing. Elements of state and action count in
+units of their range in the set, so that radians, degrees and per cent are equal.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.robust import NORMAL
+
+MIN_EPISODES = 12
+"""Episodes of one instruction that are compared among themselves; fewer are compared with the whole set."""
+_HALF = 7.0
+"""Usual spreads at which about two thirds are taken off."""
+_STEEPNESS = 4
+_MIN_LOSS = 0.05
+"""Loss of score from which a reason is given."""
+_QUANTITIES: Mapping[str, tuple[float, str]] = {
+    "pause": (0.1, "stands still for {value:.1f} s amid the motion, usual are {usual:.1f} s"),
+    "path": (0.1, "takes a detour of {value:.0%} of the range, usual are {usual:.0%}"),
+    "noise": (0.2, "the action shakes {ratio:.1f} times as much as usual"),
+    "duration": (0.1, "takes {ratio:.2f} times as long as usual"),
+    "lag": (0.3, "the state follows the action by {value:+.0f} frames, usual are {usual:+.0f}"),
+    "switches": (0.12, "the gripper is switched {value:.0f} times, usual are {usual:.0f}"),
+}
+"""Quantity -> its least spread, and the reason in words; {ratio} is that of logarithms."""
+_TWO_SIDED = ("duration", "lag", "switches")
+"""Quantities of which less than usual is odd as well."""
+_MIN_FRAMES = 8
+_HIGH = 0.65
+"""Share of its range above which a gripper's command counts as high."""
+_LOW = 0.35
+"""Share of its range below which a gripper's command counts as low again."""
+_STILL_RATIO = 0.08
+"""Share of the episode's fast speed (its 90 % quantile) below which an arm stands still."""
+_STEADY = 0.02
+"""Share of its range by which a gripper that stands still may move."""
+_MAX_LAG_S = 0.5
+
+
+class Reason(NamedTuple):
+    """One loss of score: the factor that is left, in words, the first and the last frame."""
+
+    kind: str
+    factor: float
+    spreads: float
+    text: str
+    first: int
+    last: int
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeScore:
+    """Score of one episode; reasons begin with the heaviest."""
+
+    episode: int
+    score: float
+    reasons: tuple[Reason, ...]
+
+
+class QuantityReading(NamedTuple):
+    """A number, and the first and last frame that it comes from."""
+
+    value: float
+    first: int
+    last: int
+
+
+class ArmMotion(NamedTuple):
+    """State and action (T, D) of the same elements; without an action the state stands for it."""
+
+    state: Array
+    action: Array
+
+
+def score_episodes(evidence: Evidence) -> dict[int, EpisodeScore]:
+    """Episode number -> its score: 1 where nothing is unusual; 0 where it cannot be read or is too short."""
+    flaws = dict.fromkeys(evidence.unreadable, "cannot be read")
+    flaws |= {e.number: f"has {e.length} frames" for e in evidence.episodes if e.length < _MIN_FRAMES}
+    readings = measure(evidence)
+    reasons: dict[int, list[Reason]] = {each.number: [] for each in evidence.episodes}
+    for number, flaw in flaws.items():
+        reasons[number] = [Reason("flaw", 0.0, math.inf, flaw, 0, 0)]
+    tasks = {episode.number: episode.instruction for episode in evidence.episodes if episode.number in readings}
+    for group in _groups(tasks):
+        for name in _QUANTITIES:
+            known = {number: readings[number][name] for number in group if name in readings[number]}
+            for number, reason in _judged(name, known) if known else ():
+                reasons[number].append(reason)
+    return {
+        number: EpisodeScore(
+            episode=number,
+            score=math.prod(reason.factor for reason in own),
+            reasons=tuple(sorted((r for r in own if r.factor < 1 - _MIN_LOSS), key=lambda reason: reason.factor)),
+        )
+        for number, own in sorted(reasons.items())
+    }
+
+
+def _groups(tasks: Mapping[int, str]) -> Iterable[list[int]]:
+    """Return the numbers of the episodes that are compared with each other."""
+    counts = Counter(tasks.values())
+    found: dict[str, list[int]] = {}
+    for number, task in tasks.items():
+        found.setdefault(task if counts[task] >= MIN_EPISODES else "", []).append(number)
+    return found.values()
+
+
+def _judged(name: str, readings: Mapping[int, QuantityReading]) -> Iterator[tuple[int, Reason]]:
+    """Yield (number, reason) of each reading."""
+    floor, words = _QUANTITIES[name]
+    values = np.array([reading.value for reading in readings.values()])
+    usual = float(np.median(values))
+    spread = max(NORMAL * float(np.median(np.abs(values - usual))), floor)
+    for number, (value, first, last) in readings.items():
+        distance = (value - usual) / spread
+        spreads = abs(distance) if name in _TWO_SIDED else max(distance, 0.0)
+        text = words.format(value=value, usual=usual, ratio=math.exp(min(value - usual, 50.0)))
+        yield number, Reason(name, math.exp(-((spreads / _HALF) ** _STEEPNESS)), spreads, text, first, last)
+
+
+def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
+    """Episode number -> quantity -> its number, of all episodes that are long enough; empty without a state."""
+    columns = [column for column in evidence.action_of if column is not None]
+    has_action = len(columns) == len(evidence.elements) > 0
+    motions: dict[int, ArmMotion] = {}
+    for episode, state in evidence.with_state(_MIN_FRAMES):
+        acted = state if episode.action is None or not has_action else episode.action[:, columns]
+        motions[episode.number] = ArmMotion(state, acted)
+    known = list(motions.values())
+    ranges = ArmMotion(_range([motion.state for motion in known]), _range([motion.action for motion in known]))
+    return {n: _readings(motion, ranges, evidence.is_gripper, evidence.fps) for n, motion in motions.items()}
+
+
+def _range(values: Sequence[Array]) -> Array:
+    """Return the least and the largest value (2, D) of all episodes without the outermost tenth of them."""
+    if not values:
+        return np.zeros((2, 0))
+    low = np.quantile([part.min(axis=0) for part in values], 0.1, axis=0)
+    high = np.quantile([part.max(axis=0) for part in values], 0.9, axis=0)
+    return np.stack([low, high])
+
+
+def _shares(values: Array, ranges: Array) -> Array:
+    """Return values (T, K) in units of their ranges (2, K); an element that hardly moves counts less than others."""
+    width = ranges[1] - ranges[0]
+    floor = max(0.2 * float(np.median(width)), 1e-9) if len(width) else 1.0
+    return np.asarray((values - ranges[0]) / np.maximum(width, floor), dtype=np.float64)
+
+
+def _readings(
+    motion: ArmMotion, ranges: ArmMotion, is_gripper: NDArray[np.bool_], fps: float
+) -> dict[str, QuantityReading]:
+    state = _shares(motion.state[:, ~is_gripper], ranges.state[:, ~is_gripper])
+    action = _shares(motion.action[:, ~is_gripper], ranges.action[:, ~is_gripper])
+    openings = _shares(motion.state[:, is_gripper], ranges.state[:, is_gripper])
+    commands = _shares(motion.action[:, is_gripper], ranges.action[:, is_gripper])
+    switches = sorted({frame for command in commands.T for frame in _switches(command)})
+    last = len(state) - 1
+    readings = {
+        "pause": _pause(state, openings, fps),
+        "duration": QuantityReading(float(np.log(len(state) / fps)), 0, last),
+        "switches": QuantityReading(len(switches), 0, last),
+        "path": _detour(state, [0, *(frame for frame in switches if frame < last), last]),
+        "noise": _roughness(action),
+    }
+    lag = None if motion.action is motion.state else _lag(state, action, fps)
+    return readings if lag is None else readings | {"lag": QuantityReading(lag, 0, last)}
+
+
+def _pause(state: Array, openings: Array, fps: float) -> QuantityReading:
+    """Return the longest time for which arm (T, K) and grippers (T, G) stand still amid the motion."""
+    steps = np.linalg.norm(np.diff(state, axis=0), axis=1)
+    is_still = steps < _STILL_RATIO * max(float(np.quantile(steps, 0.9)), 1e-9)
+    is_still &= (np.abs(np.diff(openings, axis=0)) < _STEADY).all(axis=1)
+    moving = np.flatnonzero(~is_still)
+    if len(moving) < 2:
+        return QuantityReading(0.0, 0, len(state) - 1)
+    gaps = np.diff(moving) - 1
+    longest = int(np.argmax(gaps))
+    return QuantityReading(float(gaps[longest]) / fps, int(moving[longest]) + 1, int(moving[longest + 1]))
+
+
+def _detour(state: Array, bounds: Sequence[int]) -> QuantityReading:
+    """Return how much longer the path is than straight lines between the bounds, and the stretch with most of it."""
+    excess = []
+    for first, last in pairwise(bounds):
+        path = float(np.linalg.norm(np.diff(state[first : last + 1], axis=0), axis=1).sum())
+        excess.append(path - float(np.linalg.norm(state[last] - state[first])))
+    worst = int(np.argmax(excess))
+    return QuantityReading(sum(excess), bounds[worst], bounds[worst + 1])
+
+
+def _roughness(values: Array) -> QuantityReading:
+    """Return the logarithm of the third differences: smooth motion has hardly any, white noise has most."""
+    third = np.linalg.norm(np.diff(values, 3, axis=0), axis=1)
+    return QuantityReading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
+
+
+def _lag(state: Array, action: Array, fps: float) -> float | None:
+    """Return by how many frames the state follows the action, a target or an increment; None if it does not."""
+    reach = max(2, round(_MAX_LAG_S * fps))
+    if len(state) < 4 * reach:
+        return None
+    lags = range(-reach, reach + 1)
+    for values in (state, np.diff(state, axis=0, prepend=state[:1]) * fps):
+        core = values[reach:-reach]
+        errors = [float((core - action[reach - lag : len(action) - reach - lag]).var(axis=0).sum()) for lag in lags]
+        if min(errors) < 0.5 * float(core.var(axis=0).sum()):
+            return float(lags[int(np.argmin(errors))])
+    return None
+
+
+def _switches(command: Array) -> list[int]:
+    """Return the frames from which a gripper's command (T,) is at the other of two levels, low and high."""
+    level = np.where(command > _HIGH, 1, np.where(command < _LOW, 0, -1))
+    if level[0] < 0:
+        level[0] = int(command[0] > 0.5)
+    latest = np.maximum.accumulate(np.where(level >= 0, np.arange(len(level)), 0))  # between the levels it stays
+    return [int(frame) + 1 for frame in np.flatnonzero(np.diff(level[latest]))]

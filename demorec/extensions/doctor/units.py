@@ -1,0 +1,58 @@
+"""Episodes whose numbers have another size than those of the others, as another unit makes them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.evidence import Evidence
+
+MIN_OTHERS = 3
+"""Episodes, at least, that one is compared with."""
+MIN_UNIT_RATIO = 7.0
+"""Ratio of sizes from which an episode has another unit: demonstrations of one task differ by a factor of two or three,
+the nearest confusion of units is 11."""
+BOUND_QUANTILES = (0.005, 0.995)
+"""Share of the frames below and above the bounds of the whole set: a single wrong reading widens none."""
+
+
+def other_units(evidence: Evidence) -> dict[int, dict[str, float]]:
+    """Episode -> "state" or "action" -> ratio of its size to the others', of those that have another unit."""
+    found: dict[int, dict[str, float]] = {}
+    for role in ("state", "action"):
+        values = {e.number: v for e in evidence.episodes if (v := getattr(e, role)) is not None and len(v)}
+        if len(values) > MIN_OTHERS:
+            for number, ratio in _other_sizes(values).items():
+                found.setdefault(number, {})[role] = ratio
+    return found
+
+
+def state_bounds(evidence: Evidence) -> tuple[Array, Array]:
+    """(D,) lowest and highest value of each element of the state in the whole set but episodes in another unit."""
+    others = evidence.once(other_units)
+    states = [state for episode, state in evidence.with_state() if episode.number not in others]
+    if not states:
+        return np.zeros(len(evidence.elements)), np.zeros(len(evidence.elements))
+    lowest, highest = np.quantile(np.concatenate(states), BOUND_QUANTILES, axis=0)
+    return lowest, highest
+
+
+def _other_sizes(values: Mapping[int, Array]) -> dict[int, float]:
+    """Episode -> ratio of its size to that of the others, of those in which most elements agree on a large one."""
+    sizes = {number: np.sqrt((each**2).mean(axis=0)) for number, each in values.items()}
+    spans = {number: np.ptp(each, axis=0) for number, each in values.items()}
+    usual_size, usual_span = (np.median(np.stack(list(part.values())), axis=0) for part in (sizes, spans))
+    alive = (usual_size > 0) & (usual_span > 0)
+    found: dict[int, float] = {}
+    for number in values if alive.any() else ():
+        with np.errstate(divide="ignore"):
+            by_size = np.log(sizes[number][alive] / usual_size[alive])
+            by_span = np.log(spans[number][alive] / usual_span[alive])
+        for sign in (1.0, -1.0):
+            agreed = np.minimum(sign * by_size, sign * by_span) > math.log(MIN_UNIT_RATIO)
+            if agreed.mean() > 0.6 and (sign > 0 or np.isfinite(by_span[agreed]).all()):
+                found[number] = float(np.exp(np.median(by_size[agreed])))
+    return found

@@ -1,0 +1,165 @@
+"""How well the state explains the images: the thumbnails, predicted by ridge regression on the other episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.robust import finest
+from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
+from demorec.extensions.doctor.units import other_units
+
+MIN_EPISODES = 5
+"""Episodes, at least: each is predicted from the others."""
+MIN_FRAMES = 20
+MAX_LAG_S = 1.0
+MAX_UNRELATED_RATIO = 0.25
+"""Share of what the state usually explains, up to which the states of other episodes are tried."""
+MAX_COMPARED = 5
+"""Episodes, at most, that are compared with all others."""
+_COMPONENTS = 8
+_MAX_PAIRED = 8
+"""Elements of the state up to which products of two are features too."""
+_RIDGE = 1e-2
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ViewFit:
+    """How well the state explains a camera's images in one episode.
+
+    Attributes:
+        lags: (L,) frames by which the images come later than the state.
+        explained: (L,) share of the images' variance that the state explains at each lag.
+        by_another: Largest share that the state of another episode explains; 0 where it was not computed, as the own
+            state explains enough.
+    """
+
+    lags: NDArray[np.intp]
+    explained: Array
+    by_another: float = 0.0
+
+    @property
+    def best(self) -> float:
+        """Share that it explains at the best lag."""
+        return float(self.explained.max())
+
+    @property
+    def lag(self) -> float:
+        """The lag at which it explains most."""
+        return finest(self.lags.tolist(), -self.explained)
+
+
+def view_fits(evidence: Evidence) -> Mapping[str, Mapping[int, ViewFit]]:
+    """Camera -> episode -> how well the state explains its images, by a fit on the other episodes."""
+    return {camera: _fits(evidence, images) for camera, images in evidence.cameras.items()}
+
+
+def _fits(evidence: Evidence, images: CameraThumbnails) -> Mapping[int, ViewFit]:
+    known = _known(evidence, images)
+    known = {number: both for number, both in known.items() if len(both[1].frames) >= MIN_FRAMES}
+    if len(known) < MIN_EPISODES:
+        return {}
+    states = _scaled(evidence, {number: episode for number, (episode, _) in known.items()})
+    outputs = _outputs({number: images for number, (_, images) in known.items()})
+    weights = _weights(states, outputs)
+    reach = max(3, round(MAX_LAG_S * evidence.fps))
+
+    def fit(shown: int, stated: int) -> ViewFit:
+        """Fit the images of one episode to the state of one, by what the episodes but the first show."""
+        others = [state for number, state in states.items() if number != shown]
+        predicted = _features(_within(states[stated], others)) @ weights[shown]
+        length = min(len(predicted), len(outputs[shown]))
+        own_reach = min(reach, length // 4)
+        lags = np.arange(-own_reach, own_reach + 1)
+        return ViewFit(lags=lags, explained=_explained(predicted[:length], outputs[shown][:length], lags))
+
+    found = {number: fit(number, number) for number in states}
+    unexplained = _unexplained(found)
+    for number in unexplained:
+        by_another = max(fit(number, other).best for other in states if other != number)
+        found[number] = replace(found[number], by_another=by_another)
+    return found
+
+
+def _unexplained(fits: Mapping[int, ViewFit]) -> list[int]:
+    """Few episodes whose images the state explains least, and less than usual."""
+    limit = MAX_UNRELATED_RATIO * float(np.median([fit.best for fit in fits.values()]))
+    found = [number for number, fit in fits.items() if fit.best < limit]
+    return sorted(found, key=lambda number: fits[number].best)[:MAX_COMPARED]
+
+
+def _weights(states: Mapping[int, Array], outputs: Mapping[int, Array]) -> dict[int, Array]:
+    """Episode -> (F, 8) weights that predict images from features, fitted to all other episodes."""
+    inputs = {number: _features(state) for number, state in states.items()}
+    products = {number: (x.T @ x, x.T @ outputs[number]) for number, x in inputs.items()}
+    squares, crossed = (sum(pair[k] for pair in products.values()) for k in (0, 1))
+    found = {}
+    for number, (own_squares, own_crossed) in products.items():
+        left = squares - own_squares
+        ridge = _RIDGE * np.trace(left) / len(left) * np.eye(len(left))
+        found[number] = np.linalg.solve(left + ridge, crossed - own_crossed)
+    return found
+
+
+def _scaled(evidence: Evidence, episodes: Mapping[int, EpisodeEvidence]) -> dict[int, Array]:
+    """Episode -> (T, E) moving elements of the state in units of their range."""
+    states = {number: episode.state for number, episode in episodes.items() if episode.state is not None}
+    alive = evidence.ranges > 0
+    middle = np.median(np.stack([np.median(state, axis=0) for state in states.values()]), axis=0)[alive]
+    return {n: np.clip((state[:, alive] - middle) / evidence.ranges[alive], -3, 3) for n, state in states.items()}
+
+
+def _within(state: Array, others: Sequence[Array]) -> Array:
+    """(T, E) state, no further out than the others: a fit of squares and products says nothing beyond its data."""
+    lowest = np.min([other.min(axis=0) for other in others], axis=0)
+    highest = np.max([other.max(axis=0) for other in others], axis=0)
+    return np.clip(state, lowest, highest)
+
+
+def _features(state: Array) -> Array:
+    """(T, F) elements, their squares and products."""
+    parts = [np.ones((len(state), 1)), state, state**2]
+    if state.shape[1] <= _MAX_PAIRED:
+        first, second = np.triu_indices(state.shape[1], 1)
+        parts.append(state[:, first] * state[:, second])
+    return np.hstack(parts)
+
+
+def _outputs(images: Mapping[int, EpisodeThumbnails]) -> dict[int, Array]:
+    """Episode -> (T, 8) principal components of the thumbnails, each episode around its own mean."""
+    flat = {n: each.thumbnails.reshape(len(each.thumbnails), -1).astype(np.float32) for n, each in images.items()}
+    centred = {number: each - each.mean(axis=0) for number, each in flat.items()}
+    covariance = sum((each.T @ each) / max(float((each**2).sum()), 1e-9) for each in centred.values())
+    _, vectors = np.linalg.eigh(np.asarray(covariance, dtype=np.float64))
+    return {number: each @ vectors[:, -_COMPONENTS:] for number, each in centred.items()}
+
+
+def _explained(predicted: Array, shown: Array, lags: NDArray[np.intp]) -> Array:
+    """(L,) share of the variance of what is shown that the prediction explains when it is that many frames earlier."""
+    reach = int(lags[-1])
+    core = predicted[reach : len(predicted) - reach]
+    core = core - core.mean(axis=0)
+    shares = []
+    for lag in lags:
+        part = shown[reach + lag : len(shown) - reach + lag]
+        part = part - part.mean(axis=0)
+        total = float((part**2).sum())
+        shares.append(1 - float(((part - core) ** 2).sum()) / total if total > 0 else 0.0)
+    return np.array(shares)
+
+
+def _known(evidence: Evidence, camera: CameraThumbnails) -> Mapping[int, tuple[EpisodeEvidence, EpisodeThumbnails]]:
+    """Episodes that have both numbers and images of every frame."""
+    return {
+        number: (episode, images)
+        for number, images in camera.episodes.items()
+        if (episode := evidence.by_number.get(number)) is not None
+        and episode.state is not None
+        and number not in evidence.once(other_units)
+        and len(images.frames) == len(episode.state)
+    }

@@ -1,0 +1,313 @@
+"""What stands beside the tables of an edited dataset, and what of its sources it will not have.
+
+Beside stand the sidecar's rows, robots, attempts, poses of cameras, boxes and progress. What is left out is known
+before anything is written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from demorec.core.errors import ExportError, describe_error
+from demorec.core.geometry import Array
+from demorec.core.plain import parse_json, to_json
+from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
+from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
+from demorec.datasets.lerobot.rows import IndexedRows
+from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
+from demorec.extensions.editing.plan import EpisodeSlice, Plan
+
+_OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
+"""What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
+_COUNTERS = ("index", "episode_index", "frame_index")
+_ROWS_AT_ONCE = 4096
+_ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
+"""Files that are copied from a single source."""
+_OF_OTHER_TOOLS = (".cache/", ".git/")
+"""Folders that belong to the download of a dataset."""
+MAX_NAMES = 5
+"""Files that are named of one kind."""
+
+
+def _moving_cameras(source: LeRobotFolder) -> tuple[str, ...] | None:
+    """Cameras of whose every frame the pose is kept; None where the files do not agree."""
+    names = [open_table(path).schema_arrow.names for path in source.sidecar_tables("camera_poses")]
+    if any(each != names[0] for each in names):
+        return None
+    return tuple(name for name in (names[0] if names else ()) if name not in _COUNTERS)
+
+
+def _poses_are_kept(plan: Plan) -> bool:
+    """Whether all sources with moving cameras have the same."""
+    found = {_moving_cameras(source) for source in plan.sources} - {()}
+    return len(found) <= 1 and None not in found
+
+
+def _has_stages(plan: Plan) -> bool:
+    """Whether progress is computed anew, from the stages that demorec wrote."""
+    needed = {*STAGE_COLUMNS, "num_goals"}
+    return all(source.sidecar_tables("episodes") and needed <= set(source.fact_types) for source in plan.sources)
+
+
+def _progress_is_kept(plan: Plan) -> bool:
+    """Whether all sources have progress of the same kind."""
+    paths = [source.root / PROGRESS_PATH for source in plan.sources]
+    if not all(path.is_file() for path in paths):
+        return False
+    schemas = [open_table(path).schema_arrow for path in paths]
+    return _has_stages(plan) or (
+        set(_COUNTERS) <= set(schemas[0].names) and all(schema.equals(schemas[0]) for schema in schemas)
+    )
+
+
+def write_kept_progress(plan: Plan, folder: Path) -> None:
+    """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
+    if not _progress_is_kept(plan):
+        return
+    if _has_stages(plan):
+        write_progress(folder)
+        return
+    sources = [IndexedRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
+    schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
+    tables = [schema.empty_table()]
+    total = 0
+    for episode, cut in enumerate(plan.cuts):
+        index = plan.sources[cut.source].places[cut.episode].episode_index
+        rows = sources[cut.source].frames(index, cut.first, cut.last)
+        if rows is not None:
+            tables.append(_counted(rows, cut, episode, total))
+        total += cut.last - cut.first
+    pq.write_table(pa.concat_tables(tables), folder / PROGRESS_PATH)
+
+
+def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:
+    """Rows of a cut with their numbers in the new dataset, in which `index` is that of its first frame."""
+    frames = rows.column("frame_index").to_numpy() - cut.first
+    counted = {"index": frames + index, "episode_index": np.full(len(frames), episode), "frame_index": frames}
+    for name, values in counted.items():
+        number = rows.schema.get_field_index(name)
+        rows = rows.set_column(number, rows.schema.field(name), pa.array(values, rows.schema.field(name).type))
+    return rows
+
+
+class SidecarReader:
+    """What stands beside the tables of one source, for the episodes of a plan.
+
+    Args:
+        plan: The new dataset.
+        number: Number of the source in it.
+
+    Methods raise ExportError if the files cannot be read.
+    """
+
+    def __init__(self, plan: Plan, number: int) -> None:
+        self._plan, self._source = plan, plan.sources[number]
+        self._rows = IndexedRows(self._source.sidecar_tables("episodes"), EPISODE_SCHEMA, rows=64)
+        tables = self._source.sidecar_tables("camera_poses") if _poses_are_kept(plan) else ()
+        self._poses = IndexedRows(tables, rows=_ROWS_AT_ONCE)
+        found = {name: self._source.boxes(mapping.feature) for name, mapping in plan.mappings[number].items()}
+        self._boxes = {name: boxes for name, boxes in found.items() if boxes is not None}
+        self._begun: set[int] = set()
+
+    def boxes(self, cut: EpisodeSlice) -> dict[str, SeenByCamera]:
+        """Return camera feature -> visible objects of an episode."""
+        found = {name: file.read(cut.episode, cut.first, cut.last) for name, file in self._boxes.items()}
+        return {name: seen for name, seen in found.items() if seen is not None}
+
+    def record(self, cut: EpisodeSlice) -> EpisodeRecord:
+        """Return the sidecar's data about an episode."""
+        source = self._source
+        index = source.places[cut.episode].episode_index
+        table = self._rows.read(index)
+        row: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
+        row.setdefault("source", source.root.name)
+        robot = row.get("robot_digest")
+        if not self._plan.keeps_scene(cut):
+            row |= dict.fromkeys(_OF_SCENE)
+            row["phases"] = _cut_phases(row, cut)
+        elif cut.task and row.get("episode_info") is not None:
+            row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
+        attempt = source.attempts.own.get(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
+        if not cut.has_end:  # a part of which nobody said whether it succeeded
+            row["success"] = None
+            attempt = {**attempt, "success": None}
+        failed = () if index in self._begun else source.attempts.failed.get(index, ())
+        self._begun.add(index)
+        return EpisodeRecord(
+            row=row,
+            attempt=attempt,
+            failed=failed,
+            moving_cameras=self._camera_poses(cut, index),
+            robot=None if robot is None else source.robot(str(robot)),
+        )
+
+    def _camera_poses(self, cut: EpisodeSlice, episode_index: int) -> dict[str, Array]:
+        """Camera -> (T, 7) world_from_camera; empty if unknown. Raises ExportError if frames are missing."""
+        rows = self._poses.frames(episode_index, cut.first, cut.last)
+        if rows is None or not rows.num_rows:
+            return {}
+        if rows.num_rows != cut.last - cut.first:
+            raise ExportError(f"Poses of cameras are missing in episode {episode_index}: {self._source.root}")
+        names = [name for name in rows.column_names if name not in _COUNTERS]
+        return {name: column_numbers(rows.column(name).combine_chunks()) for name in names}
+
+
+def kept_configs(plan: Plan) -> dict[str, Any] | None:
+    """Return config digest -> configuration, of all sources; None if no source has a sidecar."""
+    if not any(source.sidecar_tables("episodes") for source in plan.sources):
+        return None
+    configs: dict[str, Any] = {}
+    for source in plan.sources:
+        if (source.root / CONFIGS_PATH).exists():
+            configs |= read_json(source.root / CONFIGS_PATH)
+    return configs
+
+
+def kept_export(plan: Plan) -> Mapping[str, Any]:
+    """Return how the first source that says it was exported; empty if none does."""
+    found = next((s.root for s in plan.sources if (s.root / EXPORT_PATH).exists()), None)
+    return dict(read_json(found / EXPORT_PATH)) if found else {}
+
+
+def _reworded(info: str, task: str, root: Path) -> str:
+    """The description of a simulated episode with another instruction."""
+    try:
+        described = parse_json(info)
+        described["instruction"] = task
+    except (ValueError, TypeError) as error:
+        raise ExportError(f"The sidecar's episode_info cannot be used ({describe_error(error)}): {root}") from error
+    return to_json(described)
+
+
+def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any]]:
+    """Phases within a cut, frames counted from its first one."""
+    length = cut.last - cut.first
+    return [
+        {"name": phase["name"], "from": max(phase["from"] - cut.first, 0), "to": min(phase["to"] - cut.first, length)}
+        for phase in row.get("phases") or ()
+        if phase["from"] < cut.last and phase["to"] > cut.first
+    ]
+
+
+def left_out(plan: Plan) -> tuple[str, ...]:
+    """One phrase each, with the reason in brackets; what the user chose to leave out is none."""
+    found: dict[str, set[str]] = {}
+    for number, source in enumerate(plan.sources):
+        for name, reason in _files(plan, number, source.root):
+            found.setdefault(reason, set()).add(name)
+    phrases = []
+    for reason, names in found.items():
+        more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
+        phrases.append(f"{', '.join(sorted(names)[:MAX_NAMES])}{more} ({reason})")
+    return (*phrases, *_scenes(plan), *_descriptions(plan), *_attempts(plan), *_facts(plan))
+
+
+def copied_files(plan: Plan) -> tuple[str, ...]:
+    """List the files that go along as they are: those about a whole dataset, and those that demorec does not know."""
+    if len(plan.sources) > 1:
+        return ()
+    root = plan.sources[0].root
+    known = [name for name in _ABOUT_THE_WHOLE if (root / name).is_file()]
+    return (*known, *unknown_files(plan.sources[0]))
+
+
+def unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
+    """List the files, links aside, that a dataset does not use and whose names do not say what they are.
+
+    Tables among those of rows and episodes are left out: LeRobot would read a copy as part of the dataset.
+    """
+    root, used = source.root, _used_files(source)
+    strange = [name for name in _files_below(root) if not is_dataset_file(name) and root / name not in used]
+    return tuple(name for name in strange if not (root / name).is_symlink() and not _is_stray_table(name))
+
+
+def _is_stray_table(name: str) -> bool:
+    return name.startswith(("data/", "meta/episodes/")) and name.endswith(".parquet")
+
+
+def _used_files(source: LeRobotFolder) -> set[Path]:
+    """Find the files of rows and videos."""
+    return {place.data for place in source.places} | {
+        path for place in source.places for path, _ in place.videos.values()
+    }
+
+
+def _files_below(root: Path) -> list[str]:
+    names = (path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file())
+    return [name for name in names if not name.startswith(_OF_OTHER_TOOLS)]
+
+
+def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
+    for path in plan.sources[number].data_tables:
+        for name in open_table(path).schema_arrow.names:
+            if name not in plan.sources[number].info.features:
+                yield name, f"{INFO_PATH} does not list this column of the data files"
+    cameras = {mapping.feature for mapping in plan.mappings[number].values()}
+    keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
+    used = _used_files(plan.sources[number])
+    copied = copied_files(plan)
+    for name in _files_below(root):
+        path = root / name
+        if name in copied or path in used:
+            continue
+        if not is_dataset_file(name):
+            yield name, "of a kind that demorec does not know: copy it if it still holds"
+        elif name.startswith(("data/", "videos/")):
+            yield name, "no episode of the dataset is in this file"
+        elif name in _ABOUT_THE_WHOLE and len(plan.sources) > 1:
+            yield name, "each of the datasets may have its own"
+        elif name.startswith("images/"):
+            yield name, "no row has it"
+        elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
+            yield name, "other cameras move in the other datasets"
+        elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
+            yield name, "its camera is left out"
+        elif name == PROGRESS_PATH and not keeps_progress:
+            yield name, "not all datasets have progress with the same columns"
+        elif name.startswith("meta/temporal_proportions_") and not (
+            name == PROPORTIONS_PATH and keeps_progress and _has_stages(plan)
+        ):
+            yield name, "they are those of the source's episodes together"
+
+
+def _scenes(plan: Plan) -> Iterator[str]:
+    changed = [cut for cut in plan.cuts if not plan.keeps_scene(cut)]
+    lost = 0
+    for number, source in enumerate(plan.sources if changed else ()):
+        scenes = {row["episode_index"] for row in source.sidecar(["root_seed"]) if row["root_seed"] is not None}
+        indices = {source.places[cut.episode].episode_index for cut in changed if cut.source == number}
+        lost += len(indices & scenes)
+    if lost:
+        yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
+
+
+def _descriptions(plan: Plan) -> Iterator[str]:
+    spoken = any(feature.dtype == "language" for feature in plan.info.features.values())
+    if spoken and (count := sum(bool(cut.task) for cut in plan.cuts)):
+        yield f"other wordings (task_aug) in episodes: {count} (they are wordings of the old instruction)"
+
+
+def _attempts(plan: Plan) -> Iterator[str]:
+    lost = 0
+    for number, source in enumerate(plan.sources):
+        kept = {cut.episode for cut in plan.cuts if cut.source == number}
+        gone = [place.episode_index for episode, place in enumerate(source.places) if episode not in kept]
+        lost += sum(len(source.attempts.failed.get(index, ())) for index in gone)
+        lost += 0 if plan.takes_all_of(number) else len(source.attempts.homeless)
+    if lost:
+        yield f"failed attempts: {lost} (at episodes that are not in the result)"
+
+
+def _facts(plan: Plan) -> Iterator[str]:
+    names = {name for source in plan.sources if not source.info.is_old for name in source.info.other}
+    if lost := sorted(names - set(plan.info.other)):
+        yield f"{', '.join(lost)} of info.json (the datasets differ in it)"

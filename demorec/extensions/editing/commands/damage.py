@@ -1,0 +1,107 @@
+"""`demorec dataset repair` and `demorec dataset cut`: wrong tables, and episodes that should be several."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from demorec.cli.shared.output import say
+from demorec.core.errors import ConfigError, check_option
+from demorec.extensions.editing.commands.edit import EditOne, dataset_at, pairs
+
+if TYPE_CHECKING:
+    from demorec.datasets.lerobot.folder import LeRobotFolder
+    from demorec.extensions.editing.plan import Plan
+
+
+@dataclass(frozen=True, kw_only=True)
+class Repair(EditOne):
+    """Rebuild tables, counts, indices, types and statistics from the rows and videos, and list each change.
+
+    Rows, images and texts are never invented: what only those could mend is refused, or its episodes are left out.
+    A dataset without faults is not written again.
+
+    Examples:
+      demorec dataset repair cups --dry-run
+      demorec dataset repair cups --out sound
+    """
+
+    def sources(self) -> Sequence[LeRobotFolder]:
+        """The dataset as its rows have it."""
+        from demorec.extensions.editing.repair import RepairedDataset
+
+        return [RepairedDataset(dataset_at(self.dataset))]
+
+    def has_work(self, sources: Sequence[LeRobotFolder]) -> bool:
+        """Whether anything is to be repaired."""
+        if not sources[0].notes:
+            say(f"Nothing to repair, so nothing is written: {self.dataset}")
+        return bool(sources[0].notes)
+
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
+        """All episodes whose rows and images can be read."""
+        from demorec.extensions.editing.repair import RepairedDataset
+
+        assert isinstance(sources[0], RepairedDataset)
+        return sources[0].plan()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Cut(EditOne):
+    """Cut episodes into parts: before given frames, where the data jump, or around pauses, which are taken out.
+
+    Each part becomes an episode. Packets pass through; images that a part needs from before its first frame stay
+    in the video, and are counted.
+
+    Examples:
+      demorec dataset cut cups --at 0=120,260 3=45 --out parts
+      demorec dataset cut cups --jumps --out rollouts
+      demorec dataset cut cups --pauses 1.5 --out moving
+    """
+
+    at: tuple[str, ...] = ()
+    """Episodes and the frames that begin another part, 0=120,260 3=45."""
+    jumps: bool = False
+    """Cut where the state jumps, as where rollouts were recorded as one episode."""
+    pauses: float | None = None
+    """Take out each pause of at least this many seconds."""
+    feature: tuple[str, ...] = ()
+    """With --jumps or --pauses: features to watch (auto: the state without grippers)."""
+    jump_threshold: float = 0.05
+    """With --jumps: a jump is a step that exceeds those near it by more than this share of the range."""
+    still_threshold: float = 0.01
+    """With --pauses: motion is a change by more than this share of the range."""
+    margin: int = 3
+    """With --pauses: still frames to keep at either end of a pause."""
+
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
+        """All episodes, cut."""
+        from demorec.extensions.editing import cut
+
+        (source,) = sources
+        if [bool(self.at), self.jumps, self.pauses is not None].count(True) != 1:
+            raise ConfigError("Say where to cut: --at EPISODE=FRAMES, --jumps or --pauses SECONDS.")
+        if self.at:
+            return cut.cut_at(source, self._frames())
+        if self.pauses is None:
+            return cut.cut_at_jumps(source, self.feature, self.jump_threshold)
+        check_option("margin", self.margin, 0, 2**31 - 1, "frames")
+        check_option("pauses", self.pauses, 0, 86400, "seconds")
+        return cut.without_pauses(
+            source,
+            self.feature,
+            min_frames=round(self.pauses * source.info.fps),
+            threshold=self.still_threshold,
+            margin=self.margin,
+        )
+
+    def _frames(self) -> dict[int, list[int]]:
+        example = "--at 0=120,260 3=45"
+        try:
+            return {
+                int(name): [int(frame) for frame in frames.split(",")]
+                for name, frames in pairs(self.at, example).items()
+            }
+        except ValueError as error:
+            raise ConfigError(f"An episode and its frames are numbers: {example}.") from error

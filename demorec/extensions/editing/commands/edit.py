@@ -1,0 +1,210 @@
+"""What the editing commands have in common: the new dataset, what is printed about it, words that name episodes."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+from demorec.cli.shared.flags import Positional, arg
+from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
+from demorec.core.errors import ConfigError
+from demorec.core.targets import OptionalTarget
+from demorec.datasets.lerobot.paths import is_dataset
+
+if TYPE_CHECKING:
+    from demorec.datasets.lerobot.folder import LeRobotFolder
+    from demorec.extensions.editing.plan import EpisodeSlice, Plan
+
+MAX_SHOWN = 20
+"""Ranges of episodes, or differences of one level, that are printed."""
+DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
+CONDITION_HELP = (
+    "Condition on columns of the table of episodes or of demorec's sidecar, and on episode_index, num_frames, "
+    'duration_s, task, and verdict, score of demorec check: success and num_frames < 300; "cube" in task.'
+)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Edit:
+    """Flags of every command that writes a dataset."""
+
+    out: OptionalTarget = None
+    """Folder of the new dataset."""
+    decode: bool = False
+    """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
+    overwrite: bool = False
+    """Replace an existing dataset."""
+    dry_run: bool = False
+    """Print what would come out, and write nothing."""
+
+    def sources(self) -> Sequence[LeRobotFolder]:
+        """The datasets to read."""
+        raise NotImplementedError
+
+    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
+        """The new dataset."""
+        raise NotImplementedError
+
+    def has_work(self, sources: Sequence[LeRobotFolder]) -> bool:
+        """Whether there is anything to write; says so otherwise."""
+        return True
+
+    def part_names(self) -> Sequence[str]:
+        """Names of the new datasets within --out; "" for --out itself."""
+        return [""]
+
+    def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
+        """Name within --out -> new dataset."""
+        return {"": self.plan(sources)}
+
+    def run(self) -> int:
+        """Plan, write, and print what came out."""
+        from demorec.datasets.lerobot.files import leave_pandas_out
+        from demorec.extensions.editing.write import check_target
+
+        leave_pandas_out()
+        if self.out is None and not self.dry_run:
+            raise ConfigError("Name the folder of the new dataset (--out NEW), or ask what it would be (--dry-run).")
+        sources = self.sources()
+        say(*(note for source in sources for note in source.notes))
+        if not self.has_work(sources):
+            return 0
+        outs = [self.out / name for name in self.part_names()] if self.out is not None else []
+        refuse_inside(outs)
+        if outs and not self.dry_run:
+            self._write(sources, outs)
+            return 0
+        for out in outs:
+            check_target(out, sources, overwrite=self.overwrite)
+        for name, plan in self.plans(sources).items():
+            say(*_changes(plan))
+            self._print_result("Would be ", name, plan, "Would not be taken over")
+        return 0
+
+    def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
+        """Write the new datasets, which appear together, and print what came out."""
+        from demorec.extensions.editing.write import new_datasets, write_plan
+
+        results: list[tuple[int, int]] = []
+        with new_datasets(outs, sources, overwrite=self.overwrite) as folders:
+            plans = self.plans(sources)
+            for plan, folder in zip(plans.values(), folders, strict=True):
+                with ProgressBar("writing") as bar:
+                    results.append(write_plan(plan, folder, decode=self.decode, progress=bar.set))
+        for (name, plan), (decoded, around) in zip(plans.items(), results, strict=True):
+            say(*_changes(plan))
+            self._print_result("", name, plan, "Not taken over")
+            if around:
+                say(f"{counted(around, 'image')} beside cuts stay in the videos, since others need them.")
+            if decoded:
+                say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
+
+    def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
+        from demorec.extensions.editing.beside import MAX_NAMES, left_out, unknown_files
+
+        lengths = [place.length for source in plan.sources for place in source.places]
+        frames = sum(cut.last - cut.first for cut in plan.cuts)
+        numbers = [cut.episode for cut in plan.cuts]
+        is_in_parts = len(plan.sources) == 1 and len(set(numbers)) < len(numbers)
+        count = f"{len(plan.cuts)} of {counted(len(lengths), 'episode')}"
+        if is_in_parts:
+            count = f"{len(plan.cuts)} parts of {counted(len(lengths), 'episode')}"
+        text = f"{begin}{count}, {frames} of {sum(lengths)} frames"
+        place = str(self.out / name) if self.out is not None else name
+        if self.dry_run and len(plan.sources) == 1 and not is_in_parts and numbers != list(range(len(lengths))):
+            say(f"episodes {_listed(numbers)}")
+        say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
+        if unknown := unknown_files(plan.sources[0]) if len(plan.sources) == 1 else ():
+            more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
+            say(f"Copied, but not understood: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still hold.")
+
+
+@dataclass(frozen=True, kw_only=True)
+class EditOne(Edit):
+    """Flags of every command that makes one dataset of another."""
+
+    dataset: DatasetPath
+
+    def sources(self) -> Sequence[LeRobotFolder]:
+        """The dataset."""
+        from demorec.datasets.lerobot.folder import LeRobotFolder
+
+        return [LeRobotFolder(dataset_at(self.dataset))]
+
+
+def _changes(plan: Plan) -> list[str]:
+    """Lines about what is done to episodes."""
+    from demorec.extensions.editing.plan import mistyped_features
+
+    lines = []
+    for source in plan.sources:
+        for name, dtype in mistyped_features(source).items():
+            claimed = source.info.features[name].dtype
+            lines.append(
+                f"info.json says {claimed} of {name}, which the data files hold as {dtype}: corrected in the result."
+            )
+    if new := sum(bool(cut.task) for cut in plan.cuts):
+        lines.append(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
+    parts: dict[tuple[int, int], list[EpisodeSlice]] = {}
+    for cut in plan.cuts:
+        parts.setdefault((cut.source, cut.episode), []).append(cut)
+    for (number, episode), cuts in parts.items():
+        length, cut = plan.sources[number].places[episode].length, cuts[0]
+        if not cut.has_end:
+            shown = [f"{part.first}:{part.last}" for part in cuts[:MAX_SHOWN]] + ["..."] * (len(cuts) > MAX_SHOWN)
+            lines.append(f"episode {episode}: {len(cuts)} parts of {length} frames, {', '.join(shown)}")
+        elif (cut.first, cut.last) != (0, length):
+            head = counted(cut.first, "frame")
+            lines.append(f"episode {cut.episode}: {head} cut at the beginning, {length - cut.last} at the end")
+    return list(dict.fromkeys(lines))
+
+
+def dataset_at(path: Path) -> Path:
+    """The named dataset, or that of a run; ConfigError for anything else."""
+    from demorec.runs.find import expect
+    from demorec.runs.run_file import DATASET
+
+    if expect(path, "dataset", "run").kind == "dataset":
+        return path
+    if not is_dataset(path / DATASET):
+        raise ConfigError(f"This run has no dataset in {DATASET}/, make one (demorec export lerobot): {path}")
+    return path / DATASET
+
+
+def episode_numbers(texts: Sequence[str]) -> list[int]:
+    """Numbers of episodes from 0,3,5:9 or 0 3 5:9; a range excludes its end."""
+    found: list[int] = []
+    try:
+        for part in " ".join(texts).replace(",", " ").split():
+            first, colon, last = part.partition(":")
+            found += range(int(first), int(last)) if colon else [int(first)]
+    except (ValueError, MemoryError, OverflowError):
+        found = []
+    if texts and not found:
+        raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {' '.join(texts)!r}.")
+    return found
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    """Some of the numbers, as `episode_numbers` reads them."""
+    parts: list[tuple[int, int]] = []
+    for number in numbers:
+        if parts and parts[-1][1] == number:
+            parts[-1] = (parts[-1][0], number + 1)
+        else:
+            parts.append((number, number + 1))
+    texts = [f"{first}:{end}" if end - first > 1 else str(first) for first, end in parts]
+    return ",".join(texts[:MAX_SHOWN]) + (",..." if len(texts) > MAX_SHOWN else "")
+
+
+def pairs(words: Sequence[str], example: str) -> dict[str, str]:
+    """NAME=VALUE of each word; ConfigError for anything else."""
+    found = dict(word.partition("=")[::2] for word in words)
+    if not words or any("=" not in word for word in words) or len(found) != len(words):
+        given = f", not {' '.join(words)!r}" if words else ""
+        raise ConfigError(f"Each name is given once, with what it gets: {example}{given}.")
+    return found

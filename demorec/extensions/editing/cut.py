@@ -1,0 +1,171 @@
+"""Plans that cut episodes into parts: at frames, where the data jump, or around pauses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import ConfigError, OptionError
+from demorec.core.geometry import Array
+from demorec.core.registry import check_choice
+from demorec.datasets.lerobot.files import column_numbers
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
+from demorec.extensions.editing.plan import EpisodeSlice, Plan
+
+_NEAR = 5
+"""Steps before and after one that it is compared with; a slow sensor repeats a number for fewer frames."""
+Span = tuple[int, int]
+"""First frame of a part, and the one behind its last."""
+
+
+class WatchedNumbers:
+    """Numbers by which motion is judged, episode after episode.
+
+    Args:
+        source: The dataset.
+        features: Features to watch; empty for the state without grippers.
+
+    Raises:
+        ConfigError: No such feature of numbers, or the state is not known.
+    """
+
+    def __init__(self, source: LeRobotFolder, features: Sequence[str] = ()) -> None:
+        numeric = [
+            name
+            for name, feature in source.info.features.items()
+            if feature.is_numeric and name not in AUTOMATIC_FEATURES
+        ]
+        for feature in features:
+            check_choice("feature of numbers", feature, numeric)
+        self._names = features or source.roles.state
+        if not self._names:
+            raise ConfigError(f"No state was found: name a feature by --feature: {source.root}")
+        self._is_watched: NDArray[np.bool_] | None = None if features else ~source.roles.grippers()
+        self._source, self._rows = source, source.rows(self._names)
+
+    def episode(self, number: int) -> Array:
+        """(T, D) numbers of an episode."""
+        table = self._rows.read(self._source.places[number])
+        columns = [column_numbers(table.column(name).combine_chunks()) for name in self._names]
+        values = np.hstack(columns).astype(np.float64)
+        return values if self._is_watched is None else values[:, self._is_watched]
+
+    def ranges(self) -> Array:
+        """(D,) difference between largest and smallest number over the dataset."""
+        low, high = np.inf, -np.inf
+        for number in range(len(self._source.places)):
+            values = self.episode(number)
+            low = np.fmin(low, np.fmin.reduce(values))
+            high = np.fmax(high, np.fmax.reduce(values))
+        return np.asarray(high - low)
+
+
+def cut_at(source: LeRobotFolder, frames: Mapping[int, Sequence[int]]) -> Plan:
+    """All episodes, some cut before given frames: number of an episode -> frames that begin another part."""
+    plan = Plan.whole(source)
+    for number, begins in frames.items():
+        if not 0 <= number < len(plan.cuts):
+            raise ConfigError(f"There is no episode {number}: the dataset has 0 to {len(plan.cuts) - 1}: {source.root}")
+        length = plan.cuts[number].last
+        if wrong := [frame for frame in begins if not 0 < frame < length]:
+            raise ConfigError(
+                f"Episode {number} of {length} frames cannot be cut before frame {wrong[0]}: give 1 to {length - 1}."
+            )
+    return _in_parts(plan, {number: _between(plan.cuts[number].last, begins) for number, begins in frames.items()})
+
+
+def cut_at_jumps(source: LeRobotFolder, features: Sequence[str], threshold: float) -> Plan:
+    """All episodes, cut where numbers jump.
+
+    Args:
+        source: The dataset.
+        features: Whose numbers are watched; none for the state without grippers.
+        threshold: A number jumps where its step from one frame to the next exceeds all steps near it by more than this
+            share of its range over the dataset; in motion, steps near each other are similar.
+    """
+    _check_share("jump_threshold", threshold)
+    plan, watched = Plan.whole(source), WatchedNumbers(source, features)
+    least = threshold * watched.ranges()
+    parts = {}
+    for number, cut in enumerate(plan.cuts):
+        steps = np.abs(np.diff(watched.episode(number), axis=0))
+        begins = np.flatnonzero((steps - _largest_near(steps) > least).any(axis=1)) + 1
+        parts[number] = _between(cut.last, begins.tolist())
+    return _in_parts(plan, parts)
+
+
+def without_pauses(
+    source: LeRobotFolder, features: Sequence[str], *, min_frames: int, threshold: float, margin: int
+) -> Plan:
+    """All episodes without their pauses; each part between two pauses becomes an episode.
+
+    Args:
+        source: The dataset.
+        features: Whose numbers are watched; none for the state without grippers.
+        min_frames: Minimum length of a pause.
+        threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
+        margin: Still frames that stay at either end of a pause.
+    """
+    _check_share("still_threshold", threshold)
+    if min_frames < 2:
+        raise OptionError("pauses", f"is shorter than two frames at {source.info.fps} frames per second.")
+    plan, watched = Plan.whole(source), WatchedNumbers(source, features)
+    least = threshold * watched.ranges()
+    parts = {}
+    for number, cut in enumerate(plan.cuts):
+        kept: list[Span] = []
+        begin = 0
+        for first, last in _pauses(watched.episode(number), least, min_frames):
+            end = min(first + margin, last) if first else 0
+            kept.append((begin, end))
+            begin = max(last - margin, end) if last < cut.last else cut.last
+        kept = [span for span in [*kept, (begin, cut.last)] if span[1] > span[0]]
+        parts[number] = kept or [(0, cut.last)]  # nothing moves at all: that is for `drop` to decide
+    return _in_parts(plan, parts)
+
+
+def _largest_near(steps: Array) -> Array:
+    """Find the largest of the steps (T, D) around each one."""
+    padded = np.pad(steps, ((_NEAR, _NEAR), (0, 0)))
+    shifts = [shift for shift in range(2 * _NEAR + 1) if shift != _NEAR]
+    return np.asarray(np.max([padded[shift : shift + len(steps)] for shift in shifts], axis=0))
+
+
+def _pauses(values: Array, least: Array, min_frames: int) -> Iterator[Span]:
+    """Yield the stretches in which all of (T, D) numbers stay within `least` (D,) of those at their beginning."""
+    begin = 0
+    while begin + min_frames <= len(values):
+        has_left = (np.abs(values[begin + 1 : begin + min_frames] - values[begin]) > least).any(axis=1)
+        if has_left.any():
+            begin += 1
+            continue
+        moved = np.flatnonzero((np.abs(values[begin:] - values[begin]) > least).any(axis=1))
+        end = begin + int(moved[0]) if len(moved) else len(values)
+        yield begin, end
+        begin = end
+
+
+def _check_share(option: str, value: float) -> None:
+    if not 0 < value <= 1:
+        raise OptionError(option, f"is {value}, allowed are shares above 0 and up to 1.")
+
+
+def _between(length: int, begins: Sequence[int]) -> list[Span]:
+    """The parts of an episode that begin at 0 and at some frames."""
+    edges = [0, *sorted(set(begins)), length]
+    return list(pairwise(edges))
+
+
+def _in_parts(plan: Plan, parts: Mapping[int, Sequence[Span]]) -> Plan:
+    """Each episode in its parts, of which the last one ends as the episode did; others stay whole."""
+    cuts: list[EpisodeSlice] = []
+    for number, cut in enumerate(plan.cuts):
+        spans = parts.get(number, [(cut.first, cut.last)])
+        cuts += [replace(cut, first=first, last=last, has_end=False) for first, last in spans[:-1]]
+        cuts.append(replace(cut, first=spans[-1][0], last=spans[-1][1]))
+    return plan.with_cuts(cuts)

@@ -1,0 +1,222 @@
+"""Merge datasets into one: features matched by name, all differences reported at once, a mapping (TOML) to solve them.
+
+[[dataset]]
+path = "b"                                  # as on the command line
+robot_type = "so100"                        # what its arm is called in the merged dataset
+drop = ["observation.images.side"]
+
+[dataset.feature."observation.state"]       # a feature of the merged dataset
+from = "state"                              # its name in this one
+elements = ["shoulder", "gripper"]          # names in this one, in the order of the first dataset
+unit = "degree"                             # here: rad (as it is), degree, or normalised, with low and high in rad
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.core.errors import ConfigError, describe_error
+from demorec.core.files import read_text_limited
+from demorec.core.registry import check_choice, nearest_match
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
+from demorec.extensions.editing.operations import joined
+from demorec.extensions.editing.plan import FeatureMapping, Plan
+
+_UNITS = ("rad", "degree", "normalised")
+_MAX_BYTES = 1 << 20
+_KEYS = ("path", "robot_type", "drop", "feature")
+_FEATURE_KEYS = ("from", "elements", "unit", "low", "high")
+
+
+class DatasetsDifferError(ConfigError):
+    """Datasets that cannot be joined as they are.
+
+    Args:
+        sentence: All differences.
+        mapping: Lines of a mapping under which those of one rate fit, as far as any does.
+    """
+
+    def __init__(self, sentence: str, mapping: Sequence[str]) -> None:
+        super().__init__(sentence, mapping)
+        self.mapping = mapping
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def merge(sources: Sequence[LeRobotFolder], mapping: Path | None = None) -> Plan:
+    """All episodes of all datasets, one after the other.
+
+    Raises:
+        DatasetsDifferError: They differ; with all differences, and a mapping that would solve what one can.
+        ConfigError: The mapping cannot be used.
+    """
+    if len(sources) < 2:
+        raise ConfigError("Name two or more datasets to merge.")
+    entries = {} if mapping is None else _read(mapping, [source.root for source in sources])
+    plans: list[Plan] = []
+    for source in sources:
+        entry = entries.get(source.root.resolve(), {})
+        plans.append(_mapped(Plan.whole(source), entry, plans[0] if plans else None, mapping))
+    wrong = [text for plan in plans[1:] for text in _differences(plans[0], plan)]
+    if wrong:
+        raise DatasetsDifferError(f"These datasets differ: {'; '.join(wrong)}.", list(_suggested(plans)))
+    mappings = [{name: plan.mappings[0][name] for name in plans[0].mappings[0]} for plan in plans]
+    return joined([replace(plan, mappings=(mapping,)) for plan, mapping in zip(plans, mappings, strict=True)])
+
+
+def _read(path: Path, roots: Sequence[Path]) -> dict[Path, dict[str, Any]]:
+    try:
+        data = tomllib.loads(read_text_limited(path, _MAX_BYTES))
+        found = data.get("dataset", [])
+        entries = {Path(entry["path"]).resolve(): dict(entry) for entry in found}
+        if set(data) - {"dataset"}:
+            raise ValueError(f"it has {sorted(set(data) - {'dataset'})[0]!r} beside the datasets")
+    except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise ConfigError(f"The mapping cannot be used ({describe_error(error)}): {path}") from error
+    if strange := [entry for entry in entries if entry not in [root.resolve() for root in roots]]:
+        raise ConfigError(f"The mapping is about a dataset that is not merged, {strange[0]}: {path}")
+    return entries
+
+
+def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path | None) -> Plan:
+    """A dataset as its entry in the mapping wants it."""
+    for key in entry:
+        check_choice("key of a mapping", key, _KEYS)
+    features, mappings = dict(plan.info.features), dict(plan.mappings[0])
+    for name in entry.get("drop", ()):
+        if name not in mappings:
+            raise ConfigError(f"The mapping drops {name!r}, which is not there.{nearest_match(name, mappings)}: {path}")
+        del features[name], mappings[name]
+    wanted = entry.get("feature", {})
+    used = {item.get("from", name) for name, item in wanted.items()}
+    for name in used - set(wanted):  # renamed
+        features.pop(name, None)
+        mappings.pop(name, None)
+    for name, item in wanted.items():
+        for key in item:
+            check_choice("key of a feature in a mapping", key, _FEATURE_KEYS)
+        model = first.info.features.get(name) if first is not None else None
+        try:
+            features[name], mappings[name] = _converted(plan.info.features, name, item, model)
+        except (ValueError, TypeError, KeyError) as error:
+            raise ConfigError(f"The mapping of {name} cannot be used ({describe_error(error)}): {path}") from error
+    fixed = {name: features.pop(name) for name in AUTOMATIC_FEATURES}
+    mapped = plan.with_features({**features, **fixed}, mappings)
+    return replace(mapped, info=replace(mapped.info, robot_type=entry.get("robot_type", mapped.info.robot_type)))
+
+
+def _converted(
+    there: Mapping[str, DatasetFeature], name: str, item: Mapping[str, Any], model: DatasetFeature | None
+) -> tuple[DatasetFeature, FeatureMapping]:
+    """A feature of the merged dataset and its mapping, by an entry and the first dataset's feature of that name."""
+    origin = item.get("from", name)
+    if origin not in there:
+        raise ValueError(f"there is no feature {origin!r}")
+    own = there[origin]
+    if set(item) <= {"from"}:
+        return own, FeatureMapping(feature=origin)
+    if not _is_vector(own) or (model is not None and not _is_vector(model)):
+        raise ValueError("only vectors of numbers are converted")
+    target = model or own
+    elements = None
+    if "elements" in item:
+        elements = tuple(own.elements.index(text) for text in item["elements"])
+        if model is None:
+            target = replace(own, shape=(len(elements),), names=tuple(item["elements"]), written_names=None)
+    width = own.shape[0] if elements is None else len(elements)
+    if width != target.shape[0]:
+        raise ValueError(f"it gives another number of elements than {target.shape[0]}")
+    scale, offset = _unit(item, width)
+    return target, FeatureMapping(feature=origin, elements=elements, scale=scale, offset=offset)
+
+
+def _unit(item: Mapping[str, Any], width: int) -> tuple[Any, Any]:
+    """(D,) factor and summand that convert an entry's unit to rad; None for rad."""
+    unit = check_choice("unit", str(item.get("unit", "rad")), _UNITS)
+    if unit == "rad":
+        return None, None
+    if unit == "degree":
+        return np.full(width, math.pi / 180), np.zeros(width)
+    low = np.broadcast_to(np.asarray(item["low"], dtype=np.float64), (width,))
+    high = np.broadcast_to(np.asarray(item["high"], dtype=np.float64), (width,))
+    return (high - low) / 200, (high + low) / 2  # LeRobot's range of a joint is -100 to 100
+
+
+def _differences(a: Plan, b: Plan) -> Iterator[str]:
+    root = b.sources[0].root
+    if a.info.fps != b.info.fps:
+        yield f"{root} has {b.info.fps} frames a second, not {a.info.fps}, which no mapping solves"
+    if a.info.robot_type != b.info.robot_type:
+        yield f"{root} has the robot {b.info.robot_type}, not {a.info.robot_type}"
+    for name in a.info.features:
+        if name not in b.info.features:
+            yield f"{root} has no {name}"
+    for name, feature in b.info.features.items():
+        there = a.info.features.get(name)
+        if there is None:
+            yield f"{root} has {name}, which the first one has not"
+            continue
+        for what, value, first in feature.differences(there):
+            yield f"{name} of {root} has {what} {value}, not {first}"
+
+
+def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
+    """Lines of a mapping: features that not all datasets can give are dropped, elements put into one order."""
+    plans = [plan for plan in plans if plan.info.fps == plans[0].info.fps]
+    if len(plans) < 2:
+        return
+    robots = [plan.info.robot_type for plan in plans if plan.info.robot_type]
+    first = plans[0].info.features
+    common = [name for name in first if all(_can_give(plan.info.features.get(name), first[name]) for plan in plans)]
+    for plan in plans:
+        features = plan.info.features
+        yield from ("[[dataset]]", f"path = {_quoted(str(plan.sources[0].root))}")
+        if robots and plan.info.robot_type != robots[0]:
+            yield f"robot_type = {_quoted(robots[0])}"
+        if dropped := [name for name in features if name not in common]:
+            yield f"drop = {_quoted(dropped)}"
+        yield from _other_names(plans[0], plan)
+        for name in common:
+            if not _fits(features[name], first[name]):
+                yield f"[dataset.feature.{_quoted(name)}]"
+                yield f"elements = {_quoted(first[name].elements)}"
+        yield ""
+
+
+def _can_give(own: DatasetFeature | None, first: DatasetFeature) -> bool:
+    """Whether a feature equals that of the first dataset, or has all of its elements."""
+    if own is None or own.dtype != first.dtype:
+        return False
+    return _fits(own, first) or (_is_vector(own, first) and set(first.elements) <= set(own.elements))
+
+
+def _other_names(first: Plan, plan: Plan) -> Iterator[str]:
+    """Comments: which features may be one under two names, which nobody but the user knows."""
+    there, here = first.info.features, plan.info.features
+    for name in [name for name in there if name not in here]:
+        for own in [own for own in here if own not in there and _fits(here[own], there[name])]:
+            yield f"# If {_quoted(own)} is what the first one calls {_quoted(name)}, drop neither, and add:"
+            yield from (f"# [dataset.feature.{_quoted(name)}]", f"# from = {_quoted(own)}")
+
+
+def _quoted(value: object) -> str:
+    """As TOML has it, which knows no surrogates."""
+    return json.dumps(value, ensure_ascii=False)
+
+
+def _is_vector(*features: DatasetFeature) -> bool:
+    return all(feature.is_numeric and len(feature.shape) == 1 for feature in features)
+
+
+def _fits(a: DatasetFeature, b: DatasetFeature) -> bool:
+    return not any(a.differences(b))

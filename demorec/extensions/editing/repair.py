@@ -1,0 +1,271 @@
+"""A damaged dataset as its rows have it. Nothing is invented: what neither rows nor tables say is refused.
+
+Written like any other edit, the result has tables, counters and statistics that fit its rows.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from demorec.core.errors import ExportError, without_path
+from demorec.datasets.lerobot.episode_table import (
+    EpisodePlace,
+    are_on_grid,
+    has_episode_table,
+    read_episode_table,
+    read_tasks,
+)
+from demorec.datasets.lerobot.files import column_numbers, open_table
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.mp4_index import mp4_index
+from demorec.datasets.lerobot.paths import is_dataset_file
+from demorec.datasets.lerobot.row_episodes import EpisodeRun, episode_runs, images_by_rows, placed
+from demorec.datasets.lerobot.rows import DataRows
+from demorec.extensions.editing.plan import Plan
+from demorec.extensions.editing.repair_features import (
+    Repaired,
+    repaired_cameras,
+    repaired_features,
+    repaired_rate,
+    stated_info,
+    usable_info,
+)
+from demorec.extensions.editing.repair_tables import stated_splits, table_changes
+
+_MAX_NAMED = 5
+_Images = list[tuple[Path, int] | None]
+
+
+class RepairedDataset(LeRobotFolder):
+    """An open dataset, with what its tables and info.json should say.
+
+    Args:
+        root: Its folder.
+
+    Attributes:
+        changes: A sentence for each difference from tables and info.json.
+        instructions: Number of an episode -> its instruction, if its rows do not name it.
+
+    Raises:
+        ExportError: Something would have to be invented.
+    """
+
+    def __init__(self, root: Path) -> None:
+        self.changes: list[str] = []
+        self.stated = stated_info(root)
+        super().__init__(root, info=usable_info(self.stated, root))
+        self.data_tables = [path for path in self.data_tables if self._is_readable(path)]
+        self.episode_tables = [path for path in self.episode_tables if self._is_readable(path)]
+        stored = self._stored()
+        runs = self._ordered_runs()
+        videos = sorted((root / "videos").rglob("*.mp4"))
+        self._correct_info(repaired_features(self.info, self.data_tables, videos))
+        self._correct_info(repaired_rate(self.info, self.data_tables[0], videos))
+        if len({run.episode_index for run in runs}) < len(runs):
+            stored, self.episode_tables, self.keeps_statistics = {}, [], False
+        kept, images = self._with_images(runs, stored)
+        self._correct_info(repaired_cameras(self, images))
+        self.num_rows = {path: open_table(path).metadata.num_rows for path in self.data_tables}
+        self._count(kept)
+        self.instructions: dict[int, str] = {}
+        self._set_tasks(kept, stored)
+        self.listed = self.places = placed(kept, images, self.tasks)
+        self._check_timestamps()
+        self.changes += table_changes(self, self.stated, stored)
+        self.info = replace(self.info, splits=stated_splits(self, self.stated))
+
+    def _correct_info(self, repaired: Repaired) -> None:
+        self.info, changes = repaired
+        self.changes += changes
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """The changes."""
+        return tuple(self.changes)
+
+    def plan(self) -> Plan:
+        """All episodes, each with its instruction."""
+        plan = Plan.whole(self)
+        return plan.with_cuts(
+            [replace(cut, task=self.instructions.get(number, "")) for number, cut in enumerate(plan.cuts)]
+        )
+
+    def rows(self, names: Sequence[str]) -> DataRows:
+        """Read some columns of the data files, of those that they have."""
+        there = set(open_table(self.data_tables[0]).schema_arrow.names)
+        return super().rows([name for name in names if name in there])
+
+    def change(self, sentence: str) -> None:
+        """Note a difference, once."""
+        if sentence not in self.changes:
+            self.changes.append(sentence)
+
+    def _is_readable(self, path: Path) -> bool:
+        name = path.relative_to(self.root).as_posix()
+        try:
+            if not is_dataset_file(name):
+                raise ExportError("LeRobot gives no file this name")
+            open_table(path)
+        except ExportError as error:
+            self.change(f"{name} is left out: {without_path(error, path)}")
+            return False
+        return True
+
+    def _stored(self) -> dict[int, EpisodePlace]:
+        """Episode index -> where the table says that the episode is; empty where that cannot be used."""
+        if not has_episode_table(self.root, self.info):
+            self.change("The table of episodes is missing: it is written from the rows.")
+            return {}
+        try:
+            return {place.episode_index: place for place in read_episode_table(self.root, self.info)}
+        except ExportError as error:
+            self.change(f"The table of episodes is written from the rows: {without_path(error, self.root)}")
+            return {}
+
+    def _ordered_runs(self) -> list[EpisodeRun]:
+        """Find the episodes by the rows of the files that can be read, in the order of their numbers."""
+        runs: list[EpisodeRun] = []
+        problems: dict[Path, ExportError] = {}
+        for path in self.data_tables:
+            try:
+                runs += episode_runs([path], first=len(runs))
+            except ExportError as error:
+                problems[path] = error
+                self.change(f"{path.relative_to(self.root).as_posix()} is left out: {without_path(error, path)}")
+        self.data_tables = [path for path in self.data_tables if path not in problems]
+        if not runs:
+            raise next(iter(problems.values()), ExportError(f"No data file of the dataset can be read: {self.root}"))
+        if len({run.episode_index for run in runs}) == len(runs):
+            runs.sort(key=lambda run: run.episode_index)
+        for run in runs:
+            self._check_frames(run)
+        return runs
+
+    def _check_frames(self, run: EpisodeRun) -> None:
+        """Note a `frame_index` that does not begin at 0. Raises ExportError if rows are missing between others."""
+        frames = run.counters.get("frame_index", np.arange(run.length))
+        steps = np.flatnonzero(np.diff(frames) != 1)
+        if len(steps):
+            first = int(steps[0])
+            raise ExportError(
+                f"Rows of episode {run.episode_index} are missing or exchanged (frame_index {frames[first + 1]} comes "
+                f"after {frames[first]}), and nothing says which: drop it first (demorec dataset drop --episodes "
+                f"{run.episode_index}): {run.data}"
+            )
+        if frames[0] != 0:
+            self.own_counters = ("episode_index",)
+            self.change("frame_index is counted from 0 in each episode.")
+
+    def _with_images(
+        self, runs: Sequence[EpisodeRun], stored: Mapping[int, EpisodePlace]
+    ) -> tuple[list[EpisodeRun], dict[str, list[tuple[Path, int]]]]:
+        """Find the images of the episodes; leave episodes out if their images cannot be read."""
+        found = {key: self._images(key, runs, stored) for key in self.info.video_keys}
+        missing = {n: key for key, images in found.items() for n, image in enumerate(images) if image is None}
+        for number, key in missing.items():
+            self.change(f"Episode {runs[number].episode_index} is left out: images of {key} are missing or damaged.")
+        if len(missing) == len(runs):
+            raise ExportError(
+                f"No episode has all its images: leave a camera out (demorec dataset drop-features), or restore its "
+                f"videos: {self.root}"
+            )
+        kept = {key: [image for n, image in enumerate(images) if image is not None and n not in missing]
+                for key, images in found.items()}  # fmt: skip
+        return [run for number, run in enumerate(runs) if number not in missing], kept
+
+    def _images(self, key: str, runs: Sequence[EpisodeRun], stored: Mapping[int, EpisodePlace]) -> _Images:
+        """Find the images of a camera by the table if all that it says is possible, else by their number."""
+        if self.info.is_old or any(run.episode_index not in stored for run in runs):
+            places = images_by_rows(self.root, self.info, key, runs)
+        else:
+            places = [stored[run.episode_index].videos[key] for run in runs]
+        counts = {path: _num_images(path) for path, _ in places}
+        ends: dict[Path, int] = {}
+        found: _Images = []
+        for run, (path, first) in zip(runs, places, strict=True):
+            count = counts[path]
+            is_possible = first >= ends.get(path, 0) and (count is None or first + run.length <= count)
+            is_short = count is not None and count < run.length and sum(other == path for other, _ in places) == 1
+            if not is_possible and not is_short:
+                self.keeps_statistics = False
+                return list(images_by_rows(self.root, self.info, key, runs))
+            ends[path] = first + run.length
+            found.append((path, first) if is_possible and count is not None else None)
+        return found
+
+    def _count(self, runs: Sequence[EpisodeRun]) -> None:
+        """Note counters that are missing or wrong."""
+        numbers = [run.episode_index for run in runs]
+        if numbers != list(range(len(runs))):
+            self.change(f"The episodes are numbered from 0 on; they were {_listed(numbers)}.")
+        begin, wrong = 0, 0
+        for run in runs:
+            rows = np.arange(begin, begin + run.length)
+            wrong += not np.array_equal(run.counters.get("index", rows), rows)
+            begin += run.length
+        if wrong:
+            self.change(f"index counts on over the whole dataset: it was wrong in {wrong} of {len(runs)} episodes.")
+
+    def _set_tasks(self, runs: Sequence[EpisodeRun], stored: Mapping[int, EpisodePlace]) -> None:
+        """Take the instructions from the rows, else from the table of episodes; ExportError where neither has one."""
+        try:
+            known = {number: task for number, task in enumerate(read_tasks(self.root)) if task}
+        except ExportError as error:
+            known = {}
+            self.change(f"The table of tasks is written again: {without_path(error, self.root)}")
+        self.tasks = [known.get(number, "") for number in range(max(known, default=-1) + 1)]
+        for number, run in enumerate(runs):
+            place = stored.get(run.episode_index)
+            own: tuple[str, ...] = place.tasks if place is not None and len(place.tasks) == 1 else ()
+            indices = run.task_indices
+            is_named = bool(indices) and all(index in known for index in indices)
+            if is_named and (not own or own[0] in known.values() or len(indices) > 1):
+                continue
+            if not own and not indices and len(known) == 1:
+                own = tuple(known.values())
+            if not own:
+                named = f"its rows name the task {indices[0]}, which no table has" if indices else "its rows name none"
+                raise ExportError(
+                    f"The instruction of episode {run.episode_index} is not known ({named}): give it one first "
+                    f"(demorec dataset set-task --episodes {run.episode_index}): {self.root}"
+                )
+            self.instructions[number] = own[0]
+            self.change(f"Episode {run.episode_index} has the instruction {own[0]!r} of the table of episodes.")
+
+    def _check_timestamps(self) -> None:
+        """Replace timestamps by multiples of 1/fps if they are not finite or LeRobot finds no images by them."""
+        if "timestamp" not in open_table(self.data_tables[0]).schema_arrow.names:
+            self.keeps_timestamps = False
+            return
+        rows, wrong, error_s = self.rows(["timestamp"]), 0, 0.0
+        for place in self.listed:
+            seconds = column_numbers(rows.read(place).column(0).combine_chunks())[:, 0].astype(np.float64)
+            is_finite = bool(np.isfinite(seconds).all())
+            if is_finite and (are_on_grid(seconds, self.info.fps) or not self.info.video_keys):
+                continue
+            wrong += 1
+            if is_finite:
+                error_s = max(error_s, float(np.abs(seconds - np.arange(len(seconds)) / self.info.fps).max()))
+        if wrong:
+            self.keeps_timestamps = False
+            self.change(
+                f"timestamp of {wrong} of {len(self.listed)} episodes is frame_index / fps, where LeRobot looks for "
+                f"the images; the measured ones were up to {1000 * error_s:.1f} ms off."
+            )
+
+
+def _num_images(path: Path) -> int | None:
+    """Number of images of a video; None if it cannot be read."""
+    with suppress(ExportError):
+        return len(mp4_index(path)[0])
+    return None
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    shown = ", ".join(map(str, numbers[:_MAX_NAMED]))
+    return f"{shown}, ..." if len(numbers) > _MAX_NAMED else shown

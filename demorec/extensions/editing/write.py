@@ -1,0 +1,337 @@
+"""Writes a planned dataset in one pass: rows and packets pass through, counters and statistics are made anew."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from PIL import Image
+
+from demorec.core.atomic import atomic_write_all
+from demorec.core.errors import ExportError
+from demorec.core.files import open_regular
+from demorec.core.replacing import check_replaceable
+from demorec.datasets.lerobot.episode_records import episode_statistics
+from demorec.datasets.lerobot.episode_table import EpisodePlace, are_on_grid
+from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
+from demorec.datasets.lerobot.files import column_numbers
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
+from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.mp4 import EncodedVideo
+from demorec.datasets.lerobot.paths import DATASET
+from demorec.datasets.lerobot.rows import IndexedRows
+from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
+from demorec.datasets.lerobot.videos import EpisodeVideo
+from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter, EpisodeData
+from demorec.datasets.options import ProgressCallback
+from demorec.extensions.editing.beside import (
+    SidecarReader,
+    copied_files,
+    kept_configs,
+    kept_export,
+    write_kept_progress,
+)
+from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan
+from demorec.extensions.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
+
+if TYPE_CHECKING:
+    from demorec.mcap.video import Rgb
+
+_RESULT = replace(DATASET, advice="choose --overwrite or another --out")
+_NUMBERS = tuple(name for name in NAMES if name != "count")
+_EPISODES_AT_ONCE = 64
+_OF_THE_END = ("next.done", "next.success", "next.reward")
+
+
+def new_datasets(
+    outs: Sequence[Path], sources: Sequence[LeRobotFolder], *, overwrite: bool
+) -> AbstractContextManager[Sequence[Path]]:
+    """Give a folder for each new dataset; all appear together when the block ends without an error.
+
+    Args:
+        outs: Where the datasets go.
+        sources: What they are made from, which is never replaced.
+        overwrite: Whether existing datasets are replaced.
+
+    Raises:
+        ConfigError: Something is in the way.
+        ExportError: They cannot be written; what was there before is still there.
+    """
+    return atomic_write_all(outs, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
+
+
+def check_target(out: Path, sources: Sequence[LeRobotFolder], *, overwrite: bool) -> None:
+    """Raise ConfigError if `new_datasets` would, since something is in the way at `out`."""
+    check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
+
+
+def write_plan(
+    plan: Plan, folder: Path, *, decode: bool = False, progress: ProgressCallback | None = None
+) -> tuple[int, int]:
+    """Write a dataset into an empty folder; its sources are not touched.
+
+    Args:
+        plan: Episodes and features of the dataset.
+        folder: Its folder.
+        decode: Decode all images for their statistics, also of episodes whose own are known.
+        progress: Called after every episode.
+
+    Returns:
+        How many episodes' images were decoded for their statistics; how many images beside cuts stay in the videos,
+        since others are decoded from them.
+
+    Raises:
+        ExportError: A source is damaged.
+        OSError: The dataset cannot be written.
+    """
+    readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
+    start = DatasetStart(info=plan.info, facts=_fact_types(plan), tasks=kept_tasks(plan), configs=kept_configs(plan))
+    with DatasetWriter(folder, start) as writer:
+        around = 0
+        for done, cut in enumerate(plan.cuts, start=1):
+            data = readers[cut.source].episode(cut)
+            around += sum(video.lead + video.tail for video in data.videos.values())
+            writer.add(data)
+            if progress is not None:
+                progress(done, len(plan.cuts))
+        for number, source in enumerate(plan.sources):
+            for attempt in source.attempts.homeless if plan.takes_all_of(number) else ():
+                writer.add_attempt(attempt)
+        writer.finish(kept_export(plan))
+    write_kept_progress(plan, folder)
+    for name in copied_files(plan):
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with open_regular(plan.sources[0].root / name) as source_file, (folder / name).open("wb") as target:
+            shutil.copyfileobj(source_file, target)
+    return sum(reader.num_decoded for reader in readers), around
+
+
+def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
+    """Columns of facts of all sources; of two types for one name the first one's."""
+    found: dict[str, pa.DataType] = {}
+    for source in plan.sources:
+        found = {**source.fact_types, **found}
+    return found
+
+
+class _Reader:
+    """The episodes of one source as the plan wants them."""
+
+    def __init__(self, plan: Plan, number: int, *, decode: bool) -> None:
+        self.source = plan.sources[number]
+        self.num_decoded = 0
+        self._features, self._fps = plan.info.features, plan.info.fps
+        self._mappings: Mapping[str, FeatureMapping] = plan.mappings[number]
+        info = self.source.info
+        names = {mapping.feature for mapping in self._mappings.values()}
+        self._names = [name for name in info.features if name in names and not info.features[name].is_video]
+        self._rows = self.source.rows([*self._names, "task_index", "timestamp"])
+        self._references = reference_columns(info)
+        self._task_numbers = new_task_numbers(plan, number) if self._references else np.zeros(0, np.int64)
+        schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
+        tables = self.source.episode_tables if self.source.fact_types else ()
+        self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
+        self._known = {} if decode or not self.source.keeps_statistics else _kept_statistics(self.source)
+        self._sidecar = SidecarReader(plan, number)
+        self._has_sidecar = any(source.sidecar_tables("episodes") for source in plan.sources)
+
+    def episode(self, cut: EpisodeSlice) -> EpisodeData:
+        """Read an episode."""
+        place = self.source.places[cut.episode]
+        all_rows = self._rows.read(place)
+        rows = all_rows.slice(cut.first, cut.last - cut.first)
+        whole = (cut.first, cut.last) == (0, place.length)
+        columns: dict[str, Any] = {}
+        videos: dict[str, EncodedVideo] = {}
+        video_info: dict[str, dict[str, Any]] = {}
+        pixels: dict[str, PixelHistogram | Statistics] = {}
+        language = EpisodeLanguage()
+        num_decoded = 0
+        for name, mapping in self._mappings.items():
+            feature = self._features[name]
+            if feature.dtype == "language":
+                language = self._language(rows, cut)
+                continue
+            if mapping.feature in self._references:
+                values = column_numbers(self._column(rows, mapping, feature))
+                columns[name] = renumbered(values, self._task_numbers)
+                continue
+            if feature.is_video:
+                stored = self.source.video(mapping.feature, place)
+                video = stored.cut(cut.first, cut.last)
+                videos[name] = video.with_digest() if self._has_sidecar else video
+                video_info[name] = feature.info or stored.file.stream_info()
+            else:
+                columns[name] = self._column(rows, mapping, feature)
+                if mapping.feature in _OF_THE_END and cut.has_end and cut.last != place.length:
+                    columns[name] = _with_end(columns[name], self._column(all_rows, mapping, feature))
+            if feature.is_camera:
+                known = self._kept(place, mapping.feature) if whole else None
+                pixels[name] = known or self._counted(mapping.feature, cut, rows)
+                num_decoded += known is None
+        self.num_decoded += num_decoded > 0
+        tasks = [cut.task] if cut.task else self._tasks(rows)
+        return EpisodeData(
+            task=tasks[0],
+            columns=columns,
+            videos=videos,
+            video_info=video_info,
+            pixels=pixels,
+            language=language,
+            facts=self._facts(cut, place),
+            row_tasks=tasks if len(set(tasks)) > 1 else (),
+            timestamps=self._timestamps(rows, cut),
+            record=self._sidecar.record(cut) if self._has_sidecar else None,
+            boxes=self._sidecar.boxes(cut),
+        )
+
+    def _timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[Any] | None:
+        """(T,) timestamps of a cut, (T,); None for the multiples of 1/fps.
+
+        Those of a cut that begins with its episode stay to the bit. Of a later one, whose timestamps were measured, the
+        first is subtracted in float64, and the result is rounded once.
+        """
+        if not self.source.keeps_timestamps:
+            return None
+        stored: NDArray[Any] = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
+        if not cut.first:
+            return stored
+        seconds = stored.astype(np.float64)
+        if are_on_grid(seconds, self._fps, seconds[0]):
+            return None
+        measured: NDArray[Any] = (seconds - seconds[0]).astype(stored.dtype)
+        return measured
+
+    def _kept(self, place: EpisodePlace, key: str) -> Statistics | None:
+        """The statistics that the source keeps of an episode, weighted by its frames; None where it has none."""
+        if (found := self._known.get((place.episode_index, key))) is None:
+            return None
+        values = dict(zip(_NUMBERS, found[1], strict=True))
+        return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
+
+    def _counted(self, key: str, cut: EpisodeSlice, rows: pa.Table) -> PixelHistogram:
+        """Every pixel of a camera in a cut, whose rows have been read."""
+        place, feature = self.source.places[cut.episode], self.source.info.features[key]
+        if feature.is_video:
+            return _video_histogram(self.source.video(key, place), feature, cut.first, cut.last)
+        return _histogram(self.source.stored_images[key].decode(place, rows.column(key).chunks))
+
+    def _column(self, rows: pa.Table, mapping: FeatureMapping, feature: DatasetFeature) -> Any:
+        array = rows.column(mapping.feature).combine_chunks()
+        array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
+        if not mapping.is_copy:
+            return mapping.apply(column_numbers(array), feature.dtype)
+        if feature.dtype == "image" and not pa.types.is_struct(array.type):  # plain bytes, as LeRobot reads them too
+            array = pa.StructArray.from_arrays(
+                [array.cast(pa.binary()), pa.nulls(len(array), pa.string())], names=["bytes", "path"]
+            )
+        elif feature.dtype == "image":
+            array = pa.StructArray.from_arrays(
+                [array.field("bytes"), array.field("path").cast(pa.string())], names=["bytes", "path"]
+            )
+        return array
+
+    def _tasks(self, rows: pa.Table) -> list[str]:
+        tasks, found = self.source.tasks, rows.column("task_index").to_numpy()
+        if found.dtype.kind == "f" and (found % 1 == 0).all():
+            found = found.astype(np.int64)
+        if found.dtype.kind != "i" or found.min() < 0 or found.max() >= len(tasks):
+            raise ExportError(f"A row names a task that is not in the table of tasks: {self.source.root}")
+        first = tasks[found[0]]
+        return [first] if (found == found[0]).all() else [tasks[index] for index in found.tolist()]
+
+    def _language(self, rows: pa.Table, cut: EpisodeSlice) -> EpisodeLanguage:
+        """What is said in these rows, times counted from the first of them."""
+        spoken = spoken_of(rows.select(COLUMNS).to_batches(), self.source.root)
+        latest: dict[str, dict[str, Any]] = {}
+        kept = []
+        for row in spoken.persistent:
+            if cut.task and row.get("style") == "task_aug":
+                continue  # wordings of the old instruction, which LeRobot would say in place of the new one
+            time = row.get("timestamp")
+            frame = None if time is None else round(time * self._fps) - cut.first
+            if frame is None or not cut.first:
+                kept.append(row)
+            elif frame <= 0:
+                latest[str(row.get("style"))] = {**row, "timestamp": 0.0}
+            elif frame < cut.last - cut.first:
+                kept.append({**row, "timestamp": float(np.float32(frame / self._fps))})
+        if cut.first == 0:
+            end = (cut.last - 0.5) / self._fps
+            kept = [row for row in kept if row.get("timestamp") is None or row["timestamp"] < end]
+        return EpisodeLanguage(persistent=[*latest.values(), *kept], events=spoken.events)
+
+    def _facts(self, cut: EpisodeSlice, place: EpisodePlace) -> dict[str, Any]:
+        table = self._fact_rows.read(place.episode_index)
+        facts: dict[str, Any] = {} if table is None else table.drop_columns("episode_index").to_pylist()[-1]
+        if "duration_s" in facts:
+            facts["duration_s"] = (cut.last - cut.first) / self._fps
+        if "success" in facts and not cut.has_end:
+            facts["success"] = None
+        if (cut.first, cut.last) != (0, place.length):
+            facts |= _clipped_stages(facts, cut)
+        return facts
+
+
+def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
+    """A cut column in whose last row stands what only the last row of the whole episode states: how it ended."""
+    if column_numbers(column)[:-1].any():
+        return kept
+    return pa.concat_arrays([kept[:-1], column[-1:]])
+
+
+def _clipped_stages(facts: Mapping[str, Any], cut: EpisodeSlice) -> dict[str, Any]:
+    """The stages of an episode within a cut, frames counted from its first one."""
+    names, starts, ends = facts.get(STAGE_NAMES), facts.get(STAGE_STARTS), facts.get(STAGE_ENDS)
+    if not names or not starts or not ends:
+        return {}
+    found: dict[str, list[Any]] = {STAGE_NAMES: [], STAGE_STARTS: [], STAGE_ENDS: []}
+    for name, start, end in zip(names, starts, ends, strict=True):
+        if start < cut.last and end >= cut.first:
+            found[STAGE_NAMES].append(name)
+            found[STAGE_STARTS].append(max(start, cut.first) - cut.first)
+            found[STAGE_ENDS].append(min(end, cut.last - 1) - cut.first)
+    return found
+
+
+def _kept_statistics(source: LeRobotFolder) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:
+    """(episode_index, camera) -> count and (9, C) numbers of the statistics that a dataset keeps of each episode."""
+    keys = [name for name, feature in source.info.features.items() if feature.is_camera]
+    found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
+    for number, key, entry in episode_statistics(source, keys):
+        try:
+            part = Statistics.from_json(entry)
+            values = None if part is None else np.stack([part.values[name] for name in _NUMBERS])
+        except (ValueError, TypeError):
+            continue
+        if part is not None and values is not None and np.isfinite(values).all():
+            found[number, key] = part.count, values
+    return found
+
+
+def _video_histogram(video: EpisodeVideo, feature: DatasetFeature, first: int, last: int) -> PixelHistogram:
+    """Of the images of some frames of a video, decoded, every pixel counted."""
+    if not feature.is_depth:
+        return _histogram(islice(video.images(first), last - first))
+    levels = video.depth_scale.values() * (1000 if (feature.info or {}).get("depth_unit") == "mm" else 1)
+    counts = np.zeros((1, len(levels)), dtype=np.int64)
+    for codes in islice(video.codes(first), last - first):
+        counts[0] += np.bincount(codes.ravel(), minlength=len(levels))
+    return PixelHistogram(counts=counts, level_values=levels, num_images=last - first)
+
+
+def _histogram(images: Iterable[Rgb]) -> PixelHistogram:
+    counts, num_images = np.zeros(3 * 256, dtype=np.int64), 0
+    for image in images:
+        num_images += 1
+        counts += Image.fromarray(image).histogram()  # three times as fast as NumPy's bincount
+    return PixelHistogram(counts=counts.reshape(3, 256), level_values=colour_levels(), num_images=num_images)

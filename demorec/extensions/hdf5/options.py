@@ -1,0 +1,32 @@
+"""What a user chooses about an export to HDF5."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from demorec.core.errors import OptionError, check_option
+from demorec.datasets.options import CommonOptions, Exporter
+
+
+@dataclass(frozen=True, kw_only=True)
+class Hdf5Options(CommonOptions):
+    """How recordings become an HDF5 file."""
+
+    valid_share: float = 0.1
+    """Share of the episodes that mask/valid names, spread evenly; mask/train names the others."""
+    compression: int = 4
+    """Level of gzip for images, 0 (none) to 9 (smallest)."""
+
+    def validate(self) -> None:
+        """Raise ConfigError for impossible values."""
+        super().validate()
+        if not 0 <= self.valid_share < 1:
+            raise OptionError("valid_share", f"is {self.valid_share}, it must be at least 0 and below 1.")
+        check_option("compression", self.compression, 0, 9)
+
+
+HDF5 = Exporter(
+    summary="robomimic's layout, one HDF5 file: decoded images, the same numbers, masks for training and validation",
+    options=Hdf5Options,
+    function="demorec.extensions.hdf5.export:export_hdf5",
+)

@@ -1,0 +1,319 @@
+"""Bags: MCAP, .db3 and ROS 1 .bag files, and the folders of rosbag2 with their metadata.yaml, compressed or not.
+
+The first bytes of a file tell its format, not its name. A bag is read from the front to the end, once for each call
+of `messages`, in the memory of a chunk.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+import zstandard
+
+from demorec.core.errors import ConfigError, describe_error, resource_error
+from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
+from demorec.core.targets import is_utf8
+from demorec.extensions.imports.bag_files import (
+    MAX_TIME_NS,
+    BagError,
+    Report,
+    Topics,
+    read_mcap,
+    read_ros1,
+    read_sqlite,
+)
+from demorec.extensions.imports.words import in_natural_order
+from demorec.mcap.scan import ScannedMessage
+from demorec.runs.find import BAG_SUFFIXES, IMPORT_WORDS, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, name_of
+
+NS = 1_000_000_000
+_SUFFIXES = (".mcap", *BAG_SUFFIXES)
+"""Suffixes of files that a folder of bags holds; other files in it are ignored."""
+_MAX_METADATA_BYTES = 16 << 20
+_MAX_PROBLEMS = 100
+_MAX_UNPACKED_RATIO = 1000
+"""Bytes of a compressed bag's content for each of the file: no more fill the disk."""
+_ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_READERS = {MCAP_MAGIC: read_mcap, SQLITE_MAGIC: read_sqlite, ROS1_MAGIC: read_ros1}
+Files = tuple[tuple[str, str], ...]
+"""Name and SHA-256, hex digits, of each of a bag's files."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Bag:
+    """A recording of another robot: a file, or a folder of rosbag2.
+
+    Attributes:
+        files: Files that hold its messages, in order.
+        messages_are_compressed: Whether each message is compressed by itself (rosbag2's compression mode MESSAGE).
+    """
+
+    path: Path
+    files: tuple[Path, ...]
+    messages_are_compressed: bool = False
+
+    @property
+    def name(self) -> str:
+        """Name of the file or folder, without suffixes."""
+        return self.path.name.split(".")[0] if self.path.is_file() else self.path.name
+
+    @property
+    def num_bytes(self) -> int:
+        """Size of its files."""
+        return sum(file.stat().st_size for file in self.files)
+
+    def sha256s(self) -> Files:
+        """Digests of its files, by which the bag is known again."""
+        return tuple((path.name, sha256_of(path)) for path in self.files)
+
+    def messages(self, problems: list[str], topics: Topics = None) -> Iterator[ScannedMessage]:
+        """Read its messages, file after file.
+
+        Args:
+            problems: Gets a reason for each file that cannot be read to its end, or each message that is left out; the
+                same one once.
+            topics: Wanted topics (None: all).
+
+        Raises:
+            BagError: A file cannot be read at all.
+        """
+        for path in self.files:
+
+            def report(reason: str, name: str = path.name) -> None:
+                problem = f"{name}: {reason}"
+                if len(problems) < _MAX_PROBLEMS and problem not in problems:
+                    problems.append(problem)
+
+            with _unpacked(path) as (plain, magic):
+                for message in _READERS[magic](plain, topics, report):
+                    if not 0 <= message.log_ns < MAX_TIME_NS:
+                        report(f"a message of {message.channel.topic} was recorded at no possible time")
+                        continue
+                    yield _unpacked_message(message, report) if self.messages_are_compressed else message
+
+
+def _unpacked_message(message: ScannedMessage, report: Report) -> ScannedMessage:
+    try:
+        return message._replace(data=zstandard.ZstdDecompressor().decompressobj().decompress(message.data))
+    except zstandard.ZstdError as error:
+        report(f"a message of {message.channel.topic} cannot be unpacked: {error}")
+        return message._replace(data=b"")
+
+
+def bags_in(path: Path) -> list[Path]:
+    """The bag at a path, or, of a folder without metadata.yaml, the bags in it, in the natural order of their names.
+
+    They are rosbag2 folders, MCAP, .db3 and .bag files, and those files in folders in it whose metadata.yaml was lost.
+    A folder that holds none of them is given back itself.
+    """
+    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or find(path).kind in IMPORT_WORDS:
+        return [path]
+    found: list[Path] = []
+    for entry in _entries(path):
+        if not entry.is_dir():
+            found += [entry] if entry.name.endswith(_SUFFIXES) else []
+        elif os.path.lexists(entry / ROSBAG2):
+            found.append(entry)
+        else:
+            found += [file for file in _entries(entry) if file.name.endswith(_SUFFIXES)]
+    return found or [path]
+
+
+def _entries(folder: Path) -> list[Path]:
+    try:
+        return sorted(folder.iterdir(), key=lambda path: in_natural_order(path.name))
+    except OSError as error:
+        raise resource_error(error, folder) or BagError(
+            f"The folder cannot be read ({error.strerror}): {folder}"
+        ) from error
+
+
+def open_bag(path: Path) -> Bag:
+    """Open the bag at a path, without reading its messages.
+
+    Raises:
+        ConfigError: There is none, or a dataset.
+        BagError: Its format is not read.
+    """
+    try:
+        mode = path.stat().st_mode
+    except OSError as error:
+        raise resource_error(error, path) or ConfigError(
+            f"There is no bag that could be read ({error.strerror}): {path}"
+        ) from error
+    if not is_utf8(path):
+        raise ConfigError(f"{NOT_UTF8}: {path}")
+    if stat.S_ISDIR(mode):
+        return _folder(path)
+    _magic_of(path)
+    return Bag(path=path, files=(path,))
+
+
+def _magic_of(path: Path) -> bytes:
+    """The first bytes of a file, which tell its format: a key of `_READERS`, or zstd's."""
+    try:
+        with open_regular(path) as file:
+            head = file.read(max(map(len, (*_READERS, _ZSTD_MAGIC))))
+    except OSError as error:
+        raise resource_error(error, path) or BagError(f"The bag cannot be read ({error.strerror}): {path}") from error
+    if not head:
+        raise BagError(f"The bag is empty: {path}")
+    for magic in (*_READERS, _ZSTD_MAGIC):
+        if head.startswith(magic):
+            return magic
+    _refuse_other_formats(path)
+    what = "This is not an MCAP file" if path.suffix == ".mcap" else "This is not a bag"
+    raise BagError(f"{what}: MCAP, .db3 and .bag files and rosbag2 folders are read: {path}")
+
+
+def _refuse_other_formats(path: Path) -> None:
+    """Raise ConfigError for a format that another word of `demorec import` reads."""
+    kind = find(path).kind
+    if kind in IMPORT_WORDS:
+        raise ConfigError(
+            f"This is {name_of(kind)}, no bag: demorec import {IMPORT_WORDS[kind]} {path} imports it: {path}"
+        ) from None
+
+
+def _folder(path: Path) -> Bag:
+    """Open a folder of rosbag2 by its metadata.yaml."""
+    from ruamel.yaml import YAML
+
+    metadata = path / ROSBAG2
+    try:
+        _refuse_link(metadata)
+        information = YAML(typ="safe").load(read_text_limited(metadata, _MAX_METADATA_BYTES))[
+            "rosbag2_bagfile_information"
+        ]
+        names = [PurePath(str(name)).name for name in information["relative_file_paths"]]
+        mode = str(information.get("compression_mode") or "").lower()
+        compression = str(information.get("compression_format") or "")
+    except FileNotFoundError:
+        _refuse_other_formats(path)
+        raise BagError(
+            f"The folder holds no {ROSBAG2}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
+            f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"
+        ) from None
+    except (BagError, MemoryError):
+        raise
+    except Exception as error:  # the parser's own errors, and those of what it does not foresee
+        raise resource_error(error, path) or BagError(
+            f"The bag's {ROSBAG2} cannot be read ({describe_error(error)}): {path}"
+        ) from error
+    if mode not in ("", "none") and compression != "zstd":
+        raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is read: {path}")
+    if not names:
+        raise BagError(f"The bag's {ROSBAG2} names no files: {path}")
+    files = _renamed(tuple(path / name for name in dict.fromkeys(names)))
+    for file in files:
+        if not os.path.lexists(file):
+            raise BagError(f"The bag lacks its file {file.name[:80]}: {path}")
+        _refuse_link(file)
+        _magic_of(file)
+    return Bag(path=path, files=files, messages_are_compressed=mode == "message")
+
+
+def _renamed(files: tuple[Path, ...]) -> tuple[Path, ...]:
+    """Find the only file of a bag under its new name, if it is not there under the old one."""
+    if len(files) != 1 or os.path.lexists(files[0]):
+        return files
+    found = tuple(files[0].parent.glob(f"*{files[0].suffix}"))
+    return found if len(found) == 1 else files
+
+
+def _refuse_link(file: Path) -> None:
+    """Raise BagError for a link out of the bag's folder, to a file that the user did not name."""
+    if file.is_symlink() and file.resolve().parent != file.parent.resolve():
+        raise BagError(f"The bag's file is a link to another folder: name {file.name} itself, or copy it: {file}")
+
+
+@contextmanager
+def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
+    """A file and its first bytes; a compressed one is unpacked into a temporary file."""
+    magic = _magic_of(path)
+    if magic != _ZSTD_MAGIC:
+        yield path, magic
+        return
+    with tempfile.TemporaryDirectory(prefix="demorec-bag-") as folder:
+        plain = Path(folder) / path.stem
+        try:
+            _unpack(path, plain)
+        except (zstandard.ZstdError, ValueError) as error:
+            raise BagError(f"The compressed bag cannot be unpacked ({error}): {path}") from error
+        kind = _magic_of(plain)
+        if kind == _ZSTD_MAGIC:
+            raise BagError(f"The bag is compressed twice: {path}")
+        yield plain, kind
+
+
+def _unpack(path: Path, target: Path) -> None:
+    """Unpack a file; ValueError when its content is far larger than any bag's."""
+    most = _MAX_UNPACKED_RATIO * path.stat().st_size
+    with open_regular(path) as source, target.open("wb") as file:
+        for block in zstandard.ZstdDecompressor().read_to_iter(source):
+            file.write(block)
+            if file.tell() > most:
+                raise ValueError(f"it is more than {_MAX_UNPACKED_RATIO} times as large")
+
+
+@dataclass(kw_only=True)
+class TopicSummary:
+    """The messages of one topic.
+
+    Attributes:
+        type: Type of the messages, as the bag names it.
+        count: Number of messages.
+        first_ns, last_ns: Earliest and latest time of recording.
+    """
+
+    type: str
+    count: int = 0
+    first_ns: int = MAX_TIME_NS
+    last_ns: int = 0
+
+    @property
+    def rate_hz(self) -> float:
+        """Mean rate by the times of recording; 0 for fewer than two messages."""
+        span_s = (self.last_ns - self.first_ns) / NS
+        return (self.count - 1) / span_s if self.count > 1 and span_s > 0 else 0.0
+
+    def add(self, time_ns: int) -> None:
+        """Count a message that was recorded at this time."""
+        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
+        self.count += 1
+
+
+def summarize_bag(path: Path) -> dict[str, Any]:
+    """Read a bag as far as it can be read, and count the messages of each topic, as `demorec info --json` prints it.
+
+    Raises:
+        ConfigError: There is no bag.
+        BagError: Its format is not read, or a file of it cannot be opened.
+    """
+    bag = open_bag(path)
+    problems: list[str] = []
+    topics: dict[str, TopicSummary] = {}
+    for message in bag.messages(problems):
+        topic = topics.setdefault(message.channel.topic, TopicSummary(type=message.channel.type))
+        topic.add(message.log_ns)
+    first_ns = min((topic.first_ns for topic in topics.values()), default=0)
+    last_ns = max((topic.last_ns for topic in topics.values()), default=0)
+    return {
+        "kind": "bag",
+        "path": str(path),
+        "bytes": bag.num_bytes,
+        "seconds": (last_ns - first_ns) / NS,
+        "messages": sum(topic.count for topic in topics.values()),
+        "topics": [
+            {"topic": name, "type": topic.type, "messages": topic.count, "rate": topic.rate_hz}
+            for name, topic in sorted(topics.items())
+        ],
+        "problems": problems,
+    }

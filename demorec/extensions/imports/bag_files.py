@@ -1,0 +1,109 @@
+"""Files of bags as messages: MCAP as recordings are read, SQLite (.db3) and ROS 1 (.bag) by `rosbags`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from demorec.core.errors import DemorecError, describe_error
+from demorec.core.files import MCAP_MAGIC, open_regular
+from demorec.mcap.scan import CutOffError, ScannedChannel, ScannedMessage, scan
+
+MAX_TIME_NS = 1 << 62
+"""Latest time of a message, in the year 2116: the difference of two fits 64 bits."""
+Topics = Collection[str] | None
+"""Topics that are wanted; None: all."""
+Report = Callable[[str], None]
+"""Called with the reason, for the inside of a sentence, when part of a file cannot be read."""
+
+
+class BagError(DemorecError):
+    """A bag cannot be read, or does not hold what its mapping says."""
+
+
+def read_mcap(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read an MCAP file in the order of the file: with or without chunks and an index, whole or cut off.
+
+    `mcap`'s own readers make an object of each field's bytes, which makes the import of a bag a tenth dearer.
+    """
+    with open_regular(path) as file:
+        file.seek(len(MCAP_MAGIC))
+        try:
+            for item in scan(file):
+                if isinstance(item, ScannedMessage) and (topics is None or item.channel.topic in topics):
+                    yield item
+        except MemoryError:
+            raise
+        except Exception as error:  # the parsers' own errors share no other base class
+            report(str(error) if isinstance(error, CutOffError) else f"a record is damaged: {describe_error(error)}")
+
+
+def read_sqlite(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read a .db3 file of rosbag2 in the order of the times of recording; BagError when it is damaged."""
+    from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
+
+    journal = Path(f"{path}-wal")
+    if journal.is_file() and journal.stat().st_size:
+        report(f"messages in {journal.name} are not read: open a copy of the bag with sqlite3, which takes them in")
+    reader = Sqlite3Reader(Path(quote(str(path.resolve()))))  # which makes a URI of it
+    try:
+        reader.open()
+    except (MemoryError, OSError):
+        raise
+    except Exception as error:  # its own errors, and those of what it does not foresee
+        raise BagError(f"The bag is damaged ({describe_error(error).rstrip('.')}): {path}") from error
+    yield from _rosbags_messages(reader, topics, report)
+
+
+def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read a bag of ROS 1 in the order of the times of recording, or of the file where its index is missing."""
+    from rosbags.rosbag1 import Reader
+
+    reader = Reader(path)
+    try:
+        reader.open()
+    except (MemoryError, OSError):
+        raise
+    except Exception as error:  # its own errors, and those of what it does not foresee
+        report(f"it was not finished ({describe_error(error).rstrip('.')}), so it is read without its index")
+        from demorec.extensions.imports.ros1_scan import scan_ros1
+
+        channels: dict[int, ScannedChannel] = {}
+        for connection, time_ns, data in scan_ros1(path, report):
+            if topics is None or connection.topic in topics:
+                channel = channels.get(connection.id) or channels.setdefault(connection.id, _channel(connection))
+                yield ScannedMessage(channel, time_ns, data)
+        return
+    yield from _rosbags_messages(reader, topics, report)
+
+
+def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read the messages of an open reader of `rosbags`, and close it."""
+    try:
+        wanted = [connection for connection in reader.connections if topics is None or connection.topic in topics]
+        channels = {connection.id: _channel(connection) for connection in wanted}
+        for connection, time_ns, data in reader.messages(wanted) if wanted else ():
+            yield ScannedMessage(channels[connection.id], time_ns, data)
+    except MemoryError:
+        raise
+    except Exception as error:
+        report(f"it is damaged: {describe_error(error)}")
+    finally:
+        reader.close()
+
+
+def _channel(connection: Any) -> ScannedChannel:
+    """Channel of a connection of `rosbags`."""
+    encoding = getattr(connection.ext, "serialization_format", "ros1")
+    definition = connection.msgdef
+    return ScannedChannel(
+        topic=connection.topic,
+        type=connection.msgtype,
+        encoding=encoding or "cdr",
+        schema_encoding={"MSG": "ros1msg" if encoding == "ros1" else "ros2msg", "IDL": "ros2idl"}.get(
+            definition.format.name, ""
+        ),
+        schema=definition.data.encode(),
+    )

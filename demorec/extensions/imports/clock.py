@@ -1,0 +1,303 @@
+"""One clock for streams that have each their own: which message, or which two, a row takes from each stream.
+
+Integer nanoseconds throughout. Nothing is made up where a stream has nothing: a row tells how old what it holds is,
+and what is older than the mapping allows is no row.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.extensions.imports.mapping import CameraSource, Clock, Sampling
+from demorec.extensions.imports.streams import Stream
+
+NS = 1_000_000_000
+MISSING = 2**62
+"""Age of what is not there."""
+SKEW_S = 0.1
+"""Between the times of headers and of recording: a camera's exposure and transport take less."""
+_PHASES = 64
+"""Moments of a period at which a grid may begin: a stream that jitters by a third of it leaves 21 of them free."""
+_ROUNDED_NS = 2_000
+"""By which the distance of two stamps is off at most that were rounded to microseconds, in whatever direction."""
+_WAITS = (0.0, 0.25, 0.5, 0.75, 1.0)
+"""Of a period, for which a row may wait for an image."""
+Int = NDArray[np.int64]
+Numbers = NDArray[np.floating[Any]]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Timeline:
+    """A stream's messages in the order of their times.
+
+    Attributes:
+        stream: Whose it is.
+        times_ns: (M,) int64, strictly increasing.
+        order: (M,) which of the stream's messages they are. Those of equal times are left out but the first, and so
+            are those whose header has no time where others have, and video before its first keyframe.
+        is_header: Whether times are those of the headers.
+        period_ns: The usual distance of two, 0 for fewer than two.
+        is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
+        is_log_asked: Whether the mapping asks for the times of recording.
+        sample: How rows take messages.
+        max_age_ns: How old what they take may be.
+    """
+
+    stream: Stream
+    times_ns: Int
+    order: Int
+    is_header: bool
+    period_ns: int
+    is_regular: bool
+    is_log_asked: bool
+    sample: Sampling
+    max_age_ns: int
+
+    @property
+    def label(self) -> str:
+        """Which it is, for people."""
+        return f"{self.stream.label} ({self.stream.topic})"
+
+    @property
+    def rule(self) -> str:
+        """How rows take messages, in words."""
+        return f"{self.sample} by {'header' if self.is_header else 'log'} time"
+
+    @property
+    def stamps_ns(self) -> Int:
+        """(N,) of the stream's messages; 0 or less where a header has no time."""
+        return self.stream.header_ns if self.is_header else self.stream.log_ns
+
+    @property
+    def skews_ns(self) -> Int:
+        """(K,) time of recording minus that of the header, of the messages whose header has a time."""
+        return (self.stream.log_ns - self.stream.header_ns)[self.stream.header_ns > 0]
+
+    @property
+    def num_repeated(self) -> int:
+        """Messages of the time of another one."""
+        known = self.stamps_ns[self.stamps_ns > 0]
+        return len(known) - len(np.unique(known))
+
+    def chosen(self, rows_ns: Int) -> ChosenSamples:
+        """What rows of these times (R,) take."""
+        return choose(self.times_ns, rows_ns, self.sample)
+
+    def sampled(self, chosen: ChosenSamples) -> Numbers:
+        """(R, D) the numbers of these rows, of a source."""
+        stream = self.stream
+        return sampled(stream.values, self.order, chosen, unit=stream.unit, quaternions=stream.quaternions)
+
+    def within(self, begin_ns: int, end_ns: int) -> Int:
+        """Its times from one moment to another."""
+        return self.times_ns[(self.times_ns >= begin_ns) & (self.times_ns <= end_ns)]
+
+
+def timeline(stream: Stream, clock: Clock) -> Timeline:
+    """The timeline of a stream, by header stamps if they are wanted and most messages have one."""
+    by_header = (stream.part.stamp or clock.stamp) == "header"
+    sample: Sampling = stream.part.sample or clock.sample
+    if isinstance(stream.part, CameraSource) and sample == "linear":
+        sample = "latest"  # images are not mixed
+    age_s = clock.max_age_s if stream.part.max_age_s is None else stream.part.max_age_s
+    stamped = stream.header_ns > 0
+    is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
+    times = stream.header_ns if is_header else stream.log_ns
+    if (not is_header or stamped.all()) and bool(np.all(times[1:] > times[:-1])):
+        order: Int = np.arange(len(times))
+        ordered = times
+    else:
+        usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+        order = usable[np.argsort(times[usable], kind="stable")]
+        ordered = times[order]
+        is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
+        ordered, order = ordered[is_first], order[is_first]
+    steps = np.diff(ordered)
+    period = int(np.median(steps)) if len(steps) else 0
+    # Most steps of a sensor are about a period, whatever is lost; those of commands on change are of any length.
+    is_regular = len(steps) >= 8 and bool(np.mean((steps > 0.3 * period) & (steps < 1.7 * period)) > 0.6)
+    if stream.heads:
+        keyframes = np.flatnonzero(stream.heads.are_keyframes[order])
+        first = int(keyframes[0]) if len(keyframes) else len(order)
+        ordered, order = ordered[first:], order[first:]
+    return Timeline(
+        stream=stream,
+        times_ns=ordered,
+        order=order,
+        is_header=is_header,
+        period_ns=period,
+        is_regular=is_regular,
+        is_log_asked=not by_header,
+        sample=sample,
+        max_age_ns=MISSING - 1 if age_s >= 1e9 else round(age_s * NS),
+    )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ChosenSamples:
+    """What rows take from a stream.
+
+    Attributes:
+        index: (R,) the message in its timeline; of two, the earlier one; -1 for none.
+        fraction: (R,) how far the row is between that and the next one, 0 to 1; None unless they are mixed.
+        age_ns: (R,) row minus message, below 0 where the message is later; of two, the earlier one's.
+        reach_ns: (R,) how far off the message is; of two, the farther one. MISSING where there is none.
+    """
+
+    index: Int
+    fraction: NDArray[np.float64] | None
+    age_ns: Int
+    reach_ns: Int
+
+
+def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
+    """The messages for some rows.
+
+    Args:
+        times_ns: (M,) strictly increasing; one at least.
+        rows_ns: (R,) increasing.
+        sample: latest: the last message at or before the row; nearest: the earlier one of two that are as near;
+            linear: both neighbours, or one that is at the row.
+    """
+    count = len(times_ns)
+    before = np.searchsorted(times_ns, rows_ns, side="right") - 1
+    after = np.minimum(before + 1, count - 1)
+    since = np.where(before >= 0, rows_ns - times_ns[np.maximum(before, 0)], MISSING)
+    until = np.where(before + 1 < count, times_ns[after] - rows_ns, MISSING)
+    if sample == "latest":
+        return ChosenSamples(index=before, fraction=None, age_ns=since, reach_ns=since)
+    if sample == "nearest":
+        later = until < since
+        age = np.where(later, -until, since)
+        return ChosenSamples(index=np.where(later, after, before), fraction=None, age_ns=age, reach_ns=np.abs(age))
+    exact = since == 0
+    # A row outside of the stream has a neighbour on one side only, and no line to be on.
+    is_outside = ~exact & ((before < 0) | (before + 1 >= count))
+    reach = np.where(is_outside, MISSING, np.where(exact, 0, np.maximum(since, until)))
+    width = np.where(exact | is_outside, 1, times_ns[after] - times_ns[np.maximum(before, 0)])
+    fraction = np.where(exact, 0.0, np.clip(since / width, 0.0, 1.0))
+    return ChosenSamples(index=before, fraction=fraction, age_ns=np.where(is_outside, MISSING, since), reach_ns=reach)
+
+
+def sampled(values: Numbers, order: Int, chosen: ChosenSamples, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
+    """(R, D) the numbers of some rows.
+
+    Args:
+        values: (N, D) in the order of the bag.
+        order: (M,) of the timeline.
+        chosen: For the rows; all of them have a message.
+        unit: Of the values: the line between two angles (rad, degree) is the short way round.
+        quaternions: First elements of x, y, z, w, which are mixed on the sphere.
+
+    Returns:
+        The very bits of a message where one is taken; where two are mixed, float64.
+    """
+    if chosen.fraction is None or not np.any(chosen.fraction):
+        return values[order[chosen.index]]
+    first = values[order[chosen.index]].astype(np.float64)
+    second = values[order[np.minimum(chosen.index + 1, len(order) - 1)]].astype(np.float64)
+    fraction = chosen.fraction[:, np.newaxis]
+    step = second - first
+    turn = {"rad": 2 * np.pi, "degree": 360.0}.get(unit)
+    wraps = np.abs(step) > turn / 2 if turn else np.zeros(step.shape, bool)
+    if turn:
+        step = np.where(wraps, step - turn * np.round(step / turn), step)
+    mixed = first + fraction * step
+    if turn:
+        mixed = np.where(wraps, mixed - turn * np.round(mixed / turn), mixed)
+    for start in quaternions:
+        part = slice(start, start + 4)
+        mixed[:, part] = _slerp(first[:, part], second[:, part], chosen.fraction)
+    return np.where(fraction == 0.0, first, mixed)
+
+
+def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Numbers:
+    """(R, 4) on the shorter great arc from `first` to `second`, of the length of their mean."""
+    lengths = [np.linalg.norm(part, axis=1, keepdims=True) for part in (first, second)]
+    a, b = first / np.maximum(lengths[0], 1e-300), second / np.maximum(lengths[1], 1e-300)
+    cosine = np.sum(a * b, axis=1, keepdims=True)
+    b = np.where(cosine < 0, -b, b)
+    angle = np.arccos(np.clip(np.abs(cosine), 0.0, 1.0))
+    t, sine = fraction[:, np.newaxis], np.sin(angle)
+    small = sine < 1e-6
+    safe = np.where(small, 1.0, sine)
+    of_a, of_b = (np.where(small, part, np.sin(part * angle) / safe) for part in (1 - t, t))
+    mixed = of_a * a + of_b * b
+    length = (1 - t) * lengths[0] + t * lengths[1]
+    return np.asarray(mixed / np.maximum(np.linalg.norm(mixed, axis=1, keepdims=True), 1e-300) * length)
+
+
+def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> Int:
+    """(R,) row times, evenly spaced, `fps` a second; the first within a period from `begin_ns` on, none after `end_ns`.
+
+    Row k is k/fps s after the first, rounded down: a whole number of nanoseconds is not after that exactly if it is not
+    after the fraction. The first row is where a reader that takes the last message before each row is shown most of
+    those of `streams`, (M,) times of each, and these as soon as can be: none sits on an edge, where jitter and rounding
+    decide.
+    """
+    count = max(0, (end_ns - begin_ns) * fps // NS + 1)
+    inside = [times[(times >= begin_ns) & (times <= end_ns)] for times in streams]
+
+    def fit(phase: int) -> tuple[int, int]:
+        first, num_shown, age = begin_ns + phase, 0, 0
+        for times in inside:
+            rows = np.maximum(-((first - times) * fps // NS), 0)  # the first row that is not before the message
+            is_shown = np.append(rows[1:] != rows[:-1], True) & (rows <= (end_ns - first) * fps // NS)
+            num_shown += int(is_shown.sum())
+            age += int((first + rows * NS // fps - times)[is_shown].sum())
+        return num_shown, -age
+
+    phases = (0, _ROUNDED_NS, *(NS * part // (fps * _PHASES) for part in range(1, _PHASES)))
+    begin_ns += max(phases, key=fit) if count and inside else 0
+    count = max(0, (end_ns - begin_ns) * fps // NS + 1)
+    return begin_ns + np.arange(count, dtype=np.int64) * NS // fps
+
+
+def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -> Int:
+    """(R,) row times, one for each time of `lead`: at it, or a little later where an image of `others` would be lost.
+
+    Images that several cameras take at about the same moment come now in this order, now in that. At each image of one
+    of them, another one's would be a period old in one row and two newer in the next. So a row whose image of another
+    camera was in the row before may wait for the next one, though not until an image would be skipped: up to the part
+    of a period, of `_WAITS`, with which fewest images are skipped or shown twice, and the shortest of those.
+
+    Args:
+        lead: (R,) increasing.
+        others: (M,) of each other camera of that rate, increasing.
+        period_ns: The usual distance of two.
+        end_ns: The last moment of a row.
+    """
+    best, fewest = lead, -1
+    for part in _WAITS:
+        rows = _waited(lead, others, round(part * period_ns), end_ns)
+        steps = [np.diff(np.searchsorted(times, rows, side="right")) for times in others]
+        # Skipped or repeated. Cameras that always come one after the other cost the same image at both ends else.
+        num_off = sum(int(np.abs(step - 1).sum()) for step in steps)
+        if fewest < 0 or num_off < fewest:
+            best, fewest = rows, num_off
+        if not fewest:
+            break
+    return best
+
+
+def _waited(lead: Int, others: Sequence[Int], wait_ns: int, end_ns: int) -> Int:
+    """(R,) the rows of `followed` that wait for `wait_ns` at most."""
+    if not wait_ns or not len(lead):
+        return lead
+    images = [times.tolist() for times in others]
+    shown = [bisect_right(times, int(lead[0])) - 1 for times in images]
+    rows = []
+    for time, following in zip(lead.tolist(), [*lead[1:].tolist(), end_ns + 1], strict=True):
+        ends = [times[last + 2] - 1 for times, last in zip(images, shown, strict=True) if last + 2 < len(times)]
+        until = min(time + wait_ns, following - 1, end_ns, *ends)
+        nexts = [times[last + 1] for times, last in zip(images, shown, strict=True) if last + 1 < len(times)]
+        row = max([time, *(image for image in nexts if image <= until)])
+        shown = [bisect_right(times, row) - 1 for times in images]
+        rows.append(row)
+    return np.array(rows, dtype=np.int64)

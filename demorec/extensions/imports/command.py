@@ -1,0 +1,194 @@
+"""`demorec import`: other robots' bags to a run."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, cast
+
+from demorec.cli.shared.flags import Positional, arg
+from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, check_option
+from demorec.core.registry import nearest_match
+from demorec.core.targets import OptionalTarget
+from demorec.extensions.imports.formats import BAGS, FORMATS, SourceFormat
+from demorec.runs.find import find, name_of
+
+if TYPE_CHECKING:
+    from demorec.extensions.imports.episode_writer import FramesImport
+    from demorec.extensions.imports.import_file import BagReport
+
+MAX_WORKERS = 1000
+_BAGS = "Bags; each is an episode, or several, as the mapping says."
+_WORDS = ", ".join(f"{word} ({form.name})" for word, form in FORMATS.items())
+
+
+@dataclass(frozen=True, kw_only=True)
+class Import:
+    """Make a run of another robot's bags (MCAP, rosbag2, ROS 1; without ROS), HDF5 files or LeRobot dataset.
+
+    A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
+    holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
+    episode, as the mapping says. Encoded images pass through. Run the same command again to continue. A folder without
+    metadata.yaml stands for the bags in it.
+
+    A LeRobot dataset (v3.0, v2.1 or v2.0, whoever wrote it) needs no mapping: its features keep their names, its
+    numbers stay bit-exact, and its video packets pass through where each episode begins with a keyframe. With
+    --motor-units its recordings have the arm's URDF and joints.
+
+    HDF5 files in robomimic's or ALOHA's layout take a mapping as well: which datasets become which features. Their
+    numbers keep every bit, JPEG files pass through.
+
+    Examples:
+      demorec import --suggest monday.mcap > robot.toml
+      demorec import monday.mcap tuesday/ --mapping robot.toml --out runs/robot
+      demorec import bags/ --mapping robot.toml --out runs/robot --skip-bad
+      demorec import lerobot datasets/cups --out runs/cups
+      demorec import lerobot cups --out runs/cups --state joints --action targets
+      demorec import hdf5 demo.hdf5 --suggest > mapping.toml
+      demorec import hdf5 demo.hdf5 --mapping mapping.toml --out runs/demo
+    """
+
+    bags: Annotated[Positional[tuple[Path, ...]], arg(help=f"{_BAGS} Or a word in front of what is no bag: {_WORDS}.")]
+    mapping: Path | None = None
+    """Mapping file (TOML): which topics or datasets become which features; required where --suggest writes one."""
+    out: OptionalTarget = None
+    """Folder of the run, new or to be continued; required unless --suggest is given."""
+    skip_bad: bool = False
+    """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and episodes of a dataset that
+    cannot be read; list them at the end and exit with 1. Else the first of them ends the import."""
+    workers: int = 1
+    """Processes that read and write bags; the recordings are the same for any number."""
+    suggest: bool = False
+    """Write a mapping for the first bag or file to standard output instead of importing."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
+    roles: NamedByFlags = field(default_factory=RoleFlags)
+    video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
+    """How images are encoded that come as pixels."""
+
+    def run(self) -> int:
+        """Import, or suggest a mapping; print what was found; 1 if bags or episodes were skipped."""
+        if not self.bags:
+            raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
+        if self.out is not None:
+            refuse_inside([self.out])
+        check_option("workers", self.workers, 1, MAX_WORKERS)
+        word = str(self.bags[0])
+        form = FORMATS.get(word, BAGS)
+        self._check_flags(form)
+        paths = self.bags if form is BAGS else self.bags[1:]
+        if not paths:
+            name = name_of(form.kind)
+            raise ConfigError(
+                f"Name {name} after the word {word}: {form.command} {form.example}. A bag of that name is given with "
+                "its folder."
+            )
+        if form is BAGS and not paths[0].exists() and (near := nearest_match(word, FORMATS)):
+            raise ConfigError(
+                f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(FORMATS)} and its files."
+            )
+        from demorec.extensions.imports.bag import bags_in, open_bag
+
+        if self.suggest:
+            lines = form.suggest(paths[0], tell)
+            if find(paths[0]).kind == "recording":
+                tell(f"Note: demorec made this recording, and reads it as it is, without an import: {paths[0]}")
+            say(*lines)
+            return 0
+        if form.mapping and (self.mapping is None or self.out is None):
+            if form is BAGS:
+                open_bag(bags_in(paths[0])[0])  # says what it is, if it is not a bag
+            raise ConfigError(
+                f"An import needs --mapping and --out: {form.command} {paths[0]} --suggest > mapping.toml writes a "
+                "mapping."
+            )
+        if self.out is None:
+            raise ConfigError(f"An import needs --out: {form.command} {form.example}.")
+        self.video.validate()
+        if form is BAGS:
+            assert self.mapping is not None, "bags need one"
+            return self._import_bags(paths, self.mapping, self.out)
+        return self._import_frames(form, paths, self.out)
+
+    def _check_flags(self, form: SourceFormat) -> None:
+        """Raise ConfigError for flags of another format."""
+        if form.mapping and self.motors.named is not None:
+            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
+        if form.mapping and self.roles.named:
+            raise ConfigError(
+                "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
+                "bags and HDF5 files say it in their mapping."
+            )
+        if form is not BAGS and (self.workers > 1 or (self.skip_bad and form.mapping)):
+            raise ConfigError(
+                "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
+                "--workers, --skip-bad out."
+            )
+        if form.mapping is None and (self.suggest or self.mapping is not None):
+            name = name_of(form.kind)
+            raise ConfigError(f"The import of {name} needs no mapping: leave --mapping and --suggest out.")
+
+    def _import_frames(self, form: SourceFormat, paths: Sequence[Path], out: Path) -> int:
+        options: dict[str, Any] = {"video": self.video}
+        if form.mapping is None:
+            options |= {"motors": self.motors.named, "named": self.roles.named, "skip_bad": self.skip_bad}
+        result = cast("FramesImport", form.read(paths, self.mapping, out, **options))
+        say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
+        if there := result.num_episodes - result.num_new:
+            tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
+        say(f"{counted(result.num_episodes, 'episode')}, {result.num_frames} frames: {out}")
+        return _list_skipped(result.skipped, result.num_episodes + len(result.skipped), "episode")
+
+    def _import_bags(self, bags: Sequence[Path], mapping: Path, out: Path) -> int:
+        from demorec.extensions.imports.import_run import import_bags
+
+        with ProgressBar("importing", unit="bag") as bar:
+            result = import_bags(
+                bags,
+                mapping,
+                out,
+                video=self.video,
+                workers=self.workers,
+                skip_bad=self.skip_bad,
+                tell=lambda report: say(*_report_lines(report), ""),
+                progress=bar.set,
+            )
+        if result.num_new < len(result.reports):
+            tell(f"{len(result.reports) - result.num_new} of {len(result.reports)} bags had been imported before.")
+        num_dropped = sum(len(report.episodes) - len(report.made) for report in result.reports)
+        num_frames = sum(episode.num_frames for report in result.reports for episode in report.made)
+        dropped = f", {num_dropped} dropped" if num_dropped else ""
+        odd = [finding.kind for report in result.reports for finding in report.odd]
+        notes = sum(len(report.findings) for report in result.reports) - len(odd)
+        say(f"{counted(result.num_episodes, 'episode')}, {num_frames} frames{dropped}: {out}")
+        if odd:
+            kinds = ", ".join(sorted(set(odd)))
+            say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
+        else:
+            above = f"No findings; {counted(notes, 'note')} above."
+            say(above if notes else "Nothing odd was found.")
+        return _list_skipped(result.skipped, len(result.reports) + len(result.skipped), "bag")
+
+
+def _report_lines(report: BagReport) -> list[str]:
+    """Describe a bag: a table of its streams, its findings, its episodes."""
+    lines = aligned([tuple(report.streams[0]), *(tuple(stream.values()) for stream in report.streams)])
+    for finding in report.findings:
+        place = f"{finding.stream}: " if finding.stream else ""
+        lines.append(f"{finding.kind}: {place}{finding.text}")
+    lines += [line for episode in report.episodes for line in episode.lines()]
+    return [f"{report.name} ({size_in_words(report.num_bytes)})", *(f"  {line}" for line in lines)]
+
+
+def _list_skipped(skipped: Mapping[Any, str], total: int, word: str) -> int:
+    """Print what was skipped; return the exit code."""
+    if not skipped:
+        return 0
+    say(f"Skipped {len(skipped)} of {counted(total, word)}:")
+    say(*(f"  {name}: {reason}" for name, reason in skipped.items()))
+    return 1

@@ -1,0 +1,233 @@
+"""LeRobot datasets become runs: every episode a recording, its numbers bit-exact, its packets byte for byte.
+
+The same command again goes on: episodes that are there are not written.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from itertools import islice
+from pathlib import Path
+
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError, ExportError, RecordingError, resource_error
+from demorec.core.files import sha256_of
+from demorec.datasets.lerobot.boxes import BOXES_DIR
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.facts import PROGRESS_PATH
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.language import PERSISTENT
+from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
+from demorec.datasets.lerobot.recorded_features import NOT_HELD, why_not_recorded
+from demorec.datasets.lerobot.recording import DatasetRecording
+from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
+from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.extensions.imports.description import importing_versions
+from demorec.extensions.imports.episode_writer import FramesImport, Image, add_episode
+from demorec.robots.motors import Motors
+from demorec.runs.external import ExternalFolder, episode_path, open_external_run, planned_episode
+from demorec.runs.find import expect
+
+_MAX_EXACT = 2**53
+"""Largest whole number up to which float64 holds every one."""
+
+
+def import_lerobot(
+    roots: Sequence[Path],
+    mapping: Path | None,
+    out: Path,
+    *,
+    video: VideoConfig | None = None,
+    motors: Motors | None = None,
+    named: NamedRoles = NO_NAMES,
+    skip_bad: bool = False,
+) -> FramesImport:
+    """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, whoever wrote it, into a run.
+
+    Args:
+        roots: The dataset's folder, the only one.
+        mapping: Unused: datasets need none.
+        out: The run's folder; one that the same dataset began is continued.
+        video: How images are encoded whose packets cannot pass through.
+        motors: The servos whose values LeRobot recorded as state and action.
+        named: Features whose role the user names; the recordings keep it.
+        skip_bad: Leave out episodes that cannot be read; otherwise the first of them ends the import.
+
+    Raises:
+        ConfigError: This is no dataset, not one of these servos, it has what no recording can hold, or the folder holds
+            something else.
+        ExportError: It is damaged, or not at its rate.
+        RecordingError: A number is not finite, or the disk is full.
+    """
+    dataset = _opened(roots, motors, named)
+    left_out = _left_out(dataset)
+    skipped: dict[int, str] = {}
+    noted = skipped if skip_bad else None
+    survey = _surveyed(dataset, noted)
+    for name in survey.inexact:
+        dataset.leave_out(name)
+        left_out[name] = "it has whole numbers that float64 cannot hold"
+    cameras, fates = _cameras(dataset, survey)
+    digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
+    with open_external_run(out, recovers=False) as folder:
+        indices = [place.episode_index for place in dataset.places if place.episode_index not in skipped]
+        folder.planned = [planned_episode(n) for n in indices if not episode_path(folder.path, n).exists()]
+        for number, place in enumerate(dataset.places):
+            if place.episode_index in skipped:
+                continue
+            with _reading(place, noted):
+                recording = DatasetRecording(dataset, number)
+                num_new += _write(recording, cameras, folder, video or VideoConfig(), digest)
+                num_frames += place.length
+                if recording.language_left_out:
+                    left_out[PERSISTENT] = recording.language_left_out
+    return FramesImport(
+        num_episodes=len(dataset.places) - len(skipped),
+        num_frames=num_frames,
+        num_new=num_new,
+        cameras=fates,
+        left_out=left_out,
+        skipped={f"episode {index}": reason for index, reason in skipped.items()},
+        notes=dataset.notes,
+    )
+
+
+def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> LeRobotFolder:
+    if len(roots) != 1:
+        raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
+    root = roots[0]
+    expect(root, "dataset")
+    dataset = LeRobotFolder(root, motors, named)
+    state = dataset.roles.elements(dataset.roles.state)  # ConfigError if a named feature is missing
+    if parts := [name for name in named.gripper if name in state and name not in dataset.info.features]:
+        raise ConfigError(f"An import takes whole features: --gripper names {parts[0]!r}, an element of the state.")
+    if not dataset.places:
+        raise ConfigError(f"The dataset has no episodes: {root}")
+    return dataset
+
+
+@contextmanager
+def _reading(place: EpisodePlace, skipped: dict[int, str] | None) -> Iterator[None]:
+    """Note why an episode cannot be read in the context among those that are skipped; None: none is, raise it."""
+    try:
+        yield
+    except (ExportError, RecordingError) as error:
+        if skipped is None or resource_error(error) is not None:
+            raise
+        skipped[place.episode_index] = str(error)
+
+
+@dataclass(kw_only=True)
+class _Survey:
+    """What the episodes that can be read have in common.
+
+    Attributes:
+        inexact: Features with whole numbers that float64 cannot hold.
+        formats: Video camera -> (codec, (width, height)) of its files.
+        reasons: Video camera -> why its packets cannot pass through.
+    """
+
+    inexact: set[str] = field(default_factory=set)
+    formats: dict[str, set[tuple[str, tuple[int, int]]]] = field(default_factory=dict)
+    reasons: dict[str, str] = field(default_factory=dict)
+
+
+def _surveyed(dataset: LeRobotFolder, skipped: dict[int, str] | None) -> _Survey:
+    """Look at the whole numbers and the encoded images of every episode."""
+    survey = _Survey()
+    types = {feature.name: dataset.info.features[feature.name].dtype for feature in dataset.features}
+    whole = [name for name, dtype in types.items() if dtype in ("int64", "uint64")]
+    rows = dataset.rows(whole)
+    for place in dataset.places:
+        with _reading(place, skipped):
+            if place.length < 1:
+                raise ExportError(f"Episode {place.episode_index} of the dataset has no frames: {dataset.root}")
+            numbers = rows.numbers(place) if whole else {}
+            for name, key in dataset.keys.items():
+                feature = dataset.info.features[key]
+                if feature.is_video and not feature.is_depth:
+                    video = dataset.video(key, place)
+                    survey.formats.setdefault(name, set()).add((video.file.codec_name, video.file.size))
+                    survey.reasons[name] = survey.reasons.get(name) or video.why_transcoded()
+            survey.inexact |= {name for name in whole if (abs(numbers[name]) > _MAX_EXACT).any()}
+    return survey
+
+
+def _left_out(dataset: LeRobotFolder) -> dict[str, str]:
+    """What no recording can hold, by its name in the dataset -> why."""
+    features = dataset.info.features.items()
+    found = {name: reason for name, feature in features if (reason := why_not_recorded(name, feature))}
+    if dataset.language_rows is not None:
+        found.pop(PERSISTENT)
+    found |= {name: NOT_HELD for name in (BOXES_DIR, PROGRESS_PATH) if (dataset.root / name).exists()}
+    if not dataset.has_one_robot:
+        found[f"{SIDECAR_DIR}/robots"] = "not all episodes have the same robot there, as those of a run have"
+    if any(row["root_seed"] is not None for row in dataset.known.values()):
+        found[f"{SIDECAR_DIR}/episodes"] = "scenes, phases and conditions of success are not read back"
+    return found
+
+
+def _cameras(dataset: LeRobotFolder, survey: _Survey) -> tuple[dict[str, Camera], dict[str, str]]:
+    """The cameras as the recordings shall have them, and what becomes of the images of each, in words."""
+    cameras: dict[str, Camera] = {}
+    fates: dict[str, str] = {}
+    for name, key in dataset.keys.items():
+        feature = dataset.info.features[key]
+        cameras[name] = dataset.camera(name)
+        if feature.is_depth:
+            fates[name] = "the distances of its codes, in metres (32FC1)"
+        elif feature.is_video and name in survey.formats:
+            if len(survey.formats[name]) > 1:
+                raise ExportError(f"The videos of {key} are of several codecs or sizes: {dataset.root}")
+            ((codec, _),), reason = survey.formats[name], survey.reasons[name]
+            if reason:
+                cameras[name] = replace(cameras[name], kept="")
+            fates[name] = f"{codec}, encoded once, since {reason}" if reason else f"{codec}, passed through as it is"
+        else:
+            fates[name] = "images of their own, encoded once"
+    return cameras, fates
+
+
+def _write(
+    recording: DatasetRecording,
+    cameras: Mapping[str, Camera],
+    folder: ExternalFolder,
+    video: VideoConfig,
+    digest: Callable[[Path], str],
+) -> bool:
+    """Write an episode of the run, if it is not there."""
+    info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
+    if folder.has(info):
+        return False
+    leads = {camera.name: recording.lead(camera.name) if camera.kept else 0 for camera in info.cameras}
+    table = recording.table_with(leads)
+    images = {camera.name: _images(recording, camera) for camera in info.cameras}
+    add_episode(folder, info, table, images, outcome=recording.outcome, video=video, subtasks=subtasks)
+    return True
+
+
+def _info(recording: DatasetRecording, cameras: Mapping[str, Camera], digest: Callable[[Path], str]) -> EpisodeInfo:
+    """What the recording shall say of an episode."""
+    dataset, place = recording.dataset, recording.place
+    videos = [place.videos[key][0] for key in dataset.keys.values() if key in place.videos]
+    names = [INFO_PATH, *(path.relative_to(dataset.root).as_posix() for path in (place.data, *videos))]
+    return replace(
+        recording.info,
+        cameras=tuple(replace(camera, kept=cameras[camera.name].kept) for camera in recording.info.cameras),
+        origin=Origin(
+            kind="import", files=tuple(SourceFile(name=name, sha256=digest(dataset.root / name)) for name in names)
+        ),
+        versions=importing_versions(),
+    )
+
+
+def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:
+    """Of the camera's lead, where packets pass through, and of every frame."""
+    if camera.is_depth:
+        return recording.distances(camera.name)
+    if camera.kept:
+        return (packet.data for packet in recording.packets(camera.name))
+    return islice(recording.images(camera.name), recording.lead(camera.name), None)

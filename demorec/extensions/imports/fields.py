@@ -1,0 +1,332 @@
+"""Where in a message something is: paths of fields, times of headers, the numbers of a source."""
+
+from __future__ import annotations
+
+import base64
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.registry import nearest_match
+from demorec.extensions.imports.bag_files import MAX_TIME_NS
+from demorec.extensions.imports.mapping import CONVERSIONS, MAX_ELEMENTS, Source
+from demorec.mcap.cdr import Values
+
+_STEP = re.compile(r"(?P<name>[^.\[\]]+)|\[(?P<key>[^=\]]+)=(?P<value>[^\]]*)\]|\[(?P<index>\d+)\]")
+_STAMP_PATHS = (
+    ("header", "stamp"),
+    ("stamp",),
+    ("timestamp",),
+    ("header", "timestamp"),
+    ("ts", "realtime"),
+    ("transforms", 0, "header", "stamp"),
+    ("transforms", 0, "timestamp"),
+)
+_SECONDS, _NANOSECONDS = ("sec", "secs", "seconds"), ("nanosec", "nsec", "nsecs", "nanos")
+_NAME_FIELDS = ("name", "names", "joint_names")
+Step = str | int | tuple[str, str]
+
+
+class FieldError(ValueError):
+    """A message or dataset is not what the mapping takes it for; `str` says why, for the inside of a sentence."""
+
+
+class OtherPublisherError(ValueError):
+    """A message names none of the joints: it is of another publisher on the same topic, and no mistake."""
+
+
+def parse_path(path: str) -> tuple[Step, ...]:
+    """The steps of "transforms[child_frame_id=hand].transform" or "points[0].positions"; FieldError when it is none."""
+    steps: list[Step] = []
+    position = 0
+    while position < len(path):
+        if steps and path[position] == ".":
+            position += 1
+        found = _STEP.match(path, position)
+        if found is None:
+            raise FieldError(f"{path!r} is no path of a field")
+        if found["name"] is not None:
+            steps.append(found["name"])
+        elif found["index"] is not None:
+            steps.append(int(found["index"]))
+        else:
+            steps.append((found["key"], found["value"]))
+        position = found.end()
+    return tuple(steps)
+
+
+def follow(values: Any, steps: Sequence[Step]) -> Any:
+    """What is at a path; of a list of messages, the field of each."""
+    for step in steps:
+        if isinstance(step, str):
+            if isinstance(values, list):
+                values = [follow(item, (step,)) for item in values]
+                if values and all(isinstance(item, int | float) for item in values):
+                    values = np.array(values, dtype=np.float64)
+            elif isinstance(values, Mapping):
+                if step not in values:
+                    raise FieldError(f"there is no field {step!r}.{nearest_match(step, values)}".rstrip("."))
+                values = values[step]
+            else:
+                kind = (
+                    "a list" if isinstance(values, np.ndarray) else "a text" if isinstance(values, str) else "a number"
+                )
+                raise FieldError(f"there is no field {step!r} in {kind}")
+        elif isinstance(step, int):
+            if not isinstance(values, list | np.ndarray) or not 0 <= step < len(values):
+                raise FieldError(f"there is no element {step}")
+            values = values[step]
+        else:
+            items = values if isinstance(values, list) else []
+            chosen = [item for item in items if isinstance(item, Mapping) and str(item.get(step[0])) == step[1]]
+            if not chosen:
+                raise OtherPublisherError(f"nothing has the {step[0]} {step[1]!r}")
+            values = chosen[0]
+    return values
+
+
+def stamp_of(values: Values) -> int | None:
+    """The time in a message's header, nanoseconds; None when it has no header."""
+    for path in _STAMP_PATHS:
+        found: Any = values
+        for step in path:
+            if isinstance(step, str):
+                found = found.get(step) if isinstance(found, Mapping) else None
+            else:
+                found = found[step] if isinstance(found, list) and len(found) > step else None
+        if (time_ns := _nanoseconds(found)) is not None:
+            return time_ns
+    return None
+
+
+def _nanoseconds(value: Any) -> int | None:
+    if isinstance(value, Mapping):
+        seconds = next((value[key] for key in _SECONDS if key in value), None)
+        rest = next((value[key] for key in _NANOSECONDS if key in value), 0)
+        if not isinstance(seconds, int | float) or not isinstance(rest, int | float):
+            return None
+        if abs(seconds) < MAX_TIME_NS and abs(rest) < MAX_TIME_NS:  # no NaN either
+            time_ns = int(seconds) * 1_000_000_000 + int(rest)
+            return time_ns if abs(time_ns) < MAX_TIME_NS else None
+    return None
+
+
+def whole(values: Mapping[str, Any], name: str) -> int:
+    """A whole number of a message, which JSON may have as anything; FieldError when it is none, or none of 32 bits."""
+    value = values[name]
+    if isinstance(value, int | float | np.integer | np.floating) and -(2**31) <= value < 2**32:
+        return int(value)
+    raise FieldError(f"its {name} is no number of 32 bits")
+
+
+def image_bytes(values: Mapping[str, Any]) -> bytes:
+    """The bytes of an image; JSON has them in base64."""
+    data = values["data"]
+    if isinstance(data, str):
+        try:
+            return base64.b64decode(data, validate=True)
+        except ValueError as error:  # binascii's, and of texts that are not ASCII
+            raise FieldError("its image is no base64") from error
+    if isinstance(data, np.ndarray):
+        return data.tobytes()
+    if isinstance(data, bytes):
+        return data
+    raise FieldError("it holds no image")
+
+
+def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
+    """(name, number or array) of all numbers in a value, in the order of its fields; headers and texts are left out."""
+    if isinstance(value, Mapping):
+        for key, item in value.items():
+            if key != "header":
+                yield from numbers_in(item, f"{name}.{key}" if name else key)
+    elif isinstance(value, np.ndarray | bool | int | float | np.generic):
+        yield name, value
+
+
+_FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
+
+
+@dataclass(kw_only=True)
+class SourceReader:
+    """Reads the vector of a source from message after message, as its first message lays it out.
+
+    Attributes:
+        source: That one.
+        names: Of the elements of the feature.
+        joints: What messages call these elements, which may stand at another place in each; empty where elements have
+            no names, or one name is that of several.
+        steps: Path of the numbers.
+        names_steps: Path of the names beside them; None where elements have none.
+        quaternions: First element of each x, y, z, w among them.
+        others: Names in messages beside those of the first one, where the source takes all that there are.
+    """
+
+    source: Source
+    names: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()
+    steps: tuple[Step, ...] = ()
+    names_steps: tuple[Step, ...] | None = None
+    quaternions: tuple[int, ...] = ()
+    others: dict[str, None] = field(init=False, compare=False, default_factory=dict)
+    _orders: dict[tuple[str, ...], list[int]] = field(init=False, compare=False, default_factory=dict)
+
+    def read(self, values: Values) -> NDArray[np.floating[Any]]:
+        """(D,) float32 or float64, in the unit of the bag.
+
+        Raises:
+            FieldError: The message does not have what the first one had.
+            OtherPublisherError: It has none of the joints.
+        """
+        found = follow(values, self.steps)
+        if isinstance(found, np.ndarray) and found.ndim == 1 and found.dtype in _FLOATS:
+            vector: NDArray[np.floating[Any]] = found  # as it is in most messages, of which there are many
+        else:
+            vector = _joined([found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)])
+        if self.joints:
+            assert self.names_steps is not None
+            names = tuple(_names_at(values, self.names_steps))
+            order = self._orders.get(names) or self._order_of(names)
+            if len(vector) != len(names):
+                raise FieldError(f"{len(vector)} values have {len(names)} names")
+            return vector[order]
+        if elements := self.source.elements:
+            if max(elements) >= len(vector):
+                raise FieldError(f"there are {len(vector)} values, too few")
+            return vector[list(elements)]
+        if len(vector) != len(self.names):
+            raise FieldError(f"there are {len(vector)} values where the first message has {len(self.names)}")
+        return vector
+
+    def _order_of(self, names: tuple[str, ...]) -> list[int]:
+        takes_all = not self.source.joints and not self.source.elements
+        if takes_all and len(self.others) < MAX_ELEMENTS:
+            self.others |= dict.fromkeys(name for name in names if name not in self.joints)
+        missing = [joint for joint in self.joints if joint not in names]
+        if missing and len(missing) == len(self.joints):
+            raise OtherPublisherError("it names none of the joints")
+        if missing:
+            raise FieldError(f"the joint {missing[0]!r} is missing")
+        order = [names.index(joint) for joint in self.joints]
+        if len(self._orders) < 1000:
+            self._orders[names] = order
+        return order
+
+
+def reader_of(source: Source, values: Values) -> SourceReader:
+    """What reads a source, from its first message.
+
+    Raises:
+        FieldError: The message does not have what the source names.
+        OtherPublisherError: It has none of the joints.
+    """
+    steps = parse_path(source.field)
+    found = follow(values, steps)
+    parts = list(numbers_in(found))
+    if not parts:
+        raise FieldError(f"the field {source.field!r} holds no numbers")
+    count = sum(np.size(item) for _, item in parts)
+    if count > MAX_ELEMENTS:
+        raise FieldError(f"the field {source.field!r} holds {count:,} numbers, at most {MAX_ELEMENTS:,} are taken")
+    if source.names_field:
+        names_steps: tuple[Step, ...] | None = parse_path(source.names_field)
+    else:
+        beside = _names_beside(values, steps)
+        names_steps = next((place for place, names in beside if len(names) == np.size(found)), None)
+    named = _names_at(values, names_steps) if names_steps is not None else None
+    if source.joints:
+        if named is None:
+            others = {name for _, names in _names_beside(values, steps) for name in names}
+            if others and not others & {*source.joints}:
+                raise OtherPublisherError("it names none of the joints")
+            raise FieldError(f"the elements of {source.field!r} have no names, pick them by elements = [0, 1, ...]")
+        if missing := [joint for joint in source.joints if joint not in named]:
+            problem = f"there is no joint {missing[0]!r}.{nearest_match(missing[0], named)}".rstrip(".")
+            raise OtherPublisherError(problem) if len(missing) == len(source.joints) else FieldError(problem)
+        labels = list(source.joints)
+    else:
+        labels = picked(source, named if named is not None else _labels(source.field, parts), repr(source.field))
+    is_named = bool(source.joints) or (named is not None and len(set(named)) == len(named))
+    return SourceReader(
+        source=source,
+        names=names_of(source, labels, repr(source.field)),
+        joints=tuple(labels) if is_named else (),
+        steps=steps,
+        names_steps=names_steps,
+        quaternions=() if source.joints else _quaternions(labels),
+    )
+
+
+def picked[T](source: Source, elements: Sequence[T], place: str) -> list[T]:
+    """Those of all elements of a place that a source takes; FieldError when there are fewer."""
+    if outside := [index for index in source.elements if index >= len(elements)]:
+        raise FieldError(f"there is no element {outside[0]} among the {len(elements)} of {place}")
+    return [elements[index] for index in source.elements or range(len(elements))]
+
+
+def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ...]:
+    """What the elements that a source takes are called in the feature; FieldError when it speaks of more or fewer."""
+    for what, given in (("names", source.names), ("limits", source.limits)):
+        if given and len(given) != len(labels):
+            raise FieldError(f"{what}: {len(given)} given for the {len(labels)} elements of {place}")
+    return tuple(source.prefix + name for name in source.names or labels)
+
+
+def _names_beside(values: Values, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], list[str]]]:
+    """Path and texts of each list of names that may be those of the numbers at a path."""
+    for place in dict.fromkeys([*((*steps[:-1], name) for name in _NAME_FIELDS), *((name,) for name in _NAME_FIELDS)]):
+        try:
+            names = follow(values, place)
+        except (FieldError, OtherPublisherError):
+            continue
+        if isinstance(names, list) and all(isinstance(name, str) for name in names):
+            yield place, names
+
+
+def _names_at(values: Values, steps: tuple[Step, ...]) -> list[str]:
+    names = follow(values, steps)
+    if not isinstance(names, list) or not all(isinstance(name, str) for name in names):
+        raise FieldError("the field of the names holds no texts")
+    return names
+
+
+def _labels(field: str, parts: Sequence[tuple[str, Any]]) -> list[str]:
+    labels = []
+    for name, item in parts:
+        base = name or field.rsplit(".", 1)[-1]
+        labels += [f"{base}_{index}" for index in range(np.size(item))] if np.ndim(item) else [base]
+    return labels
+
+
+def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
+    """Where four elements are x, y, z, w of the same parent."""
+    starts = []
+    for index in range(len(labels) - 3):
+        four = [label.rpartition(".") for label in labels[index : index + 4]]
+        if [name for _, _, name in four] == ["x", "y", "z", "w"] and len({parent for parent, _, _ in four}) == 1:
+            starts.append(index)
+    return tuple(starts)
+
+
+def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
+    """One vector of some numbers: float32 where all are, otherwise float64, which holds the others exactly."""
+    arrays = [np.atleast_1d(np.asarray(part)) for part in parts]
+    single = all(array.dtype.newbyteorder("=") == np.float32 for array in arrays)
+    return np.concatenate([array.astype(np.float32 if single else np.float64) for array in arrays])
+
+
+def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    """Return (N, D) in the unit of the feature; the same array if that is the source's."""
+    factor = CONVERSIONS.get((part.unit, part.to or part.unit))
+    if factor is None:
+        return vectors
+    if math.isnan(factor):
+        low, high = np.array(part.limits, dtype=np.float64).T
+        scaled: NDArray[np.float64] = low + (vectors.astype(np.float64) + 100.0) / 200.0 * (high - low)
+        return scaled
+    return vectors.astype(np.float64) * factor

@@ -1,0 +1,263 @@
+"""What datasets of an HDF5 file hold: vectors with every bit as it is, and images, JPEG and distances as they are."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import DTypeLike, NDArray
+
+from demorec.core.config import MAX_PIXELS
+from demorec.episode.info import Camera, Feature, Kept
+from demorec.extensions.imports.description import imported_feature
+from demorec.extensions.imports.episode_writer import Image
+from demorec.extensions.imports.fields import FieldError, converted, names_of, picked
+from demorec.extensions.imports.hdf5_file import Hdf5Error, StoredArray
+from demorec.extensions.imports.image_messages import decode_image, image_head
+from demorec.extensions.imports.mapping import MAX_ELEMENTS, CameraSource, Source
+from demorec.mcap.cdr import Values
+
+_EXACT = 2**53
+"""Up to which float64 holds every whole number."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Column:
+    """One part of a feature with its dataset."""
+
+    part: Source
+    array: StoredArray
+    names: tuple[str, ...]
+
+    def rows(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
+        """Read (end - begin, D): float32 where that holds all numbers, otherwise float64.
+
+        Raises:
+            FieldError: A number is not finite, or float64 cannot hold it.
+            Hdf5Error: They cannot be read.
+        """
+        rows: NDArray[Any] = self.array.read(begin, end).reshape(end - begin, -1)
+        rows = rows[:, list(self.part.elements)] if self.part.elements else rows
+        if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
+            raise FieldError(f"{self.array.place} has whole numbers that float64 cannot hold")
+        is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
+        values = converted(self.part, rows.astype(np.float32 if is_small else np.float64))
+        if len(wrong := np.argwhere(~np.isfinite(values))):
+            row, element = wrong[0].tolist()
+            raise FieldError(
+                f"{self.array.place} is {values[row, element]} in row {begin + row} ({self.names[element]}), numbers "
+                "must be finite"
+            )
+        return values
+
+
+class StoredFeature:
+    """A feature of an episode.
+
+    Args:
+        name: Its name.
+        parts, arrays: Its parts, and the dataset of each.
+        shift: Number of rows by which the frames are behind the datasets' rows: 1 for the next row of a feature.
+
+    Raises:
+        FieldError: The datasets are not vectors.
+    """
+
+    def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
+        self.name, self.shift = name, shift
+        pairs = zip(parts, arrays, strict=True)
+        self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
+
+    def described(self, dtype: DTypeLike) -> Feature:
+        """Describe it, with vectors of a type, as recordings do."""
+        names = tuple(name for column in self.columns for name in column.names)
+        units = (column.part.to or column.part.unit for column in self.columns for _ in column.names)
+        called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
+        source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
+        return imported_feature(self.name, dtype, names, units, called=called, source=source)
+
+    def vectors(self, count: int) -> NDArray[np.floating[Any]]:
+        """Read (T, D) of the first `count` frames; errors are those of `_Column.rows`."""
+        return np.concatenate([column.rows(self.shift, self.shift + count) for column in self.columns], axis=1)
+
+
+def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
+    """Return the names of the elements that are taken."""
+    if len(array.shape) > 2:
+        shape = "x".join(map(str, array.shape))
+        raise FieldError(f"{array.place} is an array of {shape}, a feature takes rows of numbers")
+    count = array.shape[1] if len(array.shape) == 2 else 1
+    if not 1 <= count <= MAX_ELEMENTS:
+        raise FieldError(f"{array.place} has {count:,} numbers a row, allowed are 1 to {MAX_ELEMENTS:,}")
+    return names_of(part, picked(part, _labels(array, count), array.place), array.place)
+
+
+def _labels(array: StoredArray, count: int) -> list[str]:
+    """What the dataset's attribute `names` calls its elements, where it has one, or else its own name and a number."""
+    try:
+        named = json.loads(str(array.attribute("names") or ""))
+    except (ValueError, RecursionError, Hdf5Error):
+        named = None
+    is_list = isinstance(named, list) and len(named) == count and all(isinstance(name, str) for name in named)
+    if is_list and all(name and name.isprintable() and "," not in name for name in named):
+        return list(named)
+    base = array.place.rpartition("/")[2].replace(",", " ")
+    return [base] if len(array.shape) == 1 else [f"{base}_{number}" for number in range(count)]
+
+
+_LEAST_SIDE = 16
+"""Pixels, below which arrays of floats are no images unless the mapping says so."""
+_JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+
+
+class StoredCamera:
+    """A camera of an episode.
+
+    Attributes:
+        width, height: Pixels.
+        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are
+            encoded once.
+        description: What becomes of the images, in words.
+
+    Args:
+        name: Of the camera.
+        camera: What the mapping says of it.
+        array: Its dataset.
+        lengths: (C, T) of the JPEG files of all cameras, in an order of cameras that nobody tells; None where the file
+            has none.
+
+    Raises:
+        FieldError: They are no images.
+        Hdf5Error: They cannot be read.
+    """
+
+    def __init__(
+        self, name: str, camera: CameraSource, array: StoredArray, lengths: NDArray[np.generic] | None
+    ) -> None:
+        self.name = name
+        self._camera, self._array, self._lengths = camera, array, lengths
+        self._scale = 0.0
+        self.kept: Kept = ""
+        shape = array.shape
+        form = image_form(array)
+        if form is None:
+            found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
+            raise FieldError(
+                f"{array.place} is {found}, images are uint8 or floats of rows, height, width and 3 colours, or of "
+                "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
+            )
+        self._form = form
+        if form == "jpeg":
+            _, self.width, self.height = self._file(array.read(0, 1)[0], 0)
+            self.kept = "jpeg" if camera.colors == "rgb" else ""
+            self.description = (
+                "jpeg passed through as it is" if self.kept else "jpeg with red and blue exchanged, encoded once"
+            )
+        elif form == "depth":
+            self.height, self.width = shape[1:3]
+            self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
+            self.description = f"distances ({self.kept}) passed through as they are"
+        else:
+            self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
+            self.description = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
+        if not 1 <= self.width * self.height <= MAX_PIXELS:
+            raise FieldError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
+        if form == "pixels" and array.dtype.kind == "f":
+            self._scale = _float_scale(array)
+            self.description = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.description}"
+
+    def described(self) -> Camera:
+        """The camera as recordings know it."""
+        place = self._camera.dataset
+        return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=place)
+
+    def images(self) -> Iterator[Image]:
+        """One a row.
+
+        Raises:
+            FieldError: A JPEG file is cut off, or of another size.
+            Hdf5Error: They cannot be read.
+        """
+        for number, row in enumerate(self._array.rows()):
+            if self._form == "depth":
+                yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
+                continue
+            if self._form == "pixels":
+                image = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
+                scaled = np.rint(image.astype(np.float64) * self._scale) if self._scale else image
+                yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
+                continue
+            data, width, height = self._file(row, number)
+            if (width, height) != (self.width, self.height):
+                raise FieldError(f"{self._array.place} changes its size to {width}x{height} in row {number}")
+            yield data if self.kept else self._ordered(self._used(decode_image, data, number))
+
+    def _ordered(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+        return image if self._camera.colors == "rgb" else np.ascontiguousarray(image[:, :, ::-1])
+
+    def _file(self, row: NDArray[np.generic], number: int) -> tuple[bytes, int, int]:
+        """The JPEG file of a row, without what pads it (it ends with its own mark, never with a zero), and its size."""
+        data = row.tobytes().rstrip(b"\0")
+        if not data.endswith(_JPEG_END):
+            raise FieldError(f"{self._array.place} holds no whole JPEG file in row {number}")
+        if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
+            raise FieldError(
+                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
+                "that compress_len tells"
+            )
+        head = self._used(image_head, data, number)
+        if head.format != "jpeg":
+            raise FieldError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
+        return data, head.width, head.height
+
+    def _used[T](self, read: Callable[[Values], T], data: bytes, number: int) -> T:
+        """What is read of the JPEG file in a row."""
+        try:
+            return read({"format": "jpeg", "data": data})
+        except FieldError as error:
+            raise FieldError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
+
+
+def _float_scale(array: StoredArray) -> float:
+    """What pixels that are floats are multiplied with: 255 where none is above 1; FieldError for other numbers."""
+    lowest, highest = 0.0, 0.0
+    for number, row in enumerate(array.rows()):
+        values = row.astype(np.float64)
+        if not np.isfinite(values).all():
+            raise FieldError(f"{array.place} has pixels that are not finite in row {number}")
+        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
+    if lowest < 0 or highest > 255:
+        raise FieldError(
+            f"{array.place} has pixels from {lowest:g} to {highest:g}, floats are read from 0 to 1 or from 0 to 255"
+        )
+    return 255.0 if highest <= 1 else 1.0
+
+
+def is_camera(array: StoredArray) -> bool:
+    """Whether a dataset holds images, JPEG files or, by its name or its last axis, distances.
+
+    Raises:
+        Hdf5Error: Its first row cannot be read.
+    """
+    form, place = image_form(array), array.place.rpartition("/")[2]
+    if form == "jpeg":
+        return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
+    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
+        first = array.read(0, min(1, len(array))).astype(np.float64)
+        return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
+    is_image = len(array.shape) == 4 and min(array.shape[1:3]) >= _LEAST_SIDE  # as our own exports have distances
+    return form == "pixels" or (form == "depth" and (is_image or "depth" in place))
+
+
+def image_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
+    """What the rows of a dataset can be as images; None for numbers that are none."""
+    shape, kind = array.shape, array.dtype
+    if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
+        return "jpeg"
+    if len(shape) == 4 and (kind == np.uint8 or kind.kind == "f") and 3 in (shape[1], shape[3]):
+        return "pixels"
+    is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
+    return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None

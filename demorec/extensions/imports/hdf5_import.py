@@ -1,0 +1,395 @@
+"""HDF5 files of robomimic's or ALOHA's layout become runs: numbers bit-exact, JPEG files as they are.
+
+All files are looked through before anything is written; then rows and images pass in pieces. The same command again
+goes on: episodes that are there are not written."""
+
+from __future__ import annotations
+
+import json
+import math
+import reprlib
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.files import sha256_of
+from demorec.core.registry import nearest_match
+from demorec.episode.episode import Outcome, Table
+from demorec.episode.info import EpisodeInfo, SourceFile
+from demorec.episode.validity import find_problems
+from demorec.extensions.imports.description import imported_info, urdf_text
+from demorec.extensions.imports.episode_writer import FramesImport, add_episode
+from demorec.extensions.imports.fields import FieldError
+from demorec.extensions.imports.hdf5_arrays import StoredCamera, StoredFeature, is_camera
+from demorec.extensions.imports.hdf5_file import ForeignFile, Hdf5Error, Scalar, StoredArray
+from demorec.extensions.imports.mapping import MAX_FPS, Episodes, SourceMapping
+from demorec.extensions.imports.mapping_file import read_mapping
+from demorec.extensions.imports.words import in_natural_order, quoted, task_in_name
+from demorec.mcap.streams import frame_times
+from demorec.runs.external import differences, open_external_run, planned_episode
+from demorec.runs.find import expect
+
+_LENGTHS = "compress_len"
+"""Where ALOHA's recorders say how long the JPEG file in each row is, without what pads it."""
+
+
+def import_hdf5(
+    paths: Sequence[Path],
+    mapping_path: Path | None,
+    out: Path,
+    *,
+    video: VideoConfig | None = None,
+) -> FramesImport:
+    """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
+
+    Args:
+        paths: Of the files, in the order of their episodes.
+        mapping_path: Of the mapping.
+        out: The run's folder; one that the same files and mapping began is continued.
+        video: How images are encoded that come as pixels.
+
+    Raises:
+        ConfigError: The mapping is impossible, the files differ, or the folder holds something else.
+        Hdf5Error: A file cannot be read, or does not fit the mapping.
+        RecordingError: The disk is full or gone.
+    """
+    assert mapping_path is not None, "whoever calls asks for it"
+    mapping = read_mapping(mapping_path, "hdf5")
+    urdf = urdf_text(mapping, mapping_path)
+    for path in paths:
+        expect(path, "hdf5")
+    if len({path.resolve() for path in paths}) < len(paths):
+        raise ConfigError("A file is given twice: name each once.")
+    plan = _planned(paths, mapping, urdf)
+    with open_external_run(out, recovers=False) as folder:
+        missing = [episode for episode in plan.episodes if not folder.has(episode.info)]
+        folder.planned = [planned_episode(episode.info.episode_index) for episode in missing]
+        for episode in missing:
+            with ForeignFile(episode.path) as file, _named(episode.path):
+                stored = _Stored(file, episode.place, mapping)
+                table = stored.table(episode.info.fps)
+                images = {camera.name: camera.images() for camera in stored.cameras}
+                settings = video or VideoConfig()
+                add_episode(folder, episode.info, table, images, outcome=episode.outcome, video=settings, subtasks={})
+    return FramesImport(
+        num_episodes=len(plan.episodes),
+        num_frames=sum(episode.outcome.num_frames for episode in plan.episodes),
+        num_new=len(missing),
+        cameras=plan.cameras,
+        left_out=plan.left_out,
+    )
+
+
+class _PlannedDemo(NamedTuple):
+    """An episode that is to be imported, by its place in a file."""
+
+    path: Path
+    place: str
+    info: EpisodeInfo
+    outcome: Outcome
+
+
+class _Plan(NamedTuple):
+    """Episodes of all files; `cameras` and `left_out` are those of `FramesImport`."""
+
+    episodes: list[_PlannedDemo]
+    cameras: dict[str, str]
+    left_out: dict[str, str]
+
+
+def _planned(paths: Sequence[Path], mapping: SourceMapping, urdf: str | None) -> _Plan:
+    """Look through all files; errors are those of `import_hdf5`."""
+    episodes: list[_PlannedDemo] = []
+    cameras: dict[str, str] = {}
+    left_out: dict[str, str] = {}
+    for path in paths:
+        with ForeignFile(path) as file, _named(path):
+            source = SourceFile(name=path.name, sha256=sha256_of(path))
+            places = episode_places(file, mapping.episodes)
+            for place in places:
+                stored = _Stored(file, place, mapping)
+                info = stored.described(urdf, source, len(episodes))
+                info = _alike(info, episodes[0].info if episodes else info, file, place)
+                episodes.append(_PlannedDemo(path, place, info, stored.outcome()))
+                cameras = cameras or {c.name: f"{c.width}x{c.height}, {c.description}" for c in stored.cameras}
+                if stored.has_last:
+                    left_out["the last observation of each episode"] = "no action follows it"
+            left_out = {**_unnamed(file, places[0], mapping), **left_out}
+    return _Plan(episodes, cameras, left_out)
+
+
+class _Stored:
+    """An episode in an opened file; FieldError when its datasets do not fit the mapping."""
+
+    def __init__(self, file: ForeignFile, place: str, mapping: SourceMapping) -> None:
+        self._file, self._place, self._mapping = file, place, mapping
+
+        def array(name: str, *, may_be_ragged: bool = False) -> StoredArray:
+            return file.array("/".join(filter(None, (place, name.strip("/")))), may_be_ragged=may_be_ragged)
+
+        self.features: list[StoredFeature] = []
+        for name, parts in mapping.features.items():
+            following = parts[0].next
+            used = mapping.features[following] if following else parts
+            arrays = [array(part.dataset) for part in used]
+            self.features.append(StoredFeature(name, used, arrays, shift=1 if following else 0))
+        cameras = {name: array(camera.dataset, may_be_ragged=True) for name, camera in mapping.cameras.items()}
+        observed = list(cameras.values())
+        others: list[StoredArray] = []
+        for feature in self.features:
+            arrays = others if not feature.name.startswith("observation.") else observed
+            arrays += [] if feature.shift else [column.array for column in feature.columns]
+        # Observations may have one row more than actions, what the last action led to.
+        self.num_rows = num_rows = len((others or observed)[0])
+        self.has_last = len(observed[0]) == num_rows + 1
+        for arrays, wanted in ((others, num_rows), (observed, num_rows + self.has_last)):
+            for one in arrays:
+                if len(one) != wanted:
+                    raise FieldError(f"{one.place} has {len(one)} rows, other datasets of the episode have {wanted}")
+        stated = file.attribute(place, "num_samples")
+        if stated is not None and stated != num_rows:
+            raise FieldError(
+                f"{place or 'the episode'} has {num_rows} rows, but its num_samples says {reprlib.repr(stated)}"
+            )
+        files = [images for images in cameras.values() if len(images.shape) == 2]
+        lengths = None
+        if files and file.has(f"{place}/{_LENGTHS}"):
+            found = array(_LENGTHS)
+            if len(found.shape) != 2 or found.shape[1] != len(files[0]):
+                raise FieldError(f"{found.place} has the shape {found.shape}, it must have {len(files[0])} columns")
+            lengths = found.read(0, len(found))
+        self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
+        if self.num_frames < 1:
+            raise FieldError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
+        self.cameras = [
+            StoredCamera(name, mapping.cameras[name], images, lengths if len(images.shape) == 2 else None)
+            for name, images in cameras.items()
+        ]
+
+    def table(self, fps: int) -> Table:
+        """Read the numbers of every frame."""
+        times = frame_times(self.num_frames, fps)
+        features = {feature.name: feature.vectors(self.num_frames) for feature in self.features}
+        cameras = [camera.name for camera in self.cameras]
+        return Table(
+            time_ns=times,
+            features=features,
+            stamps=dict.fromkeys(features, times),
+            images=dict.fromkeys(cameras, np.arange(self.num_frames)),
+            image_stamps=dict.fromkeys(cameras, times),
+        )
+
+    def described(self, urdf: str | None, source: SourceFile, episode_index: int) -> EpisodeInfo:
+        """Describe it for its recording; every number is looked at."""
+        file, place, mapping = self._file, self._place, self._mapping
+        dtypes = [feature.vectors(self.num_frames).dtype for feature in self.features]
+        if attribute := mapping.robot.urdf_attribute:
+            urdf = str(found_attribute(file, place, attribute) or "")
+        try:
+            info = imported_info(
+                mapping,
+                episode_index=episode_index,
+                instruction=self._task(),
+                urdf=urdf,
+                fps=self._rate(),
+                features=(one.described(dtype) for one, dtype in zip(self.features, dtypes, strict=True)),
+                cameras=(camera.described() for camera in self.cameras),
+                files=[source],
+            )
+        except ValueError as error:
+            raise FieldError(str(error)) from error
+        if wrong := find_problems(info):
+            raise FieldError("; ".join(wrong))
+        return info
+
+    def _rate(self) -> int:
+        """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
+        if self._mapping.clock.fps:
+            return self._mapping.clock.fps
+        found, path = stated_rate(self._file, self._place), self._file.path
+        if found is None:
+            raise Hdf5Error(
+                f"Nothing in the file says how many rows a second has: give clock.fps in the mapping: {path}"
+            )
+        if not 1 <= found <= MAX_FPS or found != int(found):
+            raise Hdf5Error(
+                f"The file says that it has {found:g} rows a second, allowed are whole numbers from 1 to {MAX_FPS}: "
+                f"give clock.fps in the mapping: {path}"
+            )
+        return int(found)
+
+    def _task(self) -> str:
+        """What the robot was asked to do; Hdf5Error when the file does not say."""
+        task, path = self._mapping.task, self._file.path
+        if task.text:
+            return task.text
+        if task.file_name:
+            if text := task_in_name(path.stem):
+                return text
+            raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {path}")
+        found = found_attribute(self._file, self._place, task.attribute)
+        if not isinstance(found, str) or not found.strip():
+            raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {self._place or 'the episode'}: {path}")
+        return found
+
+    def outcome(self) -> Outcome:
+        """How it ended, which is unknown where the mapping does not ask, or other episodes of the file alone say it.
+
+        Raises:
+            Hdf5Error: No episode says it, or this one says something else.
+        """
+        name = self._mapping.episodes.success.strip("/")
+        return Outcome(success=self._success(name) if name else None, num_frames=self.num_frames)
+
+    def _success(self, name: str) -> bool | None:
+        file, place = self._file, self._place
+        found = file.attribute(place, name)
+        if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
+            raise Hdf5Error(
+                f"{place or 'The episode'} says {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
+                f"{file.path}"
+            )
+        if found is not None:
+            return bool(found)
+        if not file.has(f"{place}/{name}"):
+            if any(file.attribute(other, name) is not None for other in episode_places(file, self._mapping.episodes)):
+                return None
+            near = nearest_match(name, list(file.children(place)))
+            told = f"{place or 'The episode'} has no attribute or dataset {name!r} that says how it ended.{near}"
+            raise Hdf5Error(f"{told.rstrip('.?')}: {file.path}")
+        array = file.array(f"{place}/{name}".lstrip("/"))
+        if len(array) != self.num_rows:
+            raise Hdf5Error(f"{array.place} has {len(array)} rows, the episode has {self.num_rows}: {file.path}")
+        return bool((array.read(self.num_rows - 1, self.num_rows).astype(np.float64) > 0).all())
+
+
+def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str) -> EpisodeInfo:
+    """An episode that shares the first one's model, a long text, in memory; ConfigError when it differs."""
+    if different := differences(first, info):
+        name = f"{place} of {file.path}" if place else str(file.path)
+        raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
+    return replace(info, urdf=first.urdf)
+
+
+def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:
+    """Datasets that the mapping does not name; groups of which it names none, as one.
+
+    Raises:
+        Hdf5Error: There are cameras among them, of which it does not say that they shall be left out.
+    """
+    used = {name.partition("/")[0] for name in mapping.datasets}
+    found: dict[str, str] = {}
+    cameras: dict[str, None] = {}
+    for dataset in file.datasets(place):
+        name = dataset.removeprefix(place).lstrip("/")
+        if name not in mapping.datasets and name != _LENGTHS:
+            group = name.partition("/")[0]
+            shown = name if group in used else group
+            found[shown] = ""
+            if not mapping.leaves_out(name):
+                with suppress(Hdf5Error):  # what cannot be read is none
+                    cameras |= {shown: None} if is_camera(file.array(dataset, may_be_ragged=True)) else {}
+    if cameras:
+        raise Hdf5Error(
+            f"The mapping does not name the cameras in {', '.join(cameras)} of {place or 'the file'}: give them a "
+            f"[cameras.NAME] each, or write above its tables leave_out = [{', '.join(map(quoted, cameras))}]: "
+            f"{file.path}"
+        )
+    return found
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Errors about what does not fit name the file."""
+    try:
+        yield
+    except FieldError as error:
+        raise Hdf5Error(f"The mapping does not fit the file: {error}: {path}") from error
+
+
+_RATES = ("fps", "env_args.env_kwargs.fps", "env_args.env_kwargs.control_freq")
+"""Attributes that say how many rows a second has: our own, and robosuite's."""
+
+
+def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
+    """The groups of the episodes, demo_2 before demo_10.
+
+    Raises:
+        Hdf5Error: There are none, not those of the mask, or one of them twice.
+    """
+    group = episodes.group.strip("/")
+    if not episodes.group:
+        return [""]
+    kinds = file.children(group)
+    names = [name for name, kind in kinds.items() if kind != "dataset"]
+    if episodes.mask:
+        wanted = set(file.names(f"mask/{episodes.mask}"))
+        if missing := sorted(wanted - set(names)):
+            raise Hdf5Error(f"mask/{episodes.mask} lists {missing[0]!r}, which is not in {group}: {file.path}")
+        names = [name for name in names if name in wanted]
+    if not names:
+        raise Hdf5Error(f"There are no episodes in {group or 'the root'}: {file.path}")
+    if others := [name for name in names if kinds[name] == "other"]:
+        raise Hdf5Error(
+            f"{_below(group, others[0])} is a link or a type, only groups within the file are episodes: {file.path}"
+        )
+    places = [_below(group, name) for name in sorted(names, key=in_natural_order)]
+    seen: dict[int, str] = {}
+    for place in places:
+        first = seen.setdefault(file.address(place), place)
+        if first != place:
+            raise Hdf5Error(f"{place} is the same group as {first}, an episode stands in a file once: {file.path}")
+    return places
+
+
+def _below(group: str, name: str) -> str:
+    return f"{group}/{name}" if group else name
+
+
+def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
+    """An attribute of an episode, or of a group above it; a name with dots goes on into the JSON of one."""
+    groups = place.split("/")
+    for level in ("/".join(groups[:depth]) for depth in range(len(groups), -1, -1)):
+        if (found := file.attribute(level, name)) is not None:
+            return found
+        first, _, keys = name.partition(".")
+        text = file.attribute(level, first) if keys else None
+        if isinstance(text, str) and (inside := _in_json(text, keys.split("."))) is not None:
+            return inside
+    return None
+
+
+def _in_json(text: str, keys: list[str]) -> Scalar | None:
+    value = _parsed(text)
+    for key in keys:
+        if isinstance(value, list):
+            value = value[int(key)] if key.isdecimal() and len(key) < 10 and int(key) < len(value) else None
+        else:
+            value = value.get(key) if isinstance(value, dict) else None
+    return value if isinstance(value, str | bool | int | float) else None
+
+
+@lru_cache(maxsize=4)
+def _parsed(text: str) -> Any:
+    """Of JSON, which may stand above a thousand episodes; None when it is none."""
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def stated_rate(file: ForeignFile, place: str) -> float | None:
+    """What the file's attributes say of the rate; None when they say nothing."""
+    for name in _RATES:
+        found = found_attribute(file, place, name)
+        if isinstance(found, int | float) and not isinstance(found, bool):
+            return float(found) if abs(found) <= sys.float_info.max else math.inf
+    return None

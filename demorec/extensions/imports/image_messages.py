@@ -1,0 +1,350 @@
+"""Messages that hold an image, as ROS and Foxglove define them: what is in them, whether they are whole, their pixels.
+
+Reordering of bytes changes no value. Bayer patterns and YUV are computed, in the plainest way that others agree on:
+bilinear interpolation, ITU-R BT.601 with limited range."""
+
+from __future__ import annotations
+
+import io
+import re
+from array import array
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any, NamedTuple, cast
+
+import av
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, UnidentifiedImageError
+
+from demorec.core.config import MAX_PIXELS
+from demorec.core.errors import describe_error
+from demorec.extensions.imports.fields import FieldError, image_bytes, whole
+from demorec.mcap.cdr import Values
+from demorec.mcap.lossless import decode_millimetres
+from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
+
+_CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
+    "rgb8": (3, (0, 1, 2)),
+    "bgr8": (3, (2, 1, 0)),
+    "rgba8": (4, (0, 1, 2)),
+    "bgra8": (4, (2, 1, 0)),
+    "8UC3": (3, (2, 1, 0)),
+    "mono8": (1, (0, 0, 0)),
+    "8UC1": (1, (0, 0, 0)),
+}
+"""Encoding -> bytes of a pixel, which of them are red, green, blue; OpenCV's own names mean blue first."""
+_BAYER = {"bayer_rggb8": (0, 0), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0), "bayer_bggr8": (1, 1)}
+"""Encoding -> row and column of the first red pixel."""
+_YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2": (0, 1, 3)}
+"""Encoding -> where the first luma, U and V of a pair of pixels are, of its four bytes."""
+_DEPTH = {"16UC1": "u2", "32FC1": "f4"}
+"""Encoding of distances -> type of one."""
+_PIXEL_BYTES = (
+    {encoding: count for encoding, (count, _) in _CHANNELS.items()}
+    | dict.fromkeys(_BAYER, 1)
+    | dict.fromkeys(_YUV, 2)
+    | {encoding: np.dtype(kind).itemsize for encoding, kind in _DEPTH.items()}
+)
+
+
+def raw_image(values: Values) -> NDArray[Any]:
+    """(H, W, 3) uint8 of a message, or (H, W) distances as they are: uint16 (16UC1) or float32 (32FC1).
+
+    Raises:
+        FieldError: Its bytes are not those of its size and encoding.
+    """
+    encoding, height = str(values["encoding"]), whole(values, "height")
+    rows = _rows(values)
+    if encoding in _DEPTH:
+        kind = np.dtype(_DEPTH[encoding]).newbyteorder(">" if values.get("is_bigendian") else "<")
+        stored = np.ascontiguousarray(rows).view(kind)
+        return stored.astype(stored.dtype.newbyteorder("="))
+    if encoding in _CHANNELS:
+        channels, order = _CHANNELS[encoding]
+        return np.ascontiguousarray(rows.reshape(height, -1, channels)[:, :, list(order)])
+    return _from_bayer(rows, *_BAYER[encoding]) if encoding in _BAYER else _from_yuv(rows, *_YUV[encoding])
+
+
+def _check_raw(values: Values) -> tuple[int, int]:
+    """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
+    encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
+    if encoding not in _PIXEL_BYTES or (encoding in _YUV and width % 2):
+        raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(_PIXEL_BYTES)} are")
+    used = width * _PIXEL_BYTES[encoding]
+    step = whole(values, "step") if values.get("step") and height > 1 else used
+    data = values["data"]
+    count = len(data) if isinstance(data, bytes | np.ndarray) else len(image_bytes(values))
+    if step < used or count < step * (height - 1) + used:
+        raise FieldError(f"its image has {count:,} bytes, too few for {width}x{height} {encoding}")
+    return step, used
+
+
+def _rows(values: Values) -> NDArray[np.uint8]:
+    """(H, B) bytes, without what pads each row."""
+    step, used = _check_raw(values)
+    height, data = whole(values, "height"), np.frombuffer(image_bytes(values), np.uint8)
+    if step == used:
+        return data[: used * height].reshape(height, used)
+    padded = np.zeros(step * height, np.uint8)
+    padded[: min(len(data), len(padded))] = data[: len(padded)]
+    return padded.reshape(height, step)[:, :used]
+
+
+def _from_bayer(pixels: NDArray[np.uint8], red_row: int, red_column: int) -> Rgb:
+    height, width = pixels.shape
+    rows, columns = np.indices((height, width))
+    is_red = ((rows % 2) == red_row) & ((columns % 2) == red_column)
+    is_blue = ((rows % 2) != red_row) & ((columns % 2) != red_column)
+    masks = (is_red, ~(is_red | is_blue), is_blue)
+    return np.stack([_filled(pixels, mask) for mask in masks], axis=2)
+
+
+def _filled(pixels: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
+    """A colour at every pixel: its own, or the mean of the neighbours that have it, the nearer ones counting double."""
+    known, weights = np.pad(np.where(mask, pixels, 0).astype(np.float64), 1), np.pad(mask.astype(np.float64), 1)
+
+    def blurred(plane: NDArray[np.float64]) -> NDArray[np.float64]:
+        lines = plane[:-2] + 2 * plane[1:-1] + plane[2:]
+        return np.asarray(lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:])
+
+    mean = blurred(known) / np.maximum(blurred(weights), 1e-9)
+    return np.where(mask, pixels, np.rint(mean)).astype(np.uint8)
+
+
+def _from_yuv(pixels: NDArray[np.uint8], luma: int, u: int, v: int) -> Rgb:
+    quads = pixels.reshape(pixels.shape[0], -1, 4).astype(np.float64)
+    y = np.repeat(quads[:, :, [luma]], 2, axis=2)
+    y[:, :, 1] = quads[:, :, luma + 2]
+    scaled = 1.164383 * (y - 16)
+    blue, red = quads[:, :, [u]] - 128, quads[:, :, [v]] - 128
+    channels = (scaled + 1.596027 * red, scaled - 0.391762 * blue - 0.812968 * red, scaled + 2.017232 * blue)
+    rgb = np.stack([channel.reshape(len(pixels), -1) for channel in channels], axis=2)
+    return np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
+
+
+VIDEO_FORMATS = tuple(DECODERS)
+KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
+"""What stays as it is, byte for byte."""
+_JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
+_SEQUENCE_BYTES = 24
+"""Of an AV1 keyframe, within which its sequence header ends."""
+_ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
+
+_HEAD_BYTES = 12
+"""ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
+
+
+class ImageHead(NamedTuple):
+    """What is known of an image before it is decoded.
+
+    Attributes:
+        format: raw, jpeg, png, compressedDepth or a codec of `VIDEO_FORMATS`.
+        encoding: Of raw pixels and of distances: "rgb8", "bayer_rggb8", "16UC1"; else "".
+        width, height: Pixels; 0 in video between keyframes.
+        is_keyframe: Whether it can be decoded without those before it: in video a keyframe with its parameter sets.
+    """
+
+    format: str
+    encoding: str
+    width: int
+    height: int
+    is_keyframe: bool
+
+
+class ImageHeads:
+    """The heads of a camera's images in order: a bag has a million of them, which are of a few kinds."""
+
+    def __init__(self) -> None:
+        self._kinds: list[ImageHead] = []
+        self._places: dict[ImageHead, int] = {}
+        self._of = array("I")
+
+    def append(self, head: ImageHead) -> None:
+        """Add the next one."""
+        place = self._places.get(head)
+        if place is None:
+            place = self._places[head] = len(self._kinds)
+            self._kinds.append(head)
+        self._of.append(place)
+
+    def __len__(self) -> int:
+        return len(self._of)
+
+    def __getitem__(self, index: int) -> ImageHead:
+        return self._kinds[self._of[index]]
+
+    def kinds(self, among: NDArray[np.int64] | None = None) -> list[ImageHead]:
+        """The different ones, of all or of the images of these numbers."""
+        if among is None:
+            return list(self._kinds)
+        return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
+
+    @property
+    def are_keyframes(self) -> NDArray[np.bool_]:
+        """(N,) of each whether it can be decoded without those before it."""
+        return np.array([head.is_keyframe for head in self._kinds], bool)[np.array(self._of, np.intp)]
+
+
+def image_head(values: Values) -> ImageHead:
+    """Of a message; FieldError when it holds no image, a damaged one, or one in a format that is not read."""
+    if "data" not in values:
+        raise FieldError("it holds no image")
+    if "encoding" in values and "width" in values and "height" in values:
+        size = whole(values, "width"), whole(values, "height")
+        head = _checked(ImageHead("raw", str(values["encoding"]), *size, True))
+        _check_raw(values)
+        return head
+    if "format" not in values:
+        raise FieldError("it holds no image")
+    data = image_bytes(values)
+    name = str(values["format"]).lower()
+    if "compresseddepth" in name:
+        encoding = str(values["format"]).split(";")[0].strip()
+        if encoding != "16UC1":
+            raise FieldError(
+                f"its compressedDepth is of {encoding[:20]!r}, which does not keep what was measured; 16UC1, and 32FC1 "
+                "that is not compressed, are read"
+            )
+        height, width = _compressed_depth(data).shape
+        return _checked(ImageHead("compressedDepth", encoding, width, height, True))
+    if data.startswith((_JPEG, _PNG)):
+        return _file_head(data)
+    codec = _ALIASES.get(name, name)
+    if codec not in VIDEO_FORMATS:
+        raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
+    if not _starts_by_itself(codec, data):
+        return ImageHead(codec, "", 0, 0, False)
+    return _checked(ImageHead(codec, "", *_keyframe_size(codec, data), True))
+
+
+def _checked(head: ImageHead) -> ImageHead:
+    _check_size(head.width, head.height)
+    return head
+
+
+def _check_size(width: int, height: int) -> None:
+    if width < 1 or height < 1 or width * height > MAX_PIXELS:
+        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are read")
+
+
+@contextmanager
+def _opened(data: bytes, formats: list[str], problem: str) -> Iterator[Image.Image]:
+    """An image file; FieldError, which begins with the problem, when it is damaged."""
+    try:
+        with Image.open(io.BytesIO(data), formats=formats) as image:
+            yield image
+    except UnidentifiedImageError as error:
+        raise FieldError(f"{problem} (no whole {' or '.join(formats)} file)") from error
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+        raise FieldError(f"{problem} ({describe_error(error)})") from error
+
+
+def _file_head(data: bytes) -> ImageHead:
+    """Of a JPEG or PNG file; FieldError when it is none, damaged, or too large."""
+    kind = "jpeg" if data.startswith(_JPEG) else "png"
+    with _opened(data, [kind.upper()], "its image is damaged") as image:
+        width, height = image.size
+        if kind == "png":  # what stays as it is, is not looked into; what will be decoded must be whole
+            _check_mode(image)
+            image.verify()
+    end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
+    if end not in data[-64:]:  # some cameras pad their images
+        raise FieldError("its image is cut off")
+    return _checked(ImageHead(kind, "", width, height, True))
+
+
+def _check_mode(image: Image.Image) -> None:
+    if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+        raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
+
+
+def decode_image(values: Values) -> NDArray[Any]:
+    """(H, W, 3) RGB of an image that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
+    if "encoding" in values:
+        return raw_image(values)
+    if "compresseddepth" in str(values["format"]).lower():
+        return _compressed_depth(image_bytes(values))
+    with _opened(image_bytes(values), ["JPEG", "PNG"], "its image cannot be decoded") as image:
+        _check_mode(image)
+        return np.asarray(image.convert("RGB"))
+
+
+def _starts_by_itself(codec: str, data: bytes) -> bool:
+    if codec == "av1":
+        return is_keyframe(codec, data)
+    kinds = [kind for kind, _ in nal_units(codec, data)]
+    if codec == "h264":  # ITU-T H.264, table 7-1
+        return 5 in kinds and 7 in kinds
+    return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
+
+
+_shapes: dict[tuple[str, bytes], tuple[int, int, str]] = {}
+"""(codec, parameter sets) -> width, height and pixel format of the keyframes, one of which was decoded for it."""
+_DEEP_GRAY = re.compile(r"gray(9|1\d|f32)")
+"""FFmpeg's pixel formats of one value of more than 8 bits: depth or another measurement."""
+
+
+class NoColorError(FieldError):
+    """Encoded images hold a measurement, whose unit nobody states, in place of colours."""
+
+
+def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
+    """Return width and height of a keyframe.
+
+    Raises:
+        FieldError: It gives no image.
+        NoColorError: Its pixels are not colours.
+    """
+    key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
+    if key not in _shapes:
+        frame = next(_frames(codec, [data]), None)
+        if frame is None:
+            raise FieldError(f"its {codec} keyframe gives no image")
+        _shapes[key] = (frame.width, frame.height, frame.format.name)
+    width, height, pixel_format = _shapes[key]
+    if _DEEP_GRAY.match(pixel_format):
+        raise NoColorError(
+            f"its {codec} video holds {pixel_format}, which is depth or another measurement and not colour: leave the "
+            "topic out, or record the distances as 16UC1 or 32FC1 images"
+        )
+    return width, height
+
+
+def _parameter_sets(codec: str, data: bytes) -> bytes:
+    """Those in front of a keyframe's image, without what may differ from image to image beside them."""
+    units = list(nal_units(codec, data))
+    kinds = (7, 8) if codec == "h264" else (32, 33, 34)
+    places = [place for _, place in units[1:]] + [units[-1][1]]
+    return b"".join(data[at:end] for (kind, at), end in zip(units, places, strict=True) if kind in kinds)
+
+
+def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
+    try:
+        context = cast(av.VideoCodecContext, av.CodecContext.create(DECODERS[codec], "r"))
+        context.thread_count = 1
+        context.options = {"max_pixels": str(MAX_PIXELS)}
+        for data in packets:
+            yield from context.decode(av.Packet(data))
+        yield from context.decode(None)
+    except (av.FFmpegError, ValueError) as error:
+        raise FieldError(f"its {codec} video cannot be decoded") from error
+
+
+def _compressed_depth(data: bytes) -> NDArray[np.uint16]:
+    """(H, W) millimetres; FieldError when they are too many, or cannot be decoded."""
+    if data.startswith(_PNG, _HEAD_BYTES):
+        with _opened(data[_HEAD_BYTES:], ["PNG"], "its distances cannot be decoded") as image:
+            _check_size(*image.size)
+            if image.mode not in ("I;16", "I"):
+                raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
+            return np.asarray(image).astype(np.uint16)
+    size = data[_HEAD_BYTES : _HEAD_BYTES + 8]
+    if len(size) < 8:
+        raise FieldError("its distances are cut off")
+    width, height = (int.from_bytes(part, "little") for part in (size[:4], size[4:]))
+    _check_size(width, height)
+    try:
+        return decode_millimetres(data, (height, width))
+    except ValueError as error:
+        raise FieldError(f"its distances cannot be decoded ({describe_error(error)})") from error

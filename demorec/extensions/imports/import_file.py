@@ -1,0 +1,183 @@
+"""import.json: what a run was imported from, by which mapping, and what was found in it; kept for `check`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from demorec.core.errors import ConfigError, describe_error, resource_error
+from demorec.core.files import read_text_limited, replace_text
+from demorec.core.plain import from_json, to_json
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.clock import NS, Timeline
+from demorec.extensions.imports.findings import NOTE, Finding, lost_in
+from demorec.extensions.imports.rows import EpisodeRows
+from demorec.runs.run_file import IMPORT_NAME
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeReport:
+    """Report of a part of a bag that is an episode, or none.
+
+    Attributes:
+        episode_index: Its number in the run; None if it was dropped.
+        begin_s, end_s: Its place in the bag, from the first message on.
+        num_frames: Number of rows.
+        success: Outcome; None where the bag does not say.
+        pictures: Camera -> what became of its images, in words.
+        reason: Why it was dropped; "" for others.
+        discarded: The marker that left it out, so that nothing is missing; "" for others.
+        follows: The stream whose messages have a row each; "" for rows of a grid.
+    """
+
+    episode_index: int | None
+    begin_s: float
+    end_s: float
+    num_frames: int
+    success: bool | None
+    pictures: dict[str, str]
+    reason: str = ""
+    discarded: str = ""
+    follows: str = ""
+
+    def lines(self) -> Iterator[str]:
+        """Describe it in words."""
+        place = f"{self.begin_s:.2f} to {self.end_s:.2f} s"
+        if self.episode_index is None:
+            yield f"no episode from {place}: {self.reason}"
+            return
+        verdict = {True: ", success", False: ", failure", None: ""}[self.success]
+        rows = f", one for each message of {self.follows}" if self.follows else ""
+        yield f"episode {self.episode_index}: {place}, {self.num_frames} frames{rows}{verdict}"
+        for camera, text in self.pictures.items():
+            yield f"  camera {camera}: {text}"
+
+
+@dataclass(frozen=True, kw_only=True)
+class BagReport:
+    """Report of a bag.
+
+    Attributes:
+        name: Name of the file or folder, without its place.
+        files: Name and SHA-256 of each of its files.
+        num_bytes: Size of its files.
+        streams: Figures of each stream, as `stream_figures` has them.
+        findings, episodes: As described there.
+    """
+
+    name: str
+    files: tuple[tuple[str, str], ...]
+    num_bytes: int
+    streams: tuple[dict[str, str], ...]
+    findings: tuple[Finding, ...]
+    episodes: tuple[EpisodeReport, ...]
+
+    @property
+    def odd(self) -> tuple[Finding, ...]:
+        """Findings that are no notes."""
+        return tuple(finding for finding in self.findings if finding.kind != NOTE)
+
+    @property
+    def made(self) -> tuple[EpisodeReport, ...]:
+        """Episodes that were not dropped."""
+        return tuple(episode for episode in self.episodes if episode.episode_index is not None)
+
+    def dropped_lines(self) -> Iterator[str]:
+        """Describe the parts that became no episode, and what was odd."""
+        for episode in self.episodes:
+            if episode.episode_index is None:
+                yield from episode.lines()
+        if kinds := sorted({finding.kind for finding in self.odd}):
+            yield f"findings in the bag ({', '.join(kinds)}), which demorec check lists"
+
+
+def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str, str]:
+    """Return the figures of a stream by their name in the report's table.
+
+    The skew is the median of the time of recording minus that of the header, the jitter the deviation of those steps
+    that lack no message, the age that of the oldest message in any row.
+    """
+    steps = np.diff(line.times_ns)
+    usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
+    ages = [line.chosen(rows.table.time_ns).reach_ns.max() for rows in episodes]
+    return {
+        "stream": line.stream.label,
+        "topic": line.stream.topic,
+        "messages": str(len(line.stream)),
+        "rate Hz": f"{NS / line.period_ns:.1f}" if line.is_regular else "on change",
+        "clock": "header" if line.is_header else "log",
+        "skew ms": f"{np.median(line.skews_ns) / 1e6:.1f}" if len(line.skews_ns) else "-",
+        "jitter ms": f"{np.std(usual) / 1e6:.1f}" if line.is_regular else "-",
+        "longest ms": f"{steps.max(initial=0) / 1e6:.1f}",
+        "lost": str(int(lost_in(line).sum()) if line.is_regular else 0),
+        "age ms": f"{max(ages) / 1e6:.1f}" if ages else "-",
+    }
+
+
+FORMAT = 1
+_MAX_BYTES = 256 << 20
+
+
+@dataclass(frozen=True, kw_only=True)
+class SkippedBag:
+    """A bag that an import left out: the name of the file or folder, without its place, and why, in words."""
+
+    name: str
+    reason: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImportFile:
+    """The content of import.json.
+
+    Attributes:
+        format: Of this file.
+        mapping: Of all bags, as plain data: that of an older release may have other keys.
+        mapping_digest: Of it.
+        bags: Reports of the imported bags in order; those that are not whole yet are missing.
+        skipped: Bags that were left out when they were last given.
+    """
+
+    format: int = FORMAT
+    mapping: Mapping[str, Any]
+    mapping_digest: str
+    bags: tuple[BagReport, ...] = ()
+    skipped: tuple[SkippedBag, ...] = ()
+
+    @property
+    def num_episodes(self) -> int:
+        """Number of episodes that were made; the next one has this number."""
+        return sum(len(bag.made) for bag in self.bags)
+
+
+def load_import_file(folder: Path) -> ImportFile | None:
+    """Load the import.json of a run; None if it has none, BagError if it cannot be read."""
+    path = folder / IMPORT_NAME
+    try:
+        found = from_json(read_text_limited(path, _MAX_BYTES), ImportFile)
+        if found.format != FORMAT:
+            raise ConfigError(f"import.json has format {found.format}, this demorec knows up to {FORMAT}: {path}")
+        return found
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    except OSError as error:
+        raise resource_error(error, path) or BagError(
+            f"import.json cannot be read ({error.strerror}): {path}"
+        ) from error
+    except ValueError as error:
+        raise BagError(f"import.json is damaged ({describe_error(error)}): {path}") from error
+
+
+def save_import_file(content: ImportFile, folder: Path) -> None:
+    """Replace import.json in one step; BagError when it cannot be written."""
+    path = folder / IMPORT_NAME
+    try:
+        replace_text(path, to_json(content, indent=2) + "\n")
+    except OSError as error:
+        raise resource_error(error, path) or BagError(
+            f"import.json cannot be written ({error.strerror}): {path}"
+        ) from error

@@ -1,0 +1,195 @@
+"""The strict reading of a mapping's TOML file: bounded, unknown keys refused with the nearest known one."""
+
+from __future__ import annotations
+
+import dataclasses
+import tomllib
+import typing
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+from demorec.core.errors import ConfigError, describe_error
+from demorec.core.files import read_text_limited
+from demorec.core.plain import MAX_LISTED, from_plain, listed
+from demorec.core.registry import nearest_match
+from demorec.episode.features import ACTION, STATE
+from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
+from demorec.extensions.imports.mapping import (
+    CONVERSIONS,
+    KIND,
+    MAX_FPS,
+    MAX_SECONDS,
+    Source,
+    SourceKind,
+    SourceMapping,
+)
+
+_MAX_FILE_BYTES = 1 << 20
+_KINDS: dict[SourceKind, str] = {"bag": "bags", "hdf5": "HDF5 files"}
+
+
+def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
+    """A mapping of bags, or of HDF5 files, from its TOML file.
+
+    Raises:
+        ConfigError: All keys that are unknown, else all values of a wrong type, else all that is impossible: the former
+            often cause the latter.
+    """
+    try:
+        data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
+    except FileNotFoundError as error:
+        raise ConfigError(f"There is no mapping (demorec import ... --suggest > FILE writes one): {path}") from error
+    except OSError as error:
+        raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"The mapping is no valid TOML ({describe_error(error)}): {path}") from error
+    if problems := list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_LISTED)):
+        for other in _KINDS:
+            if not any(_unknown_keys(data, SourceMapping, "", other)):
+                raise ConfigError(f"This is a mapping of {_KINDS[other]}, not of {_KINDS[kind]}: {path}")
+        raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
+    try:
+        if kind == "hdf5" and isinstance(data.get("episodes", {}), dict):
+            # Nobody asks how an episode ended unless the mapping says where that is.
+            data["episodes"] = {"success": ""} | data.get("episodes", {})
+        mapping = from_plain({**data, KIND: kind}, SourceMapping)
+    except ValueError as error:
+        raise ConfigError(f"The mapping cannot be used: {error}: {path}") from error
+    if problems := list(_problems(mapping)):
+        raise ConfigError(f"The mapping cannot be used: {listed(problems)}: {path}")
+    return mapping
+
+
+def _unknown_keys(value: Any, kind: Any, place: str, of: SourceKind) -> Iterator[str]:
+    arguments = typing.get_args(kind)
+    if isinstance(value, list) and typing.get_origin(kind) is tuple:
+        for item in value:
+            yield from _unknown_keys(item, arguments[0], place, of)
+    children: dict[str, Any] = {}
+    if isinstance(value, dict) and dataclasses.is_dataclass(kind):
+        own = {one.name for one in dataclasses.fields(kind) if one.metadata.get(KIND, of) == of} - {KIND}
+        children = {name: hint for name, hint in typing.get_type_hints(kind).items() if name in own}
+        where = f" in {place}" if place else ""
+        for key in (key for key in value if key not in children):
+            yield f"unknown key {key!r}{where}.{nearest_match(key, children)}".rstrip(".")
+    elif isinstance(value, dict) and len(arguments) == 2:
+        children = dict.fromkeys(value, arguments[1])
+    for key, item in value.items() if children else ():
+        if key in children:
+            yield from _unknown_keys(item, children[key], f"{place}.{key}".strip("."), of)
+
+
+def _problems(mapping: SourceMapping) -> Iterator[str]:
+    """What is impossible in it, whatever the bag or file."""
+    yield from _feature_problems(mapping)
+    if ACTION not in mapping.features:
+        what = "topic" if mapping.kind == "bag" else "dataset"
+        yield f"there is no feature 'action': name its {what}, or next = \"observation.state\""
+    yield from _camera_problems(mapping)
+    if not mapping.robot.name.strip():
+        yield "robot.name is empty"
+    task, clock = mapping.task, mapping.clock
+    elsewhere = "topic" if mapping.kind == "bag" else "attribute"
+    if (bool(task.text.strip()) + bool(task.topic or task.attribute) + task.file_name) != 1:
+        yield f"[task] needs one of text, {elsewhere} and file_name"
+    if mapping.robot.urdf and (mapping.robot.urdf_topic or mapping.robot.urdf_attribute):
+        yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
+    if not (clock.fps == 0 and mapping.kind == "hdf5") and not 1 <= clock.fps <= MAX_FPS:
+        yield f"clock.fps is {clock.fps}, allowed are 1 to {MAX_FPS}"
+    if mapping.kind == "bag":
+        yield from _bag_problems(mapping)
+        return
+    for name in sorted(filter(mapping.leaves_out, mapping.datasets)):
+        yield f"leave_out leaves out {name!r}, which the mapping names"
+    if mapping.episodes.mask and not mapping.episodes.group:
+        yield "episodes.mask chooses among the episodes of a group, but episodes.group is empty"
+
+
+def _feature_problems(mapping: SourceMapping) -> Iterator[str]:
+    if len(mapping.features) > MAX_FEATURES:
+        yield f"there are {len(mapping.features):,} features, allowed are up to {MAX_FEATURES}"
+        return
+    if STATE not in mapping.features:
+        yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
+    for name, sources in mapping.features.items():
+        if "/" in name or not name or name.startswith("observation.images"):
+            yield f"a feature cannot be called {name!r}"
+        if not sources:
+            yield f"the feature {name!r} has no source"
+        for source in sources:
+            yield from _source_problems(mapping, name, source)
+
+
+def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Iterator[str]:
+    place, is_bag = f"the feature {name!r}", mapping.kind == "bag"
+    for what, taken in (("an element", source.elements), (f"a joint of {source.topic}", source.joints)):
+        if len(set(taken)) != len(taken):
+            yield f"{place} names {what} twice"
+    if any(element < 0 for element in source.elements):
+        yield f"{place} names an element below 0"
+    pair = (source.unit, source.to or source.unit)
+    if pair not in CONVERSIONS and pair[0] != pair[1]:
+        yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
+    if "percent" in pair and pair[0] != pair[1] and not source.limits:
+        yield f"{place} needs limits, since -100..100 stands for each joint's own range"
+    if any(not low < high for low, high in source.limits):
+        yield f"{place} has limits that are not [lowest, highest]"
+    if source.next:
+        yield from _next_problems(mapping, name, source.next, is_bag=is_bag)
+    if bool(source.topic or source.dataset) == bool(source.next):
+        what, parts = ("topic", "sources") if is_bag else ("dataset", "parts")
+        yield f"{place} needs either a {what} or next in each of its {parts}"
+    if source.topic and not source.field:
+        yield f"{place} needs the field of {source.topic}"
+    if source.joints and source.elements:
+        yield f"{place} picks elements of {source.topic} both by joints and by elements"
+    yield from _age_problems(place, source.max_age_s)
+
+
+def _next_problems(mapping: SourceMapping, name: str, following: str, *, is_bag: bool) -> Iterator[str]:
+    place, known = f"the feature {name!r}", [other for other in mapping.features if other != name]
+    if len(mapping.features[name]) > 1 and not is_bag:
+        yield f"{place} has other parts beside next"
+    if following not in known and (following in mapping.features or following != STATE):  # whose lack is said already
+        yield f"{place} follows {following!r}, which is no feature.{nearest_match(following, known)}".rstrip(".")
+    elif any(other.next for other in mapping.features.get(following, ())):
+        yield f"{place} follows {following!r}, which follows another feature itself"
+
+
+def _camera_problems(mapping: SourceMapping) -> Iterator[str]:
+    if len(mapping.cameras) > MAX_CAMERAS:
+        yield f"there are {len(mapping.cameras):,} cameras, allowed are up to {MAX_CAMERAS}"
+        return
+    for name, camera in mapping.cameras.items():
+        if not name.isidentifier():
+            yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"
+        if not (camera.topic or camera.dataset):
+            yield f"cameras.{name} needs a {'topic' if mapping.kind == 'bag' else 'dataset'}"
+        yield from _age_problems(f"cameras.{name}", camera.max_age_s)
+
+
+def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
+    task, clock, episodes = mapping.task, mapping.clock, mapping.episodes
+    yield from _age_problems("clock", clock.max_age_s)
+    fields = {task.topic: task.field, **({episodes.topic: episodes.field} if episodes.cut == "marker" else {})}
+    if mapping.subtasks.topic and fields.get(mapping.subtasks.topic, mapping.subtasks.field) != mapping.subtasks.field:
+        yield f"subtasks.field is {mapping.subtasks.field!r}, but another field of the same topic is taken for texts"
+    if episodes.cut == "marker" and not episodes.topic:
+        yield 'episodes.cut = "marker" needs episodes.topic'
+    if episodes.cut == "times" and not episodes.times_s:
+        yield 'episodes.cut = "times" needs episodes.times_s'
+    if any(not begin < end for begin, end in episodes.times_s):
+        yield "episodes.times_s has an episode that ends before it begins"
+    if not 0 < episodes.gap_s <= MAX_SECONDS:
+        yield f"episodes.gap_s is {episodes.gap_s:g}, it must be above 0 and at most {MAX_SECONDS:g}"
+    if not 0 <= clock.max_trim_s <= MAX_SECONDS:
+        yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
+    if any(not -MAX_SECONDS <= time <= MAX_SECONDS for times in episodes.times_s for time in times):
+        yield f"episodes.times_s has a time beyond {MAX_SECONDS:g} s"
+
+
+def _age_problems(place: str, age: float | None) -> Iterator[str]:
+    if age is not None and not 0 < age <= MAX_SECONDS:
+        yield f"{place}.max_age_s is {age:g}, it must be above 0 and at most {MAX_SECONDS:g}"

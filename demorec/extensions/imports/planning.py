@@ -1,0 +1,344 @@
+"""A bag is read and judged as a whole: the episodes that shall be recorded of it, and a report of what was found.
+
+The mapping says where episodes begin and end, what they are called and how they ended, by what the bag holds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from demorec.core.config import VideoConfig
+from demorec.core.errors import ConfigError
+from demorec.core.plain import listed
+from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
+from demorec.episode.validity import find_problems
+from demorec.extensions.imports.bag import Bag, Files
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.bag_findings import all_findings, row_findings
+from demorec.extensions.imports.clock import NS
+from demorec.extensions.imports.description import imported_feature, imported_info
+from demorec.extensions.imports.fields import FieldError
+from demorec.extensions.imports.findings import Finding
+from demorec.extensions.imports.import_file import BagReport, EpisodeReport, stream_figures
+from demorec.extensions.imports.mapping import Episodes, SourceMapping
+from demorec.extensions.imports.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
+from demorec.extensions.imports.streams import Text, read_streams
+from demorec.extensions.imports.words import task_in_name
+from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
+from demorec.mcap.video import size_problem
+from demorec.runs.external import differences
+
+_SHOWN = 40
+"""Characters of a marker in an error."""
+_MOST_LISTED = 5
+"""Maximum number of markers in an error."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedEpisode:
+    """An episode that shall be written; `subtasks` is row -> what is begun there, in words."""
+
+    info: EpisodeInfo
+    rows: EpisodeRows
+    subtasks: Mapping[int, str]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class PlannedBag:
+    """A bag that has been read; its episodes are numbered from 0 until the run's numbers are known."""
+
+    bag: Bag
+    report: BagReport
+    episodes: tuple[PlannedEpisode, ...]
+
+    def numbered(self, first: int) -> PlannedBag:
+        """The same with the numbers of a run."""
+        reports = (
+            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
+            for row in self.report.episodes
+        )
+        episodes = (
+            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
+            for episode in self.episodes
+        )
+        return replace(self, report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
+
+
+def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoConfig) -> PlannedBag:
+    """Read and judge a bag.
+
+    Args:
+        bag: To be read.
+        mapping: Of it.
+        urdf: The robot's model, None where the mapping names no file.
+        video: How pixels are to be encoded.
+
+    Raises:
+        BagError: It cannot be read, does not fit the mapping, or would give an episode with something missing.
+        ConfigError: Its episodes differ.
+    """
+    files = bag.sha256s()
+    streams = read_streams(bag, mapping)
+    try:
+        lines = Timelines(streams, mapping)
+        findings = all_findings(lines)
+        begin = min(int(line.times_ns[0]) for line in lines.lines.values())
+        episodes: list[PlannedEpisode] = []
+        reports: list[EpisodeReport] = []
+        for window in windows(lines):
+            episode, reason = None, ""
+            if window.discarded:
+                reason = f"its marker says {window.discarded!r}"
+            else:
+                try:
+                    rows = lines.rows(window)
+                    episode = _episode(bag, files, lines, rows, urdf, len(episodes))
+                    if wrong := list(_problems(episode, video)):
+                        raise BagError(f"The episode cannot be recorded: {'; '.join(wrong)}")
+                    episodes.append(episode)
+                except NoRowsError as error:
+                    if mapping.clock.when_old == "error":
+                        raise BagError(f"The bag gives no whole episode: {error}{_reported(findings)}") from error
+                    reason = str(error)
+            reports.append(_report(window, begin, episode, reason))
+        for episode in episodes:
+            if different := differences(episodes[0].info, episode.info):
+                raise ConfigError(f"The bag's episodes differ ({'; '.join(different)}): {bag.path}")
+    except BagError as error:
+        raise BagError(f"{error}: {bag.path}") from error
+    rows_of = [episode.rows for episode in episodes]
+    report = BagReport(
+        name=bag.path.name,
+        files=files,
+        num_bytes=bag.num_bytes,
+        streams=tuple(stream_figures(line, rows_of) for line in lines.lines.values()),
+        findings=(*findings, *row_findings(lines, rows_of)),
+        episodes=tuple(reports),
+    )
+    return PlannedBag(bag=bag, report=report, episodes=tuple(episodes))
+
+
+def _reported(findings: Sequence[Finding]) -> str:
+    """What else is odd in a bag that gives no whole episode, which may be why."""
+    kinds = {finding.kind: finding.kind for finding in findings}
+    offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
+    kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
+    return f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
+
+
+def _episode(
+    bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, urdf: str | None, index: int
+) -> PlannedEpisode:
+    mapping = lines.mapping
+    if topic := mapping.robot.urdf_topic:
+        texts = lines.streams.texts[topic]
+        urdf = texts[0].value if texts else ""
+        if not isinstance(urdf, str) or not urdf.strip():
+            raise BagError(f"{topic} holds no robot description")
+    try:
+        info = imported_info(
+            mapping,
+            episode_index=index,
+            instruction=_task_text(bag.name, lines, rows.window),
+            urdf=urdf,
+            fps=mapping.clock.fps,
+            features=(_feature(name, values.dtype, lines) for name, values in rows.table.features.items()),
+            cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
+            files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
+        )
+    except FieldError as error:
+        raise BagError(f"The episode cannot be recorded: {error}") from error
+    return PlannedEpisode(info=info, rows=rows, subtasks=_subtask_rows(lines, rows))
+
+
+def windows(lines: Timelines) -> list[Window]:
+    """The episodes of a bag, in order; BagError when there are none, or where a marker has no meaning."""
+    begin = min(int(line.times_ns[0]) for line in lines.lines.values())
+    end = max(int(line.times_ns[-1]) for line in lines.lines.values())
+    episodes = lines.mapping.episodes
+    if episodes.cut == "file":
+        return [Window(begin_ns=begin, end_ns=end)]
+    if episodes.cut == "times":
+        found = [
+            Window(begin_ns=begin + round(first * NS), end_ns=begin + round(last * NS))
+            for first, last in episodes.times_s
+        ]
+        if outside := [window for window in found if window.begin_ns >= end]:
+            raise BagError(
+                f"An episode begins {(outside[0].begin_ns - begin) / NS:g} s after the first message, the bag has only "
+                f"{(end - begin) / NS:.1f} s"
+            )
+        return found
+    if episodes.cut == "gap":
+        times = np.unique(np.concatenate([line.times_ns for line in lines.lines.values()]))
+        parts = np.split(times, np.flatnonzero(np.diff(times) > episodes.gap_s * NS) + 1)
+        return [Window(begin_ns=int(part[0]), end_ns=int(part[-1])) for part in parts]
+    markers = lines.streams.texts[episodes.topic]
+    if unknown := _unknown_words(markers, lines.mapping):
+        raise BagError(
+            f"Markers of {episodes.topic} say {unknown}, which the mapping "
+            f"does not know: put it into episodes.discard (the episode is left out) or episodes.ignore, or set start, "
+            f"stop, success or failure"
+        )
+    if found := _between_markers(markers, episodes):
+        return found
+    raise BagError(
+        f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no episode"
+    )
+
+
+def _unknown_words(markers: list[Text], mapping: SourceMapping) -> str:
+    """What markers say that the mapping gives no meaning, each once; "" for nothing. Subtasks may share their topic."""
+    words = mapping.episodes
+    known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
+    is_shared = words.topic == mapping.subtasks.topic
+
+    def is_known(value: object) -> bool:
+        return isinstance(value, str | int | float) and ((is_shared and isinstance(value, str)) or value in known)
+
+    found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if not is_known(marker.value))
+    return listed(found, _MOST_LISTED, ", ")
+
+
+def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
+    found: list[Window] = []
+    begin: int | None = None
+    for marker in sorted(markers, key=lambda marker: marker.time_ns):
+        if marker.value is True or marker.value == words.start:
+            begin = marker.time_ns
+        elif begin is not None and (
+            marker.value is False or marker.value in (words.stop, words.success, words.failure)
+        ):
+            success = {words.success: True, words.failure: False}.get(marker.value) if marker.value else None
+            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, success=success))
+            begin = None
+        elif begin is None and found and marker.value in (words.success, words.failure):
+            # The verdict may come after the end.
+            found[-1] = replace(found[-1], success=marker.value == words.success)
+        elif begin is not None and marker.value in words.discard:
+            found.append(Window(begin_ns=begin, end_ns=marker.time_ns, discarded=marker.value))
+            begin = None
+        elif found and marker.value in words.discard:
+            found[-1] = replace(found[-1], discarded=marker.value)
+    return found
+
+
+def _task_text(bag_name: str, lines: Timelines, window: Window) -> str:
+    """What the robot was asked to do in an episode; BagError where the bag does not say."""
+    task = lines.mapping.task
+    if task.text:
+        return task.text.strip()
+    if task.file_name:
+        if text := task_in_name(bag_name):
+            return text
+        raise BagError("The bag's name says no task, which the mapping takes from it")
+    texts = [text for text in lines.streams.texts[task.topic] if text.time_ns <= window.end_ns]
+    if not texts:
+        raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown")
+    value = max(texts, key=lambda text: text.time_ns).value
+    if not isinstance(value, str) or not value.strip():
+        raise BagError(f"The task of {task.topic} is no text")
+    return value.strip()
+
+
+def _subtask_rows(lines: Timelines, rows: EpisodeRows) -> dict[int, str]:
+    """Row -> what is begun there: the texts of the mapping's topic that were said within the episode.
+
+    Of several before a row the last one holds from it on; a text that is said again, and an empty one, begins nothing.
+
+    Raises:
+        BagError: What was said is no text.
+    """
+    words, topic = lines.mapping.episodes, lines.mapping.subtasks.topic
+    is_marker = words.cut == "marker" and words.topic == topic
+    ends = {words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
+    markers = ends if is_marker else set()
+    found: dict[int, str] = {}
+    for text in sorted(lines.streams.texts.get(topic, ()), key=lambda text: text.time_ns):
+        if not rows.window.begin_ns <= text.time_ns <= rows.table.time_ns[-1]:
+            continue
+        if not isinstance(text.value, str):
+            raise BagError(f"The subtask of {topic} is no text")
+        if text.value in markers:
+            continue
+        if said := " ".join(text.value.split()):
+            found[int(np.searchsorted(rows.table.time_ns, text.time_ns))] = said
+    before = ["", *found.values()]
+    return {row: said for (row, said), last in zip(found.items(), before, strict=False) if said != last}
+
+
+def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
+    rules = [
+        f"{source.next} of the next frame"
+        if source.next
+        else f"{source.topic} {source.field}, {lines.lines[name, index].rule}"
+        for index, source in enumerate(lines.mapping.features[name])
+    ]
+    streams = [line.stream for line in lines.sources(name)]
+    names = tuple(element for stream in streams for element in stream.names)
+    units = (stream.unit for stream in streams for _ in stream.names)
+    return imported_feature(name, dtype, names, units, called=names, source="; ".join(rules))
+
+
+def _camera(name: str, plan: TakenImages, lines: Timelines) -> Camera:
+    info = lines.streams.infos.get(name, {})
+    matrix, distortion = _numbers(info, "k", "K"), _numbers(info, "d", "D")
+    width, height = plan.head.width, plan.head.height
+    fits = (info.get("width") or width, info.get("height") or height) == (width, height)
+    known = fits and len(matrix) == 9 and matrix[0] > 0 and bool(np.isfinite(matrix).all())
+    return Camera(
+        name=name,
+        width=width,
+        height=height,
+        kept=plan.kept,
+        intrinsics=tuple(matrix) if known else None,
+        distortion=tuple(distortion) if known and len(distortion) == 5 and np.isfinite(distortion).all() else (),
+        source=f"{plan.topic}, {lines.lines[name].rule}",
+    )
+
+
+def _numbers(values: Mapping[str, Any], *keys: str) -> list[float]:
+    """Those of the first of these fields that is there."""
+    found = next((values[key] for key in keys if key in values), None)
+    return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []
+
+
+def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
+    """What no recording can hold, found before anything of the bag is written."""
+    yield from find_problems(episode.info)
+    for name, plan in episode.rows.cameras.items():
+        if not plan.kept and (problem := size_problem(video, plan.head.width, plan.head.height)):
+            yield f"camera {name}: {problem}"
+    if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
+        yield f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+    table = episode.rows.table
+    for stamps in (table.time_ns, *table.stamps.values(), *table.image_stamps.values()):
+        if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
+            yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
+            return
+
+
+def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str) -> EpisodeReport:
+    """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
+    rows = None if episode is None else episode.rows
+    begin_ns, end_ns = window.begin_ns, window.end_ns
+    if rows:
+        begin_ns, end_ns = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
+    return EpisodeReport(
+        episode_index=None if episode is None else episode.info.episode_index,
+        begin_s=(begin_ns - zero_ns) / NS,
+        end_s=(end_ns - zero_ns) / NS,
+        num_frames=rows.table.num_frames if rows else 0,
+        success=window.success,
+        pictures=(
+            {name: plan.described(rows.table.images[name]) for name, plan in rows.cameras.items()} if rows else {}
+        ),
+        reason=reason,
+        discarded=window.discarded,
+        follows=rows.follows if rows else "",
+    )

@@ -1,0 +1,299 @@
+"""The rows of an episode: what each takes from every stream, how old that is, and why there can be no episode."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import cast
+
+import numpy as np
+
+from demorec.episode.episode import Table
+from demorec.episode.info import DEPTH_UNITS, Kept
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.clock import (
+    MISSING,
+    NS,
+    ChosenSamples,
+    Int,
+    Numbers,
+    Timeline,
+    followed,
+    grid,
+    timeline,
+)
+from demorec.extensions.imports.image_messages import KEPT_FORMATS, VIDEO_FORMATS, ImageHead
+from demorec.extensions.imports.mapping import ROWS, SourceMapping
+from demorec.extensions.imports.streams import BagStreams, Key
+
+RATE = 0.05
+"""By which the rate of images that rows follow may differ from fps: as far as the check `rate` takes it for that of the
+episode. Where fps is the rate rounded, half an image a second is more."""
+_SAME_COUNT = 2
+"""Images that cameras of one rate differ by: one more or less at each end of an episode."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Window:
+    """Where an episode is in its bag.
+
+    Attributes:
+        begin_ns, end_ns: Its first and last moment, by the mapping's clock.
+        success: How it ended; None where the bag does not say.
+        discarded: The marker that says that it is no episode; "" for those that are.
+    """
+
+    begin_ns: int
+    end_ns: int
+    success: bool | None = None
+    discarded: str = ""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class TakenImages:
+    """Images that an episode takes of a camera.
+
+    Attributes:
+        topic: Topic of the messages.
+        head: Head of the first image.
+        kept: Codec whose packets stay as they are, or encoding of distances; "" for pixels, which are encoded once.
+        taken: (P,) number of each image's message in its topic, in the order of their times.
+    """
+
+    topic: str
+    head: ImageHead
+    kept: Kept
+    taken: Int
+
+    def described(self, shown: Int) -> str:
+        """Describe in words what becomes of the images, of which the rows show those of (R,) these numbers."""
+        num_shown = len(np.unique(shown))
+        what = f"{len(self.taken)} images {self.head.width}x{self.head.height}, "
+        kind = self.head.encoding if self.head.format == "raw" else self.head.format
+        what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
+        repeated = len(shown) - num_shown
+        rows = "row shows" if repeated == 1 else "rows show"
+        what += f", {repeated} {rows} the image of the row before" if repeated else ""
+        return what + (f", {len(self.taken) - num_shown} shown by no row" if len(self.taken) > num_shown else "")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class EpisodeRows:
+    """An episode before its images are read.
+
+    Attributes:
+        window: Where it is in the bag.
+        table: Its rows, by the mapping's clock; a feature is as old as the oldest of its sources.
+        cameras: Name -> its images.
+        follows: Stream whose messages have a row each ("camera front"); "" for a grid.
+    """
+
+    window: Window
+    table: Table
+    cameras: Mapping[str, TakenImages]
+    follows: str
+
+
+class NoRowsError(BagError):
+    """An episode would hold what is missing or too old; `str` says what."""
+
+
+class Timelines:
+    """All streams of a bag on the mapping's clock.
+
+    Attributes:
+        streams, mapping: As given.
+        lines: Stream -> timeline.
+    """
+
+    def __init__(self, streams: BagStreams, mapping: SourceMapping) -> None:
+        self.streams, self.mapping = streams, mapping
+        self.lines = {key: timeline(stream, mapping.clock) for key, stream in streams.all.items()}
+        if empty := [line for line in self.lines.values() if not len(line.times_ns)]:
+            raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
+
+    def sources(self, feature: str) -> list[Timeline]:
+        """The timelines of a feature's sources; for a source that is another feature's next row, those of that one."""
+        found: list[Timeline] = []
+        for index, source in enumerate(self.mapping.features[feature]):
+            found += self.sources(source.next) if source.next else [self.lines[feature, index]]
+        return found
+
+    def rows(self, window: Window) -> EpisodeRows:
+        """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
+        begin, end = self._extent(window)
+        times, follows = self._times(window, begin, end)
+        if len(times) < 2:
+            raise NoRowsError(f"only {len(times)} rows have all streams")
+        chosen = {key: line.chosen(times) for key, line in self.lines.items()}
+        for judge in (_too_old, _unfit):
+            if problems := [text for key, rows in chosen.items() if (text := judge(self.lines[key], rows, times))]:
+                raise NoRowsError("; ".join(problems))
+        mapped = self.mapping.features
+        has_next = any(source.next for sources in mapped.values() for source in sources)
+        count = len(times) - has_next
+        features = {name: self._feature(name, chosen, times, count) for name in mapped}
+        shown = {name: chosen[name].index[:count] for name in self.mapping.cameras}
+        places = {name: _taken(self.lines[name], indices) for name, indices in shown.items()}
+        return EpisodeRows(
+            window=window,
+            table=Table(
+                time_ns=times[:count],
+                features={name: values for name, (values, _) in features.items()},
+                stamps={name: stamps for name, (_, stamps) in features.items()},
+                images={name: np.searchsorted(places[name], indices) for name, indices in shown.items()},
+                image_stamps={name: self.lines[name].times_ns[taken] for name, taken in places.items()},
+            ),
+            cameras={name: _camera(self.lines[name], taken) for name, taken in places.items()},
+            follows=follows,
+        )
+
+    def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> tuple[Numbers, Int]:
+        """Return the first `count` rows (R, D) of a feature and their stamps.
+
+        They are float32 where all sources are, otherwise float64. A source that is a feature's next row is taken one
+        row later.
+        """
+        values, ages = [], []
+        for index, source in enumerate(self.mapping.features[name]):
+            later = 1 if source.next else 0
+            part = slice(later, later + count)
+            followed_sources = self.mapping.features.get(source.next, ())
+            keys: list[Key] = [(source.next, number) for number in range(len(followed_sources))] or [(name, index)]
+            for key in keys:
+                values.append(self.lines[key].sampled(chosen[key])[part])
+                # The age of a next row counts from the row that has it, and so is below 0.
+                ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
+        return np.concatenate(values, axis=1), times[:count] - np.max(np.stack(ages), axis=0)
+
+    def _extent(self, window: Window) -> tuple[int, int]:
+        """From where on and until when all streams have something, within a window."""
+        max_trim_s, lines = self.mapping.clock.max_trim_s, list(self.lines.values())
+        begins, ends = [_first(line, window) for line in lines], [_last(line, window) for line in lines]
+        begin, last = max(begins), max(int(line.times_ns[-1]) for line in lines)
+        end = min(window.end_ns, *ends, last)
+        late, early = lines[begins.index(begin)], lines[ends.index(min(ends))]
+        problems = []
+        if begin - window.begin_ns > round(max_trim_s * NS):
+            problems.append(f"{late.label} begins {(begin - window.begin_ns) / NS:.2f} s late")
+        if window.end_ns - end > round(max_trim_s * NS):
+            problems.append(f"{early.label} ends {(window.end_ns - end) / NS:.2f} s early")
+        if problems:
+            raise NoRowsError(f"{' and '.join(problems)}, allowed are {max_trim_s:g} s")
+        return begin, end
+
+    def _times(self, window: Window, begin: int, end: int) -> tuple[Int, str]:
+        """(R,) of the rows, and what they follow."""
+        clock = self.mapping.clock
+        if clock.rows not in ROWS:
+            line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
+            if line is None:
+                raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
+            return line.within(begin, end), line.stream.label
+        if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
+            return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
+        # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a
+        # stream that jitters is off by a few hundredths.)
+        slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
+        return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
+
+    def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
+        """Cameras that give an image for each row; the one that rows follow first.
+
+        That is the one with the fewest images: of those that have about as few, the first of the mapping, so that it is
+        the same in all episodes. A camera of distances is followed only where there is no other.
+        """
+        fps = self.mapping.clock.fps
+        counts: dict[str, int] = {}
+        for name in self.mapping.cameras:
+            times = self.lines[name].within(begin, end)
+            seconds = float(times[-1] - times[0]) / NS if len(times) > 1 else 0.0
+            if seconds and abs(len(times) - 1 - fps * seconds) <= max(RATE * fps, 0.5) * seconds + 1:
+                counts[name] = len(times)
+        colour = [name for name in counts if self.lines[name].stream.heads[0].encoding not in DEPTH_UNITS]
+        may_lead = colour or list(counts)
+        fewest = min((counts[name] for name in may_lead), default=0)
+        lead = next((name for name in may_lead if counts[name] <= fewest + _SAME_COUNT), "")
+        return [lead, *(name for name in counts if name != lead)] if lead else []
+
+    def _followed(self, cameras: list[str], window: Window, begin: int, end: int) -> Int:
+        """A row for each image of the first of some cameras, so that those of the others are shown as well."""
+        line = self.lines[cameras[0]]
+        # The image that was there shortly before another stream began is shown as soon as that has something.
+        first = max(window.begin_ns, begin - line.period_ns // 2)
+        lead = np.unique(np.maximum(line.within(first, end), begin))
+        are_latest = all(self.lines[name].sample == "latest" for name in cameras)
+        others = [self.lines[name].times_ns for name in cameras[1:]] if are_latest else []
+        return followed(lead, others, period_ns=line.period_ns, end_ns=end)
+
+
+def _first(line: Timeline, window: Window) -> int:
+    """From when on a stream has something in a window: at once if what came before is still fit to be used."""
+    before = int(np.searchsorted(line.times_ns, window.begin_ns, side="right")) - 1
+    if before >= 0 and window.begin_ns - int(line.times_ns[before]) <= line.max_age_ns:
+        return window.begin_ns
+    return int(line.times_ns[min(before + 1, len(line.times_ns) - 1)])
+
+
+def _last(line: Timeline, window: Window) -> int:
+    """Until when it has: what its last message says holds until the next would have come."""
+    last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
+    age = 0 if line.sample == "linear" else line.max_age_ns
+    if line.is_regular:
+        age = min(age, line.period_ns if line.sample == "latest" else line.period_ns // 2)
+    return int(line.times_ns[last]) + age
+
+
+def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
+    """Why what the rows take is missing or too old; "" when it is not."""
+    ages = chosen.reach_ns
+    bad = np.flatnonzero((ages > line.max_age_ns) | (chosen.index < 0))
+    if not len(bad):
+        return ""
+    worst = int(ages[bad].max())
+    what = "has nothing" if worst >= MISSING else f"is up to {worst / NS:.3f} s away"
+    return (
+        f"{line.label} {what} at {len(bad)} of {len(times)} rows, from {(times[bad[0]] - times[0]) / NS:.2f} s on, "
+        f"allowed are {line.max_age_ns / NS:g} s"
+    )
+
+
+def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
+    """Why what the rows take cannot be recorded; "" when it can."""
+    stream = line.stream
+    if stream.names:
+        used = stream.values[line.order[chosen.index]]
+        if chosen.fraction is not None:
+            after = np.minimum(chosen.index + 1, len(line.order) - 1)
+            used = np.where(chosen.fraction[:, np.newaxis] > 0, used + stream.values[line.order[after]], used)
+        bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
+        if len(bad):
+            at = (times[bad[0]] - times[0]) / NS
+            return f"{line.label} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
+        return ""
+    first, last = int(chosen.index.min()), int(chosen.index.max())
+    heads = stream.heads.kinds(line.order[first : last + 1])
+    sizes = sorted({(head.width, head.height) for head in heads if head.width})
+    formats = sorted({head.format for head in heads})
+    if len(sizes) > 1:
+        return f"{line.label} changes its size ({', '.join(f'{w}x{h}' for w, h in sizes)})"
+    return f"{line.label} has images of several kinds ({', '.join(formats)})" if len(formats) > 1 else ""
+
+
+def _taken(line: Timeline, shown: Int) -> Int:
+    """Return which images of its timeline a camera needs to show these (R,): of video, from the keyframe before on."""
+    taken = np.unique(shown)
+    if line.stream.heads[int(line.order[shown[0]])].format not in VIDEO_FORMATS:
+        return taken
+    first = int(taken[0])
+    while not line.stream.heads[int(line.order[first])].is_keyframe:
+        first -= 1
+    return np.arange(first, int(taken[-1]) + 1)
+
+
+def _camera(line: Timeline, taken: Int) -> TakenImages:
+    """Describe the images of its timeline that an episode takes of a camera."""
+    head = line.stream.heads[int(line.order[taken[0]])]
+    kept = head.encoding if head.encoding in DEPTH_UNITS else head.format if head.format in KEPT_FORMATS else ""
+    numbers = np.asarray(line.stream.places)[line.order[taken]]
+    return TakenImages(topic=line.stream.topic, head=head, kept=cast(Kept, kept), taken=numbers)

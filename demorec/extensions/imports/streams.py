@@ -1,0 +1,342 @@
+"""A bag's streams: when each message of the mapping's topics was, and the numbers of those that hold any.
+
+Numbers stay in memory, some hundred bytes a message; of images only what is needed to choose among them does. They
+are read from the bag once more when their rows are written.
+"""
+
+from __future__ import annotations
+
+import zlib
+from array import array
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.errors import describe_error
+from demorec.core.plain import listed
+from demorec.core.registry import nearest_match
+from demorec.extensions.imports.bag import Bag
+from demorec.extensions.imports.bag_files import BagError
+from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
+from demorec.extensions.imports.fields import (
+    OtherPublisherError,
+    SourceReader,
+    converted,
+    follow,
+    image_bytes,
+    parse_path,
+    reader_of,
+    stamp_of,
+)
+from demorec.extensions.imports.image_messages import ImageHeads, image_head
+from demorec.extensions.imports.mapping import ROWS, CameraSource, Source, SourceMapping, Unit
+from demorec.extensions.imports.words import quoted
+from demorec.mcap.cdr import Values
+from demorec.mcap.scan import ScannedMessage
+
+NO_STAMP = -(2**63)
+Key = tuple[str, int] | str
+"""A stream: (feature, number of its source), or the name of a camera."""
+_MAX_TEXT = 10_000
+_MAX_URDF = 4 << 20
+_SHOWN_JOINTS = 40
+_INFO_FIELDS = ("width", "height", "k", "K", "d", "D")
+"""Of a camera's calibration that are asked for."""
+
+
+@dataclass(kw_only=True, eq=False)
+class Stream:
+    """The messages of one source or camera, in the order in which the bag has them; it grows while they are read.
+
+    Attributes:
+        label: Which it is: "observation.state" or "camera front".
+        part: What the mapping says of it.
+        type: Of its messages.
+        reader: Of a source's numbers, since its first message.
+        logged, stamped: `log_ns` and `header_ns` as they grow.
+        places: Which of the topic's messages each is, from 0; empty for others than cameras.
+        vectors: Of the source, in its unit, behind each other: an array for each of a million messages takes three
+            times as much memory, and leaves holes.
+        dtype: Of these.
+        heads: (N,) what is known of each image; empty for others.
+        sums: CRC-32 of each message's bytes.
+        image_sums: CRC-32 of each image's bytes; empty for others.
+        num_malformed: Messages that cannot be read or lack something.
+        first_problem: What is wrong with the first of them.
+        first_refusal: Why the first message was left to another publisher.
+    """
+
+    label: str
+    part: Source | CameraSource
+    type: str = ""
+    reader: SourceReader | None = None
+    logged: array[int] = field(default_factory=lambda: array("q"))
+    stamped: array[int] = field(default_factory=lambda: array("q"))
+    places: array[int] = field(default_factory=lambda: array("q"))
+    vectors: bytearray = field(default_factory=bytearray)
+    dtype: np.dtype[np.floating[Any]] | None = None
+    heads: ImageHeads = field(default_factory=ImageHeads)
+    sums: array[int] = field(default_factory=lambda: array("I"))
+    image_sums: array[int] = field(default_factory=lambda: array("I"))
+    num_malformed: int = 0
+    first_problem: str = ""
+    first_refusal: str = ""
+
+    def add(self, number: int, message: ScannedMessage, values: Values, checksum: int) -> None:
+        """Take one message."""
+        self.type = self.type or message.channel.type
+        try:
+            if isinstance(self.part, Source):
+                self.reader = self.reader or reader_of(self.part, values)
+                self._add_vector(self.reader.read(values))
+            else:
+                head, image_sum = image_head(values), zlib.crc32(image_bytes(values))
+                self.heads.append(head)  # both or neither
+                self.image_sums.append(image_sum)
+                self.places.append(number)
+        except OtherPublisherError as error:
+            self.first_refusal = self.first_refusal or str(error)
+            return
+        except (ValueError, RecursionError, OverflowError, TypeError) as error:
+            self.malformed(describe_error(error))
+            return
+        stamp = stamp_of(values)
+        self.logged.append(message.log_ns)
+        self.stamped.append(NO_STAMP if stamp is None else stamp)
+        self.sums.append(checksum)
+
+    def malformed(self, problem: str) -> None:
+        """Count a message that cannot be used."""
+        self.num_malformed += 1
+        self.first_problem = self.first_problem or problem
+
+    def _add_vector(self, vector: NDArray[np.floating[Any]]) -> None:
+        if self.dtype is None:
+            self.dtype = vector.dtype
+        elif self.dtype != vector.dtype:  # float64 holds both
+            self.vectors = bytearray(np.frombuffer(self.vectors, self.dtype).astype(np.float64).data)
+            self.dtype = np.dtype(np.float64)
+        self.vectors += vector.astype(self.dtype, copy=False).data
+
+    def __len__(self) -> int:
+        return len(self.logged)
+
+    @property
+    def topic(self) -> str:
+        """Of its messages."""
+        return self.part.topic
+
+    @property
+    def log_ns(self) -> NDArray[np.int64]:
+        """(N,) when each was recorded."""
+        return np.asarray(self.logged)
+
+    @property
+    def header_ns(self) -> NDArray[np.int64]:
+        """(N,) the time in each header, or NO_STAMP."""
+        return np.asarray(self.stamped)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """(D,) of the elements of a source, since its first message; none of cameras."""
+        return self.reader.names if self.reader else ()
+
+    @property
+    def quaternions(self) -> tuple[int, ...]:
+        """First element of each x, y, z, w among them."""
+        return self.reader.quaternions if self.reader else ()
+
+    @property
+    def unit(self) -> Unit:
+        """Of the feature; "" for cameras."""
+        return (self.part.to or self.part.unit) if isinstance(self.part, Source) else ""
+
+    @cached_property
+    def values(self) -> NDArray[np.floating[Any]]:
+        """(N, D) in the unit of the feature, of the whole stream of a source."""
+        assert isinstance(self.part, Source)
+        return converted(self.part, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
+
+
+class Text(NamedTuple):
+    """A text, number or boolean of a topic (task, marker, robot description), and when it was said.
+
+    Attributes:
+        time_ns: Of its message, as the mapping's clock takes it.
+        is_header: Whether that is the time of a header.
+    """
+
+    time_ns: int
+    value: Any
+    is_header: bool
+
+
+def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
+    """The name of a feature, and the joints where several of its sources are of one topic."""
+    if not source.joints or sum(other.topic == source.topic for other in sources) == 1:
+        return feature
+    return f"{feature} ({', '.join(source.joints[:2])}{', ...' if len(source.joints) > 2 else ''})"
+
+
+def _unnamed_joints(stream: Stream, reader: SourceReader) -> str:
+    """What to write where a source takes whatever its topic names, and that is not the same in all messages."""
+    lists = " and one with ".join(
+        f"joints = [{', '.join(map(quoted, joints[:_SHOWN_JOINTS]))}{', ...' if len(joints) > _SHOWN_JOINTS else ''}]"
+        for joints in (reader.joints, list(reader.others))
+    )
+    return (
+        f"{stream.label} takes all joints of {stream.topic}, whose messages do not name the same ones, as those of two "
+        f"publishers: write a source with {lists}, or leave the latter out"
+    )
+
+
+class BagStreams:
+    """All that a mapping takes from a bag.
+
+    Args:
+        mapping: Of the bag.
+
+    Attributes:
+        all: Key -> stream, the sources of features before cameras.
+        infos: Name of a camera -> its first calibration message.
+        texts: Topic -> its texts.
+        problems: Why parts of the bag could not be read.
+    """
+
+    def __init__(self, mapping: SourceMapping) -> None:
+        self._mapping = mapping
+        self.problems: list[str] = []
+        self._decoder = BagDecoder()
+        self.all: dict[Key, Stream] = {
+            (name, index): Stream(label=_label(name, source, sources), part=source)
+            for name, sources in mapping.features.items()
+            for index, source in enumerate(sources)
+            if source.topic
+        }
+        for name, camera in mapping.cameras.items():
+            self.all[name] = Stream(label=f"camera {name}", part=camera)
+        self._of_topic: dict[str, list[Stream]] = {}
+        for stream in self.all.values():
+            self._of_topic.setdefault(stream.topic, []).append(stream)
+        self._fields = {mapping.task.topic: mapping.task.field, mapping.robot.urdf_topic: "data"}
+        self._fields[mapping.subtasks.topic] = mapping.subtasks.field
+        if mapping.episodes.cut == "marker":
+            self._fields[mapping.episodes.topic] = mapping.episodes.field
+        self._fields.pop("", None)
+        self.texts: dict[str, list[Text]] = {topic: [] for topic in self._fields}
+        self.infos: dict[str, Values] = {}
+        self._info_topics = {camera.info_topic: name for name, camera in mapping.cameras.items() if camera.info_topic}
+        followed = {mapping.clock.rows}.difference(ROWS)
+        self._wanted = {*self._of_topic, *self._fields, *self._info_topics, *followed}
+        self._counts: dict[str, int] = {}
+        self._types: defaultdict[str, set[str]] = defaultdict(set)
+        self._refused: dict[str, str] = {}
+
+    def add(self, message: ScannedMessage) -> None:
+        """Take a message."""
+        topic = message.channel.topic
+        number = self._counts.get(topic, 0)
+        self._counts[topic] = number + 1
+        self._types[topic].add(message.channel.type)
+        if topic not in self._wanted or topic in self._refused:
+            return
+        streams = self._of_topic.get(topic, ())
+        try:
+            values = self._decoder.values(message)
+        except UnknownEncodingError as error:
+            self._refused[topic] = str(error)
+            return
+        except (ValueError, RecursionError, OverflowError, TypeError) as error:
+            for stream in streams:
+                stream.malformed(str(error))
+            if topic in self.texts:
+                self._refused[topic] = describe_error(error)
+            return
+        checksum = zlib.crc32(message.data)
+        for stream in streams:
+            stream.add(number, message, values, checksum)
+        if topic in self.texts:
+            self._add_text(topic, message, values)
+        if topic in self._info_topics:
+            kept = {key: values[key] for key in _INFO_FIELDS if key in values}
+            self.infos.setdefault(self._info_topics[topic], kept)
+
+    def _add_text(self, topic: str, message: ScannedMessage, values: Values) -> None:
+        try:
+            value = follow(values, parse_path(self._fields[topic]))
+        except ValueError as error:
+            self._refused[topic] = str(error)
+            return
+        value = value.item() if isinstance(value, np.generic) else value
+        if not isinstance(value, str | bool | int | float):
+            self._refused[topic] = f"the field {self._fields[topic]!r} is no text, number or boolean"
+            return
+        limit = _MAX_URDF if topic == self._mapping.robot.urdf_topic else _MAX_TEXT
+        if isinstance(value, str) and len(value) > limit:
+            self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
+            return
+        stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
+        self.texts[topic].append(Text(message.log_ns if stamp is None else stamp, value, stamp is not None))
+
+    def check(self, bag: Bag) -> None:
+        """Raise BagError for all that the mapping names and the bag lacks."""
+        problems = []
+        if not self._counts:
+            unread = f" ({self.problems[0]})" if self.problems else ""
+            raise BagError(f"The bag holds no messages{unread}: {bag.path}")
+        for topic in sorted(self._wanted):
+            if topic not in self._counts:
+                problems.append(f"there is no message of {topic!r}.{nearest_match(topic, self._counts)}".rstrip("."))
+            elif topic in self._refused:
+                problems.append(f"{topic} cannot be read, since {self._refused[topic]}")
+            elif len(self._types[topic]) > 1:
+                problems.append(f"{topic} has messages of several types ({', '.join(sorted(self._types[topic]))})")
+        for stream in self.all.values():
+            if stream.topic in self._counts and stream.topic not in self._refused and not len(stream):
+                reason = stream.first_problem or stream.first_refusal
+                problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
+            if stream.reader is not None and stream.reader.others:
+                problems.append(_unnamed_joints(stream, stream.reader))
+        problems += self._double_names()
+        for stream in self.all.values():
+            if stream.part.stamp == "header" and len(stream) and max(stream.stamped) <= 0:
+                problems.append(
+                    f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
+                )
+            if stream.heads and not stream.heads.are_keyframes.any():
+                problems.append(f"{stream.topic} has no keyframe with its parameter sets, so it cannot be decoded")
+        if problems:
+            raise BagError(f"The mapping does not fit the bag: {listed(problems)}: {bag.path}")
+
+    def _double_names(self) -> Iterator[str]:
+        seen: dict[tuple[str, str], str] = {}
+        for key, stream in self.all.items():
+            if isinstance(key, str):
+                continue
+            feature, _ = key
+            for label in stream.names:
+                if (feature, label) in seen:
+                    yield (
+                        f"{feature} gets {label!r} from {seen[feature, label]} and from {stream.topic}: leave one out, "
+                        "or tell them apart by prefix or names"
+                    )
+                    break
+                seen[feature, label] = stream.topic
+
+
+def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:
+    """Read a bag from its front to its end.
+
+    Raises:
+        BagError: The mapping does not fit the bag; one message tells all problems.
+    """
+    streams = BagStreams(mapping)
+    for message in bag.messages(streams.problems):
+        streams.add(message)
+    streams.check(bag)
+    return streams

@@ -1,0 +1,257 @@
+"""`demorec evaluate` and `demorec correct`: a policy acts in closed loop, alone or with the expert behind it."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.output import say, say_json
+from demorec.cli.shared.paths import refuse_inside
+from demorec.cli.shared.progress import ProgressBar
+from demorec.core.config import GenerateConfig, VideoConfig
+from demorec.core.errors import ConfigError, check_option
+from demorec.core.targets import OptionalTarget
+from demorec.extensions.policies import TakeOver
+
+if TYPE_CHECKING:
+    from demorec.extensions.policies.evaluation import Evaluation
+    from demorec.extensions.policies.statistics import RateComparison
+
+
+Split = Literal["all", "train", "eval"]
+_SCENES = ("task", "robot", "objects", "object_split", "split", "seed", "variation")
+"""Options of `GenerateConfig` that decide which scenes there are."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RolloutFlags:
+    """Which policy, in which scenes, recorded how; each command has its own default of `split`."""
+
+    policy: Path | None = None
+    """Output folder of lerobot-train, or a pretrained_model folder."""
+    task: str = "pick_place"
+    """A name from `demorec list tasks`, or my_package.my_module:MyTask."""
+    robot: str = "panda"
+    """A name from `demorec list robots`, or my_package.my_module:MY_ARM."""
+    objects: tuple[str, ...] = ()
+    """Shelves that the task draws from, as in generate-dataset."""
+    object_split: Split = "all"
+    """Which shapes of the shelves: eval has those that generate-dataset --object-split train leaves out."""
+    cameras: tuple[str, ...] = ()
+    """Cameras of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
+    num_episodes: int = 50
+    """Number of scenes."""
+    seed: int = 0
+    """Root seed of the scenes; unless --split is eval, choose another one than the dataset's."""
+    out: OptionalTarget = None
+    """Folder for the results (auto: one per task)."""
+    action: str | None = None
+    """joint, joint_increment, ee or ee_delta (auto: as in the dataset that the policy was trained on)."""
+    action_steps: int | None = None
+    """Actions to execute before the policy is queried again (auto: as trained)."""
+    episode_length: int | None = None
+    """Time limit in frames (auto: 15 s per object to be moved)."""
+    fps: int = 30
+    """Frames per second, as in the dataset."""
+    variation: Literal["none", "mild", "full"] = "mild"
+    """How much the scenes vary, as in generate-dataset."""
+    renderer: str | None = None
+    """Renderer for a policy that uses images (auto: that of generate-dataset)."""
+    video: VideoConfig = field(default_factory=VideoConfig)
+    """Encoding of the recorded images."""
+    workers: int | None = None
+    """Processes (auto: one per core)."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the cameras and steps that the policy names."""
+    overwrite: bool = False
+    """Delete what this command made in the output folder before and start again."""
+    split: Split = "eval"
+    """As in generate-dataset."""
+
+    def carry_out(self, policy: Path, out: Path, *, title: str, takeover: TakeOver | None = None) -> Evaluation:
+        """Let a policy act in every scene; the recordings go to `out`."""
+        check_option("num_episodes", self.num_episodes, 1, 1_000_000)
+        check_option("workers", self.workers, 1, 1024)
+        refuse_inside([out])
+        from demorec.core.processes import available_cores
+        from demorec.core.registry import check_choice
+        from demorec.extensions.policies.rollouts import evaluate, settings_for
+        from demorec.loop.actions import ACTION_KINDS
+
+        settings = settings_for(
+            policy,
+            self._config(),
+            action=None if self.action is None else check_choice("action", self.action, ACTION_KINDS),
+            action_steps=self.action_steps,
+            episode_length=self.episode_length,
+            allowed=allowed_modules(self.allow),
+        )
+        workers = self.workers or available_cores()
+        with ProgressBar(title, total=self.num_episodes, unit="rollout", at_once=workers) as bar:
+
+            def progress(evaluation: Evaluation) -> None:
+                bar.note(str(evaluation.rate))
+                bar.set(len(evaluation.rollouts))
+
+            return evaluate(
+                replace(settings, takeover=takeover),
+                out,
+                num_episodes=self.num_episodes,
+                workers=workers,
+                overwrite=self.overwrite,
+                progress=progress,
+            )
+
+    def _config(self) -> GenerateConfig:
+        names = (*_SCENES, "fps", "cameras", "video", "renderer")
+        values: dict[str, Any] = {name: getattr(self, name) for name in names}
+        return GenerateConfig(**{name: value for name, value in values.items() if value is not None})
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluate(RolloutFlags):
+    """Run a policy saved by LeRobot on held-out scenes: success rate, where it fails, every rollout recorded.
+
+    An episode succeeds when the task's own strict conditions hold for five frames. Run the same command again to
+    continue where it stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed; their numbers
+    begin at 0 here and at its --seed there.
+
+    Examples:
+      demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
+      demorec evaluate --policy outputs/train --split all --seed 1 --out all
+      demorec evaluate --compare evaluations/clean evaluations/noisy
+      demorec view evaluations/clean/failed            (watch the failures)
+    """
+
+    split: Split = "eval"
+    """eval: scenes and seeds that --split train excludes; all or train: as generate-dataset makes them."""
+    compare: tuple[Path, Path] | None = None
+    """Compare two finished evaluations instead: FOLDER FOLDER."""
+    json: bool = False
+    """Print the result as JSON."""
+
+    def run(self) -> int:
+        """Evaluate or compare, and report."""
+        if self.compare is not None:
+            return self._compare(*self.compare)
+        if self.policy is None:
+            raise ConfigError("Nothing to evaluate: give --policy FOLDER, or --compare FOLDER FOLDER.")
+        out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
+        evaluation = self.carry_out(self.policy, out, title="evaluating")
+        if self.json:
+            say_json(_plain(evaluation))
+        else:
+            say(*_evaluation_lines(evaluation, out))
+        return 0
+
+    def _compare(self, first: Path, second: Path) -> int:
+        from demorec.extensions.policies.evaluation import load_evaluation
+        from demorec.extensions.policies.statistics import compare
+
+        a, b = load_evaluation(first), load_evaluation(second)
+        scenes_a, scenes_b = a.settings.config, b.settings.config
+        for name in _SCENES:
+            there, here = getattr(scenes_a, name), getattr(scenes_b, name)
+            if there != here:
+                raise ConfigError(f"The two evaluations did not use the same scenes: {name} is {there} and {here}.")
+        comparison = compare(a.successes, b.successes)
+        if self.json:
+            say_json(asdict(comparison))
+        else:
+            say(*_compared(comparison, first, second))
+        return 0
+
+
+def _evaluation_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
+    from demorec.extensions.policies.statistics import cells
+
+    settings = evaluation.settings
+    yield f"policy        {settings.policy_type} {settings.policy_digest}, action {settings.action}"
+    yield f"scenes        {settings.config.task}, split {settings.config.split}, seed {settings.config.seed}"
+    yield f"success       {evaluation.rate} (Wilson 95 %)"
+    lengths = sorted(r.num_frames for r in evaluation.rollouts if r.success)
+    if lengths:
+        yield f"median length {lengths[len(lengths) // 2] / settings.config.fps:.1f} s of the successes"
+    yield from _counts("failures", (f"{r.phase}: {r.reason}" for r in evaluation.rollouts if not r.success))
+    yield from ("", f"{'by cell':<20} {'range':<20} success (Wilson 95 %)")
+    for cell in cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]):
+        yield f"{cell.factor:<20} {f'{cell.low:.3f} .. {cell.high:.3f}':<20} {cell.rate}"
+    yield from ("", f"recordings    {out / 'episodes'}, {out / 'failed'}")
+
+
+def _counts(title: str, reasons: Iterable[str]) -> Iterator[str]:
+    for number, (reason, count) in enumerate(Counter(reasons).most_common()):
+        yield f"{title if number == 0 else '':<13} {count:>4}  {reason}"
+
+
+def _plain(evaluation: Evaluation) -> dict[str, Any]:
+    from demorec.core.plain import to_plain
+    from demorec.extensions.policies.statistics import cells
+
+    plain: dict[str, Any] = to_plain(evaluation)
+    plain["success_rate"] = evaluation.rate.value
+    plain["interval"] = list(evaluation.rate.interval)
+    plain["cells"] = to_plain(cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]))
+    return plain
+
+
+def _compared(comparison: RateComparison, first: Path, second: Path) -> list[str]:
+    low, high = (100 * bound for bound in comparison.interval)
+    alone = f"{comparison.only_first} scenes by the first, {comparison.only_second} by the second"
+    return [
+        f"first         {comparison.first}   {first}",
+        f"second        {comparison.second}   {second}",
+        f"difference    {100 * comparison.difference:+.1f} points [{low:+.1f}, {high:+.1f}] (Newcombe 95 %)",
+        f"one alone     {alone} (McNemar, exact: p = {comparison.p_value:.3g})",
+    ]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Correct(RolloutFlags):
+    """Let a policy act until it strays, then let the scripted expert finish: demonstrations of what the policy lacks.
+
+    The expert takes over when the policy strays from what the expert would do, gets stuck, runs out of time, or at a
+    random moment. It stops the arm, brings what the hand holds to its goal or releases it, and finishes the task or
+    hands back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
+    replayed like any other. Run the same command again to continue where it stopped.
+
+    Examples:
+      demorec correct --policy outputs/train --num-episodes 100 --seed 1 --out fix1
+      demorec correct --policy outputs/train --stray-metres 0.1 --hand-back
+      demorec export lerobot fix1 --out data/fix1 --intervention --corrected-only
+    """
+
+    split: Split = "train"
+    """train or all: scenes as generate-dataset makes them (with another --seed than the dataset's); eval: held out."""
+    takeover: TakeOver = field(default_factory=TakeOver)
+    """When the expert takes over."""
+
+    def run(self) -> int:
+        """Let both act, and report."""
+        if self.policy is None:
+            raise ConfigError("There is no policy to correct: give --policy FOLDER.")
+        self.takeover.validate()
+        out = self.out or Path("corrections") / self.task.rpartition(":")[2]
+        evaluation = self.carry_out(self.policy, out, title="correcting", takeover=self.takeover)
+        say(*_correction_lines(evaluation, out))
+        return 0
+
+
+def _correction_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
+    from demorec.extensions.policies.turns import read_takeover
+
+    config = evaluation.settings.config
+    found = [read_takeover(out / rollout.file) for rollout in evaluation.rollouts]
+    frames = sum(taken.num_frames for taken in found if taken is not None)
+    total = sum(rollout.num_frames for rollout in evaluation.rollouts)
+    yield f"policy        {evaluation.settings.policy_type} {evaluation.settings.policy_digest}"
+    yield f"scenes        {config.task}, split {config.split}, seed {config.seed}"
+    yield f"by itself     {sum(taken is None for taken in found)} of {len(found)} episodes"
+    yield from _counts("taken over", (reason for taken in found if taken is not None for reason in taken.reasons))
+    yield f"success       {evaluation.rate} (Wilson 95 %) in the end"
+    yield f"expert acted  {frames} of {total} frames"
+    yield f"recordings    {out / 'episodes'}, {out / 'failed'}"

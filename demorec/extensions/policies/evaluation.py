@@ -1,0 +1,199 @@
+"""An evaluation, and its folder: opened under a lock, kept up to date, never mixed with another evaluation."""
+
+from __future__ import annotations
+
+import functools
+import json
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
+from dataclasses import dataclass, field, replace
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.errors import ConfigError, DemorecError, GenerationError, describe_error, resource_error, write_error
+from demorec.core.files import LOCK_NAME, make_folder, read_json_object, replace_text, run_lock
+from demorec.core.own_versions import differences
+from demorec.core.plain import from_plain, to_plain
+from demorec.core.replacing import (
+    ReplaceableKind,
+    check_replaceable,
+    check_unsettled_parts,
+    json_object,
+    obstacle,
+    replaced_parts,
+    settle_parts,
+)
+from demorec.episode.features import ActionKind, StateKind
+from demorec.extensions.policies import TakeOver
+from demorec.extensions.policies.statistics import Rate, factors_of
+from demorec.generate.contents import foreign_recordings
+from demorec.loop import prepare
+from demorec.runs.find import EVALUATION_NAME
+from demorec.runs.run_file import EPISODES, FAILED, Attempt
+
+_PARTS = (EVALUATION_NAME, EPISODES, FAILED)
+"""Names that an evaluation writes; other files in its folder are never touched."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Settings:
+    """What decides the result of an evaluation.
+
+    Attributes:
+        policy: Folder of the policy; only `policy_digest` decides the result, not the place.
+        policy_type: LeRobot's name of its kind ("act").
+        policy_digest: SHA-256 of its config and weights, 16 hex digits.
+        config: Task, split, root seed, cameras: which scenes, seen how.
+        action: Meaning of the policy's actions.
+        action_steps: Actions executed before it looks again; None: as trained.
+        privileged: Whether it sees observation.environment_state.
+        sensed: Other observed features, which datasets have only when named.
+        state: What its observation.state holds.
+        episode_length: Time limit; None: the environment's.
+        takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
+    """
+
+    policy: str
+    policy_type: str
+    policy_digest: str
+    config: GenerateConfig
+    action: ActionKind
+    action_steps: int | None = None
+    privileged: bool = False
+    sensed: tuple[str, ...] = ()
+    state: StateKind = "joint"
+    episode_length: int | None = None
+    takeover: TakeOver | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """An evaluation, finished or not.
+
+    Attributes:
+        settings: What decides the result.
+        rollouts: One line each, in the order of the episodes.
+        factors: Randomised values of the scene of each rollout.
+        versions: package -> version, of what decides scenes, rollouts and the policy's answers; none in evaluations of
+            older versions of demorec.
+    """
+
+    settings: Settings
+    rollouts: tuple[Attempt, ...] = ()
+    factors: tuple[Mapping[str, float], ...] = field(default=())
+    versions: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def rate(self) -> Rate:
+        """Of strict successes."""
+        return Rate(successes=sum(bool(r.success) for r in self.rollouts), trials=len(self.rollouts))
+
+    @property
+    def successes(self) -> dict[int, bool]:
+        """Scene (episode index) -> success."""
+        return {r.episode_index: bool(r.success) for r in self.rollouts}
+
+
+def load_evaluation(folder: Path) -> Evaluation:
+    """Read evaluation.json. Raises ConfigError if it is missing, DemorecError if it is damaged."""
+    path = folder / EVALUATION_NAME
+    try:
+        return from_plain(read_json_object(path), Evaluation)
+    except FileNotFoundError as error:
+        raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
+    except (OSError, ValueError) as error:
+        raise DemorecError(f"{EVALUATION_NAME} is damaged ({describe_error(error)}): {path}") from error
+
+
+@contextmanager
+def open_evaluation(settings: Settings, out: Path, *, overwrite: bool) -> Iterator[Evaluation]:
+    """Yield the existing evaluation, or a new one; the folder is locked until the context ends."""
+    if not check_unsettled_parts(out, _PARTS):
+        _check_place(out, overwrite=overwrite)  # leaves no lock in a refused folder
+    make_folder(out)
+    with run_lock(out):
+        settle_parts(out, _PARTS)
+        _check_place(out, overwrite=overwrite)
+        with replaced_parts(out, _PARTS) if overwrite and (out / EVALUATION_NAME).is_file() else nullcontext():
+            evaluation = _begin_or_continue(settings, out)
+        yield evaluation
+
+
+def _check_place(out: Path, *, overwrite: bool) -> None:
+    """Raise ConfigError for a folder that holds something other than an evaluation."""
+    is_free = not out.exists() or (out.is_dir() and {path.name for path in out.iterdir()} <= {LOCK_NAME})
+    if not is_free and not (out / EVALUATION_NAME).is_file():
+        raise ConfigError(f"The folder holds something that is no evaluation, choose another --out: {out}")
+    if overwrite and not is_free:
+        check_replaceable(out, EVALUATION, overwrite=True)
+
+
+def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
+    """Make the folder and update its evaluation.json."""
+    versions = _versions(settings.config)
+    evaluation = Evaluation(settings=settings, versions=versions)
+    if (out / EVALUATION_NAME).is_file():
+        evaluation = load_evaluation(out)
+        here_versions = versions if evaluation.versions else {}
+        there, here = _deciding(evaluation.settings), _deciding(settings)
+        if lines := differences(there, evaluation.versions, here, here_versions):
+            advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
+            raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
+        kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
+        evaluation = with_rollouts(replace(evaluation, settings=settings), kept)
+    for place in (EPISODES, FAILED):
+        make_folder(out / place)
+    save_evaluation(evaluation, out)
+    return evaluation
+
+
+def _is_evaluation(folder: Path) -> bool:
+    found = json_object(folder / EVALUATION_NAME)
+    return isinstance(found.get("settings"), dict) and isinstance(found.get("rollouts"), list)
+
+
+EVALUATION = ReplaceableKind(
+    name="an evaluation",
+    is_folder=True,
+    recognises=_is_evaluation,
+    strangers=lambda folder: [name for place in (EPISODES, FAILED) for name in foreign_recordings(folder, place)],
+)
+
+
+def _deciding(settings: Settings) -> dict[str, Any]:
+    return {key: value for key, value in to_plain(settings).items() if key != "policy"}
+
+
+def _versions(config: GenerateConfig) -> dict[str, str]:
+    """Return the versions of the packages that decide the scenes and run the policy."""
+    versions = deciding_versions(config)
+    for package in ("lerobot", "torch"):
+        with suppress(PackageNotFoundError):
+            versions[package] = version(package)
+    return versions
+
+
+def with_rollouts(evaluation: Evaluation, rollouts: list[Attempt]) -> Evaluation:
+    """Return the evaluation with these rollouts, in order, and the factors of their scenes."""
+    ordered = sorted(rollouts, key=lambda r: r.episode_index)
+    return replace(
+        evaluation,
+        rollouts=tuple(ordered),
+        factors=tuple(_factors(evaluation.settings.config, r.episode_index, r.attempt) for r in ordered),
+    )
+
+
+@functools.lru_cache(maxsize=100_000)
+def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[str, float]:
+    plan = EpisodePlan(config=config, episode_index=episode_index, attempt=attempt)
+    return factors_of(prepare(plan).info.simulated.scene)
+
+
+def save_evaluation(evaluation: Evaluation, folder: Path) -> None:
+    """Replace evaluation.json in one step. Raises GenerationError or ConfigError if it cannot be written."""
+    try:
+        replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))
+    except OSError as error:
+        raise resource_error(error) or write_error("The evaluation", error, folder, GenerationError) from error

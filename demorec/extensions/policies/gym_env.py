@@ -1,0 +1,399 @@
+"""The tasks as gymnasium environments, for policies that were trained on exported recordings.
+
+    import demorec.extensions.policies.gym_env
+    env = gymnasium.make("demorec/PickPlace-v0", cameras=("front", "wrist"), split="eval")
+
+World, cameras, renderer and feature vectors are those of the recordings: stepping a recording's commands through the
+environment gives the recorded observations, bit-exact. Every task of `demorec list tasks` is registered when this
+module is imported; `env_id` registers somebody else's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from demorec.core.config import EpisodePlan, GenerateConfig
+from demorec.core.errors import ConfigError, SceneError
+from demorec.core.registry import check_choice
+from demorec.core.tables import CAMERAS, TASKS, environment_name
+from demorec.episode import features
+from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SuccessCheck
+from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
+from demorec.episode.info import EpisodeInfo, Feature
+from demorec.episode.observation_rows import ObservationRows
+from demorec.episode.scene import Scene
+from demorec.episode.simulated import on_request, with_simulation
+from demorec.episode.variation import Preset
+from demorec.loop import PreparedEpisode, Session, SimulatorCache, Step, prepare
+from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
+from demorec.render.painter import Painter, WarmRenderer
+from demorec.sim.world import World
+
+SUCCESS_FRAMES = 5
+"""For how many frames in a row every check of the task must hold."""
+SECONDS_PER_GOAL = 15.0
+"""Time limit for each object to be moved, about twice what the expert takes."""
+PROBED_SCENES = 16
+"""How many scenes are looked at to tell whether the number of objects varies."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Situation:
+    """What the simulation is at after a reset or a step, unrounded: what a recorder or an analysis needs.
+
+    Attributes:
+        frame_index: Control steps since the reset.
+        observation: Now.
+        images: camera name -> images now.
+        last_frame: The frame of the step that led here, with what was commanded; None after a reset.
+        checks: The task's conditions with the values found now.
+        is_success: Whether all of them have held for `SUCCESS_FRAMES` frames.
+    """
+
+    frame_index: int
+    observation: Observation
+    images: Mapping[str, CameraImages]
+    last_frame: Frame | None
+    checks: tuple[SuccessCheck, ...]
+    is_success: bool
+
+
+class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
+    """One task: the robot acts until the task's strict conditions have held for 5 frames, or time is up.
+
+    Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`, with `privileged`
+    `environment_state`, with `sensed` the features that it names without the prefix `observation.`, with cameras
+    `pixels` (camera name -> (H, W, 3) uint8): see `demorec.episode.features`.
+    Action: float32 of one of the kinds of `demorec.episode.features.action_vectors`; float64 is taken as it is. Targets
+    are held within the joint limits in position and velocity; a pose out of reach keeps the last target.
+    Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
+    `info["is_success"]` says that the conditions have held for so long (the datasets' `next.success` is how an episode
+    ended); `info["episode_index"]` names the scene; after a step, `info["command"]` is what the motors were sent in it,
+    the row of the datasets' `command` of the frame before.
+
+    `reset(seed=N)` gives the scene of episode N of the split, the same whatever was done before; without a seed, a
+    random one. `reset(options={"scene": scene})` gives a scene of a recording.
+
+    Args:
+        task: A name of `demorec list tasks`, or package.module:Name.
+        split: "eval": scenes and seeds that `generate-dataset --split train` leaves out; "train", "all": those that it
+            makes.
+        seed: Root of all scenes, as of `generate-dataset`.
+        variation: How much the scenes differ.
+        objects, object_split, robot, fps, physics_hz, width, height, renderer: As of `generate-dataset`.
+        cameras: Names of `demorec list cameras`.
+        privileged: Whether to give `environment_state`; None: only without cameras, and only for a task whose scenes
+            all have as many numbers to tell, since a space has one length.
+        sensed: Features that datasets have only when named (`export --features`), as "observation.wrench".
+        state: What `agent_pos` holds.
+        action: What an action means.
+        episode_length: Time limit in frames; None: 15 s for each object to be moved.
+        render_mode: None or "rgb_array".
+        render_camera: Whose images `render` returns.
+        render_width, render_height: Their size, pixels.
+        config: Everything that decides scenes and images at once; replaces the arguments above that it holds.
+
+    Raises:
+        ConfigError: An unknown name or an impossible value.
+    """
+
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (each instance has its own)
+    _viewer: Painter | None = None
+    _session: Session | None = None
+    _situation: Situation | None = None
+
+    def __init__(
+        self,
+        task: str = "pick_place",
+        *,
+        split: Literal["all", "train", "eval"] = "eval",
+        seed: int = 0,
+        variation: Preset = "mild",
+        objects: Collection[str] = (),
+        object_split: Literal["all", "train", "eval"] = "all",
+        robot: str = "panda",
+        fps: int = 30,
+        physics_hz: int = 240,
+        cameras: tuple[str, ...] = (),
+        width: int = 224,
+        height: int = 224,
+        renderer: str | None = None,
+        privileged: bool | None = None,
+        sensed: Collection[str] = (),
+        state: StateKind = "joint",
+        action: ActionKind = "joint",
+        episode_length: int | None = None,
+        render_mode: str | None = None,
+        render_camera: str = "front",
+        render_width: int = 320,
+        render_height: int = 240,
+        config: GenerateConfig | None = None,
+    ) -> None:
+        if config is None:
+            config = GenerateConfig(
+                task=task,
+                split=split,
+                seed=seed,
+                variation=variation,
+                objects=tuple(objects),
+                object_split=object_split,
+                robot=robot,
+                fps=fps,
+                physics_hz=physics_hz,
+                cameras=tuple(cameras),
+                width=width,
+                height=height,
+                renderer=renderer or GenerateConfig.renderer,
+            )
+        config.validate()
+        self._action_kind = check_choice("action", action, ACTION_KINDS)
+        self._state_kind = check_choice("state", state, STATE_KINDS)
+        self.config, self.render_mode = config, _checked(render_mode)
+        self.metadata = {**type(self).metadata, "render_fps": config.fps}
+        self._render_camera, self._render_size = render_camera, (render_width, render_height)
+        self.episode = prepare(EpisodePlan(config=config, episode_index=0))
+        info = self.episode.info
+        self._sensed = _on_request(info, sensed)
+        num_goals = max(1, len(info.simulated.scene.goals))
+        self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * num_goals)
+        self.privileged = self._is_privileged() if privileged is None else privileged
+        self._vector_lengths = self._lengths(info)
+        self.observation_space = _observation_space(info, self._vector_lengths)
+        low, high = (bound.astype(np.float32) for bound in action_bounds(info.simulated.robot, action, fps=config.fps))
+        self.action_space = spaces.Box(low, high)
+        self._simulators, self._viewers = SimulatorCache(), WarmRenderer()
+
+    @property
+    def keys(self) -> dict[str, str]:
+        """Dataset feature -> key of the observation, images aside."""
+        return {name: _key(name) for name in self._vector_lengths}
+
+    @property
+    def info(self) -> EpisodeInfo:
+        """Of the present episode."""
+        return self.episode.info
+
+    @property
+    def world(self) -> World:
+        """The simulated world, after a reset."""
+        return _after_reset(self._session, "world").world
+
+    @property
+    def situation(self) -> Situation:
+        """What the simulation is at, after a reset or a step."""
+        return _after_reset(self._situation)
+
+    @property
+    def max_episode_steps(self) -> int:
+        """The time limit, frames."""
+        return self._max_episode_steps
+
+    @property
+    def task(self) -> str:
+        """Name of the task."""
+        return self.config.task
+
+    @property
+    def task_description(self) -> str:
+        """The present episode's instruction, LeRobot's task text."""
+        return self.info.instruction
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Begin an episode; see the class for `seed` and for the option "scene".
+
+        Raises:
+            SceneError: No layout was found, the scene cannot be built, or it has other features than the space says.
+        """
+        super().reset(seed=seed)
+        scene = (options or {}).get("scene")
+        index = int(self.np_random.integers(2**31)) if seed is None else seed
+        self.episode = self._prepare(index, scene)
+        info = self.info
+        if self._lengths(info) != self._vector_lengths:
+            raise SceneError(
+                f"Episode {index} of {self.config.task!r} has other objects than episode 0, and an environment has one "
+                "observation space: leave privileged out and use cameras."
+            )
+        world, renderer = self._simulators.acquire(info)
+        session = Session.of_episode(world, self.episode, renderer, only_color=True)
+        session.reset()
+        self._session = session
+        self._viewer, self._held = None, 0
+        self._decoder = ActionDecoder(world, self._action_kind)
+        self._situation = self._look(session, None)
+        return self._observation(self._situation), {"is_success": False, "episode_index": index}
+
+    def step(self, action: NDArray[np.floating]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step; ValueError for an action of a wrong shape or with a value that is no number."""
+        return self.act(Step(action=self.command_for(action), phase=POLICY_PHASE))
+
+    def command_for(self, action: NDArray[np.floating]) -> Action:
+        """What `step` would send now; errors as there. Deltas go on from here, unless `act` sends something else."""
+        _after_reset(self._session)
+        values = np.asarray(action, dtype=np.float64)
+        if values.shape != self.action_space.shape or not np.isfinite(values).all():
+            raise ValueError(f"An action has shape {self.action_space.shape} and finite values, found {values!r}.")
+        return self._decoder.command(values)
+
+    def act(self, step: Step) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One control step as `step` makes it, whoever decided it; its command is sent as it is."""
+        session = _after_reset(self._session)
+        frame = session.frame(step)
+        self._decoder.follow(frame.command)
+        session.step(frame.command)
+        self._situation = self._look(session, frame)
+        success = self._situation.is_success
+        truncated = not success and session.frame_index >= self._max_episode_steps
+        information = {
+            "is_success": success,
+            "episode_index": self.episode.plan.episode_index,
+            "command": np.append(frame.command.joint_target, frame.command.gripper_target),
+        }
+        return self._observation(self._situation), float(success), success, truncated, information
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """(H, W, 3) uint8 image of the present state from `render_camera`; None without a render mode."""
+        if self.render_mode is None:
+            return None
+        _after_reset(self._situation)
+        if self._viewer is None:
+            name, (width, height) = self._render_camera, self._render_size
+            camera = CAMERAS.load(name).camera(name, self.info.simulated.robot, width=width, height=height)
+            self._viewer = Painter(self._viewers.of(self.config.renderer), (camera,), antialias=self.config.antialias)
+            self._viewer.setup(self.world)
+        return self._viewer.images()[self._render_camera].color
+
+    def close(self) -> None:
+        """Free the simulator and the renderers; harmless when called twice."""
+        try:
+            self._simulators.close()
+        finally:
+            self._viewers.close()
+        self._viewer = self._session = self._situation = None
+
+    def _prepare(self, index: int, scene: Scene | None) -> PreparedEpisode:
+        """The first attempt at this episode for which a layout is found, as the generator does it."""
+        for attempt in range(self.config.max_attempts):
+            try:
+                episode = prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))
+                break
+            except SceneError:
+                if attempt == self.config.max_attempts - 1:
+                    raise
+        if scene is None:
+            return episode
+        scene = replace(scene, cameras=episode.info.simulated.scene.cameras)
+        return replace(episode, info=with_simulation(episode.info, scene=scene))
+
+    def _is_privileged(self) -> bool:
+        """The default: without cameras, and with as many objects in each of the first scenes."""
+        if self.config.cameras:
+            return False
+        lengths = set()
+        for index in range(PROBED_SCENES):
+            simulated = self._prepare(index, None).info.simulated
+            names = features.observation_names(simulated.robot, simulated.scene, privileged=True)
+            lengths.add(len(names[features.ENVIRONMENT_STATE]))  # a round object has no yaw: its vector is shorter
+        return len(lengths) == 1
+
+    def _lengths(self, info: EpisodeInfo) -> dict[str, int]:
+        """Dataset feature -> how many numbers it has."""
+        names = features.observation_names(
+            info.simulated.robot,
+            info.simulated.scene,
+            privileged=self.privileged,
+            state=self._state_kind,
+            sensed=self._sensed,
+        )
+        return {name: len(components) for name, components in names.items()}
+
+    def _look(self, session: Session, last_frame: Frame | None) -> Situation:
+        checks = session.checks()
+        self._held = self._held + 1 if all(check.passed for check in checks) else 0
+        return Situation(
+            frame_index=session.frame_index,
+            observation=session.observation,
+            images=session.images,
+            last_frame=last_frame,
+            checks=checks,
+            is_success=self._held >= SUCCESS_FRAMES,
+        )
+
+    def _observation(self, situation: Situation) -> dict[str, Any]:
+        simulated = self.info.simulated
+        vectors = features.observation_vectors(
+            ObservationRows.of_observation(situation.observation),
+            simulated.robot,
+            simulated.scene,
+            privileged=self.privileged,
+            state=self._state_kind,
+            sensed=self._sensed,
+        )
+        observation: dict[str, Any] = {_key(name): rows[0] for name, rows in vectors.items()}
+        if situation.images:
+            observation["pixels"] = {name: images.color for name, images in situation.images.items()}
+        return observation
+
+
+def _key(feature: str) -> str:
+    """A dataset feature's key in the observation, as LeRobot's `preprocess_observation` maps it back."""
+    return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
+
+
+def _checked(render_mode: str | None) -> str | None:
+    if render_mode not in (None, "rgb_array"):
+        raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
+    return render_mode
+
+
+def _on_request(info: EpisodeInfo, names: Collection[str]) -> tuple[Feature, ...]:
+    known = {feature.name: feature for feature in on_request(info)}
+    return tuple(known[check_choice("sensed", name, tuple(known))] for name in names)
+
+
+def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:
+    found: dict[str, spaces.Space[Any]] = {
+        _key(name): spaces.Box(-np.inf, np.inf, shape=(length,), dtype=np.float32)
+        for name, length in vector_lengths.items()
+    }
+    if info.simulated.scene.cameras:
+        sizes = {camera.name: (camera.height, camera.width, 3) for camera in info.simulated.scene.cameras}
+        images = {name: spaces.Box(0, 255, shape=size, dtype=np.uint8) for name, size in sizes.items()}
+        found["pixels"] = spaces.Dict(images)
+    return spaces.Dict(found)
+
+
+def _after_reset[T](value: T | None, what: str = "episode") -> T:
+    if value is None:
+        raise RuntimeError(f"the environment has no {what} yet: call reset first")
+    return value
+
+
+def env_id(task: str) -> str:
+    """Gymnasium's name of a task's environment ("demorec/PickPlace-v0"); registers it where that was not done yet.
+
+    Raises:
+        ConfigError: An unknown task.
+    """
+    TASKS.check_name(task)
+    full = environment_name(task)
+    if full not in gymnasium.registry:
+        gymnasium.register(full, entry_point="demorec.extensions.policies.gym_env:DemorecEnv", kwargs={"task": task})
+    elif gymnasium.registry[full].kwargs["task"] != task:
+        raise ConfigError(
+            f"Two tasks are called {full!r}: {gymnasium.registry[full].kwargs['task']} and {task}; rename one class."
+        )
+    return full
+
+
+for _task in TASKS.names():
+    env_id(_task)

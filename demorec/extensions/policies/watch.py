@@ -1,0 +1,166 @@
+"""Watches a policy, and decides when and why the expert takes over.
+
+The expert has a script, and no action for every state: so its way is simulated beforehand in a world of its own, from
+the same state on, and a policy's commands are compared with the part of that way that it has reached.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from demorec.core.geometry import Array, angle_between
+from demorec.episode.episode import Action, Observation
+from demorec.extensions.policies import TakeOver
+from demorec.extensions.policies.gym_env import Situation
+from demorec.loop import PreparedEpisode, Session
+from demorec.sim.world import World
+from demorec.tasks.script import Behaviour, ExpertFailure, Step
+from demorec.tasks.skills import Expert
+
+_AHEAD_SECONDS = 1.0
+"""How far ahead on the expert's way a policy may be from one frame to the next."""
+_SAME_PLACE = 0.001
+"""Metres within which two places of the way are one; the later one counts, since the expert also waits."""
+
+
+def correcting_behaviour(episode: PreparedEpisode, *, noise: bool) -> Behaviour:
+    """How the expert does it in an episode that it takes over: without a miss on purpose, with `noise` or without."""
+    behaviour = replace(episode.behaviour, miss_x=0.0, miss_y=0.0)
+    return behaviour if noise else replace(behaviour, action_noise=0.0)
+
+
+class Rehearsal:
+    """The expert's way from a state on.
+
+    Args:
+        world: Of the episode's robot; it is reset.
+        episode: Whose scene and task.
+        commands: What was sent since the episode's start; the way begins after them.
+    """
+
+    def __init__(self, world: World, episode: PreparedEpisode, commands: Sequence[Action]) -> None:
+        session = Session(world, episode.info.simulated.scene, episode.task)
+        session.reset()
+        for command in commands:
+            session.step(command)
+        seen, actions = [session.observation], [world.hold()]
+        for step in _steps(world, episode, is_start=not commands):
+            seen.append(session.observation)
+            actions.append(step.action)
+            session.step(step.action)
+        self._actions = actions
+        self._wanted = np.array([action.base_from_tcp_target.position for action in actions])  # (T, 3)
+        self._places = np.array([_place(observation) for observation in seen])  # (T, 4)
+        self._objects = {
+            name: np.array([observation.object_poses[name].position for observation in seen])  # (T, 3)
+            for name in seen[0].object_poses
+        }
+        self._ahead = max(1, round(_AHEAD_SECONDS * episode.info.fps))
+        self._reached = 0
+
+    def distance(self, observation: Observation, command: Action) -> tuple[float, float, float]:
+        """How far a policy is that commands this now; to be asked once a frame, since the way is followed forward.
+
+        Returns:
+            Metres from the TCP that it commands to the nearest one that the expert commands within the next second;
+            radians between the directions of the hand there; and metres from the objects to where the expert has them
+            at the same place of its way, the largest.
+        """
+        window = slice(self._reached, self._reached + self._ahead)
+        off = np.abs(self._places[window] - _place(observation)).sum(axis=1)
+        self._reached += int(np.flatnonzero(off < off.min() + _SAME_PLACE)[-1])
+        window = slice(self._reached, self._reached + self._ahead)
+        shifts = np.linalg.norm(self._wanted[window] - command.base_from_tcp_target.position, axis=1)
+        nearest = int(shifts.argmin())
+        there = self._actions[self._reached + nearest].base_from_tcp_target
+        here = observation.object_poses
+        objects = (np.linalg.norm(way[self._reached] - here[name].position) for name, way in self._objects.items())
+        angle = angle_between(there, command.base_from_tcp_target)
+        return float(shifts[nearest]), angle, float(max(objects, default=0.0))
+
+
+def _steps(world: World, episode: PreparedEpisode, *, is_start: bool) -> Iterator[Step]:
+    """What the expert does until it is done or gives up."""
+    expert = Expert(world, correcting_behaviour(episode, noise=False))
+    try:
+        yield from episode.task.script(expert) if is_start else episode.task.resume(expert)
+    except ExpertFailure:
+        return
+
+
+def _place(observation: Observation) -> Array:
+    """(4,) TCP position and opening, metres: where on a way somebody is."""
+    return np.array([*observation.base_from_tcp.position, observation.gripper_width])
+
+
+_STILL_METRES = 0.005
+"""Maximum range of a stuck hand's TCP along each axis."""
+_STILL_WIDTH = 0.002
+"""Maximum range of its opening, metres."""
+
+
+class Watch:
+    """Watches a policy in one episode; a function of the episode and of what the policy does.
+
+    Args:
+        rules: When the expert takes over.
+        episode: Whose random stream says at which moment, if at a random one.
+        max_frames: Time limit of the policy.
+        world: In which the expert's way is rehearsed; needed only where straying counts.
+    """
+
+    def __init__(
+        self, rules: TakeOver, episode: PreparedEpisode, *, max_frames: int, world: World | None = None
+    ) -> None:
+        fps = episode.info.fps
+        self._rules, self._episode, self._world = rules, episode, world
+        self._limit = min(max_frames, round(rules.after_seconds * fps) or max_frames)
+        random = episode.rng("takeover")
+        is_random, moment = random.random() < rules.random_share, int(random.integers(1, self._limit + 1))
+        self._moment = moment if is_random else self._limit
+        self._past: deque[Array] = deque(maxlen=max(2, round(rules.stuck_seconds * fps)))
+        self._max_astray = max(1, round(rules.stray_seconds * fps))
+        self._astray = 0
+        self._rehearsal: Rehearsal | None = None
+
+    def begin(self, commands: Sequence[Action]) -> None:
+        """The policy begins to act, or acts again, after these commands of the episode."""
+        self._past.clear()
+        self._astray = 0
+        if commands:
+            self._moment = self._limit  # the random moment has been
+        if self._world is not None and (self._rules.stray_metres or self._rules.stray_radians):
+            self._rehearsal = Rehearsal(self._world, self._episode, commands)
+
+    def is_over(self, situation: Situation) -> bool:
+        """Whether the policy has had its time."""
+        return situation.frame_index >= self._limit
+
+    def reason(self, situation: Situation, command: Action) -> str:
+        """Why the expert takes over instead of this command; "" while the policy goes on. To be asked once a frame."""
+        observation = situation.observation
+        self._past.append(_place(observation))
+        if self.is_over(situation):
+            return "the policy has had its time"
+        if situation.frame_index >= self._moment:
+            return "a random moment"
+        if self._rules.stuck_seconds > 0 and len(self._past) == self._past.maxlen:
+            spread = np.ptp(np.array(self._past), axis=0)
+            if (spread[:3] < _STILL_METRES).all() and spread[3] < _STILL_WIDTH:
+                return "the policy is stuck"
+        return self._stray(situation, command)
+
+    def _stray(self, situation: Situation, command: Action) -> str:
+        if self._rehearsal is None:
+            return ""
+        limits = self._rules
+        tcp, angle, objects = self._rehearsal.distance(situation.observation, command)
+        if 0.0 < limits.stray_metres < objects:
+            return "an object is astray"
+        is_astray = 0.0 < limits.stray_metres < tcp or 0.0 < limits.stray_radians < angle
+        self._astray = self._astray + 1 if is_astray else 0
+        return "the policy strays" if self._astray >= self._max_astray else ""

@@ -1,0 +1,273 @@
+"""The deep check: a recording, or an episode of a dataset, is made again, and all of it must come out the same."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Literal
+
+from demorec.check.dataset import CheckedDataset, DescribedEpisode
+from demorec.check.run_dataset import episode_differences, export_options
+from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
+from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
+from demorec.core.own_versions import version_differences
+from demorec.core.plain import digest
+from demorec.core.processes import in_turn
+from demorec.core.tables import RENDERERS
+from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import with_simulation
+from demorec.extensions.remake.deep.contents import Contents, RemakeDifference, coded_topics, content_differences
+from demorec.extensions.remake.deep.images import image_differences
+from demorec.extensions.remake.demonstration import ReplayOptions, open_demonstration
+from demorec.extensions.remake.drive import replay
+from demorec.extensions.remake.rerender import config_as, recorded_view, view_painter
+from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
+from demorec.mcap import EpisodeWriter, Recording, open_simulated
+from demorec.robots.assets import allow_models
+
+
+@dataclass(frozen=True, kw_only=True)
+class DeepReport:
+    """How a recording compares with itself made again.
+
+    Attributes:
+        path: The recording.
+        versions: One line for each version, and the type of CPU, in which what made it differs from what is here. With
+            any of them nothing is provable here, so that differences are warnings.
+        differences: Everything that differs, ordered by the first frame.
+        error: Why it could not be made again; "" where it could.
+        replay: How its own commands fare in its own scene, in words; "" unless numbers differ.
+        is_derived: Whether it is a replay or rendering, of which labels, phases and events are taken over.
+        num_frames: Of the recording.
+    """
+
+    path: Path
+    versions: tuple[str, ...] = ()
+    differences: tuple[RemakeDifference, ...] = ()
+    error: str = ""
+    replay: str = ""
+    is_derived: bool = False
+    num_frames: int = 0
+
+    @property
+    def level(self) -> Literal["pass", "warn", "fail"]:
+        """Failed if it cannot be made again or differs, and neither versions nor the CPU explain it."""
+        if self.versions:
+            return "warn"
+        return "fail" if self.error or self.differences else "pass"
+
+
+_simulators = SimulatorCache()
+"""Of this process."""
+
+
+def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Sequence[str] = ()) -> DeepReport:
+    """Make a recording again and compare everything.
+
+    Args:
+        path: The recording.
+        simulators: Gives world and renderer; by default one that stays warm for as long as the process lives.
+        allowed: The user's own modules that may be imported for what the recording names.
+
+    Raises:
+        ResourceError: This machine cannot do it, which says nothing about the recording.
+    """
+    report = DeepReport(path=path)
+    try:
+        with (
+            tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder,
+            open_simulated(path) as recording,
+        ):
+            info = recording.info
+            report = replace(report, num_frames=recording.num_frames, is_derived=bool(info.origin))
+            report = replace(report, versions=_unlike_here(info, allowed))
+            again = Path(folder) / "again.mcap"
+            remake(recording, again, simulators, allowed)
+            differences = tuple(_differences(recording, again))
+            if not report.is_derived and any(d.field != "image" for d in differences):
+                report = replace(report, replay=_replayed(recording, simulators, allowed))
+            return replace(report, differences=differences)
+    except DemorecError as error:
+        return _impossible(report, error)
+
+
+def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
+    """The report that it could not be made again; ResourceError where this machine cannot do it."""
+    lack = resource_error(error)
+    if lack is error:
+        raise error
+    if lack is not None:
+        raise lack from error
+    if isinstance(error, NotAllowedError | RecordingError):  # neither versions nor the CPU explain it
+        report = replace(report, versions=())
+    return replace(report, error=str(error))
+
+
+def _unlike_here(info: EpisodeInfo, allowed: Sequence[str]) -> tuple[str, ...]:
+    """Describe the differences in versions, and in the type of CPU, between an episode and this machine."""
+    lines = list(version_differences(info.versions, _versions_here(info, allowed)))
+    if info.simulated.cpu != cpu_type():
+        lines.append(f"it was simulated on {info.simulated.cpu or 'an unknown CPU'}, this is {cpu_type()}")
+    return tuple(lines)
+
+
+def _versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
+    """package -> version of what would make such an episode here."""
+    with suppress(DemorecError):
+        return deciding_versions(_recorded_config(info, allowed))
+    return deciding_versions()
+
+
+def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
+    """The config that an episode says it was made with.
+
+    Raises:
+        ConfigError: The config is not valid.
+        NotAllowedError: It names something of a module that is not among those `allowed`.
+    """
+    config = config_as(info.simulated.config, GenerateConfig)
+    config.check_names(allowed)
+    config.validate()
+    return config
+
+
+def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    """Make the episode of a recording again, into a file.
+
+    A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
+    its commands are sent again in its recorded scene, and labels, phases and events are taken over.
+
+    Raises:
+        ConfigError: Its config cannot be used.
+        DemorecError: It cannot be simulated, drawn or written here.
+    """
+    if recording.info.origin:
+        _send_again(recording, path, simulators, allowed)
+    else:
+        _generate_again(recording.info, path, simulators, allowed)
+
+
+def _generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
+    config = _recorded_config(recorded, allowed)
+    episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
+    world, renderer = simulators.acquire(episode.info)
+    session = Session.of_episode(world, episode, renderer)
+    with EpisodeWriter(path, episode.info, video=config.video) as writer:
+        for frame in session.run(ScriptAgent(episode)):
+            writer.write(frame)
+        writer.finish(session.outcome)
+
+
+def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    allow_models(allowed)
+    options = ReplayOptions(allowed=tuple(allowed))
+    demonstration = open_demonstration(recording, options)
+    info = with_simulation(recording.info, config_digest=digest(recording.info.simulated.config))
+    RENDERERS.check_name(str(info.simulated.config.get("renderer", "raster")))
+    world, renderer = simulators.acquire(info)
+    painter = None if renderer is None else view_painter(renderer, recorded_view(info), info.simulated.config)
+    with EpisodeWriter(path, info, video=config_as(info.simulated.config.get("video", {}), VideoConfig)) as writer:
+        _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
+        if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
+            recorded = recording.outcome
+            outcome = replace(
+                outcome,
+                failure_phase=recorded.failure_phase,
+                failure_reason=recorded.failure_reason,
+                num_retries=recorded.num_retries,
+                success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
+            )
+        writer.finish(outcome)
+
+
+def _differences(recording: Recording, again: Path) -> Iterator[RemakeDifference]:
+    """Ordered by the first frame, what belongs to no frame first."""
+    found, made = Contents.of(recording.path), Contents.of(again)
+    with open_simulated(again) as remade:
+        if recording.is_recovered:
+            made.cut_off(found)
+        differences, images = content_differences(found, made, remade.info, recording.info.fps)
+        differences += image_differences(found, made, remade, coded_topics(remade.info), images)
+    yield from sorted(differences, key=lambda difference: difference.frames[:1])
+
+
+def _replayed(recording: Recording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:
+    """Describe a replay of the recorded commands in the recorded scene, which locates the fault."""
+    options = ReplayOptions(allowed=tuple(allowed))
+    try:
+        demonstration = open_demonstration(recording, options)
+        report, _ = replay(demonstration, simulators.acquire(recording.info)[0], options)
+    except DemorecError as error:
+        return f"cannot be replayed ({error})"
+    if report.first_difference is None:
+        return "its commands, sent again in its recorded scene, give its recorded states to the bit"
+    step, what = report.first_difference
+    return f"its commands, sent again in its recorded scene, give other states from frame {step} on ({what})"
+
+
+def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
+    """One report for each recording, in order."""
+    if workers == 1 or len(paths) < 2:
+        with closing(SimulatorCache()) as simulators:
+            for path in paths:
+                yield deep_check(path, simulators, allowed)
+        return
+    yield from in_turn(partial(deep_check, allowed=tuple(allowed)), paths, workers)
+
+
+def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
+    """One report for each episode that the sidecar knows, in order; a single one where that cannot be done.
+
+    Each episode is made again from what the sidecar says of it, exported, and compared.
+
+    Raises:
+        ResourceError: This machine cannot do it, which says nothing about the dataset.
+    """
+    with closing(SimulatorCache()) as simulators:
+        try:
+            dataset = CheckedDataset(path)
+            if not dataset.sidecar:
+                raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
+            dataset.check_simulated()
+            options = export_options(path)
+            if missing := dataset.folder.missing:
+                raise ExportError(missing)
+            for number, problem in dataset.unreadable.items():
+                yield _impossible(DeepReport(path=path / f"episode {number}"), ExportError(problem))
+            for episode in dataset.described():
+                info = episode.info
+                report = DeepReport(
+                    path=path / f"episode {episode.number}",
+                    versions=_unlike_here(info, allowed),
+                    num_frames=len(episode.rows["index"]),
+                )
+                try:
+                    found = tuple(_episode_differences(episode, dataset, options, simulators, allowed))
+                    yield replace(report, differences=found)
+                except DemorecError as error:
+                    yield _impossible(report, error)
+        except DemorecError as error:
+            yield _impossible(DeepReport(path=path), error)
+
+
+def _episode_differences(
+    episode: DescribedEpisode,
+    dataset: CheckedDataset,
+    options: ExportOptions,
+    simulators: SimulatorCache,
+    allowed: Sequence[str],
+) -> Iterator[RemakeDifference]:
+    info = episode.info
+    if info.origin:
+        raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
+    with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
+        again = Path(folder) / "again.mcap"
+        _generate_again(info, again, simulators, allowed)
+        for what, frames in episode_differences(again, options, episode, dataset):
+            yield RemakeDifference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")

@@ -1,0 +1,257 @@
+"""`demorec replay`: recorded actions or states back into the simulator."""
+
+from __future__ import annotations
+
+import math
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from demorec.cli.shared.flags import Allow, Positional, allowed_modules
+from demorec.cli.shared.output import say, say_json, tell
+from demorec.cli.shared.paths import need_paths, refuse_sources
+from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
+from demorec.core.errors import ConfigError, OptionError
+from demorec.core.registry import modules_of
+from demorec.core.tables import load_robot
+from demorec.core.targets import OptionalTarget
+from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
+
+if TYPE_CHECKING:
+    from demorec.extensions.remake.demonstration import Demonstration, ReplayOptions
+    from demorec.extensions.remake.drive import ReplayReport
+
+
+@dataclass(frozen=True, kw_only=True)
+class Replay:
+    """Send recorded actions back into the simulator and compare everything sensed, and the outcome, with the recording.
+
+    Recordings must replay bit-exactly (on the same type of machine); labels, phases and images are for
+    demorec check --deep. Datasets hold float32 actions without the
+    exploration noise that was executed; for them success and deviations are reported. Exit code 0: as recorded
+    (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded. What
+    the same command has written to --out before stays.
+
+    With --robot a simulated arm does what a real one did, by the actions of its dataset or imported recordings alone,
+    on an empty table, and how far it is from the measured states is reported of each joint. Exit code 1: farther than
+    --tolerance, where that is given.
+
+    Examples:
+      demorec replay recordings/cubes/episodes/episode_000000.mcap
+      demorec replay recordings/cubes --episodes 0:10
+      demorec replay datasets/cubes
+      demorec replay recordings/cubes --noise 0.01 --delay 2 --export-hz 10
+      demorec replay episode.mcap --out replayed --view
+      demorec replay --robot so101 --motor-units degrees datasets/desk
+    """
+
+    paths: Positional[tuple[Path, ...]]
+    """Recordings, runs, folders of recordings, or exported datasets."""
+    episodes: str = ""
+    """Which episodes, by number: 0:100, ::2, 3,5,8:10; all by default."""
+    states: bool = False
+    """Set the recorded states one after another instead of sending the actions."""
+    export_hz: int | None = None
+    """Send commands at this rate; must divide the recorded rate."""
+    noise: float = 0.0
+    """Standard deviation of noise added to every joint target, rad."""
+    delay: int = 0
+    """Delay of every command, in steps."""
+    seed: int = 0
+    """Seed of the noise."""
+    tolerance: float = 0.0
+    """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
+    robot: str = ""
+    """The arm that does what a real one did: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
+    motors: MotorsByFlags = field(default_factory=MotorFlags)
+    roles: NamedByFlags = field(default_factory=RoleFlags)
+    out: OptionalTarget = None
+    """Folder for recordings of the replays, images included."""
+    view: bool = False
+    """Show recording and replay overlaid in Rerun."""
+    overwrite: bool = False
+    """Replace recordings in the output folder."""
+    allow: Allow = ()
+    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
+    json: bool = False
+    """Print JSON: a list with one object for each episode."""
+
+    def run(self) -> int:
+        """Replay and report."""
+        need_paths(self.paths, "replay")
+        if self.tolerance < 0:
+            raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
+        from demorec.extensions.remake.demonstration import ReplayOptions
+        from demorec.extensions.remake.drive import is_as_recorded, replay_all
+
+        allowed = (*allowed_modules(self.allow), *modules_of([self.robot]))
+        options = ReplayOptions(
+            states=self.states,
+            export_hz=self.export_hz,
+            noise=self.noise,
+            delay=self.delay,
+            seed=self.seed,
+            allowed=allowed,
+            robot=load_robot(self.robot, allowed) if self.robot else None,
+            motors=self.motors.named,
+            named=self.roles.named,
+        )
+        if options.robot is not None and (self.out is not None or self.view):
+            raise ConfigError("--robot compares numbers, of a scene nothing is known: leave --out, --view out.")
+        options.validate()
+        with ExitStack() as stack:
+            out = self.out
+            if out is None and self.view:
+                out = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="demorec-replay-")))
+            if out is not None:
+                targets = [out / file.name for path in self.paths for file in _replayable(path).recordings]
+                refuse_sources(self.paths, targets or [out], do="replay")
+            found = demonstrations(self.paths, options, episodes=self.episodes)
+            reports: list[ReplayReport] = []
+            pairs: list[tuple[Path, Path]] = []
+            with ProgressBar("replaying") as bar:
+                for report, written in replay_all(found, options, out=out, overwrite=self.overwrite):
+                    reports.append(report)
+                    bar.advance()
+                    if not self.json:
+                        say(describe_replay(report))
+                    if written is not None:
+                        pairs.append(written)
+            if not reports:
+                raise ConfigError(f"No episode has a number within {self.episodes!r}.")
+            good = [is_as_recorded(r, tolerance=self.tolerance, bitwise=options.is_plain) for r in reports]
+            if self.json:
+                from demorec.core.plain import to_plain
+
+                say_json([to_plain(report) for report in reports])
+            else:
+                if options.robot is not None:
+                    say("Nothing stood on the table: where the arm held something, the gripper closes farther here.")
+                else:
+                    say(_summary(reports, sum(good)))
+                    say(_compared(reports))
+                if self.out is not None:
+                    say(f"Recordings of the replays: {self.out}")
+            if self.view:
+                _show(pairs)
+        return 0 if all(good) else 1
+
+
+def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
+    """Yield what there is to replay in some paths, in order.
+
+    Tells, before each of them, in which versions what recorded it differs from what is here, and where modules of the
+    user's own are not what they were.
+    """
+    from demorec.core.config import deciding_versions
+    from demorec.core.own_versions import changed_sources, version_differences
+    from demorec.robots.assets import allow_models
+
+    allow_models(options.allowed)
+    noted: set[str] = set()
+    here = deciding_versions()
+    for demonstration in _found(paths, options, episodes=episodes):
+        versions = demonstration.info.versions
+        lines = [f"{line} since this was recorded" for line in changed_sources(versions, options.allowed)]
+        lines += version_differences({name: versions[name] for name in versions if name in here}, here)
+        if new := [line for line in lines if line not in noted]:
+            tell(f"Note: {'; '.join(new)}.")
+        noted.update(new)
+        yield demonstration
+
+
+def _found(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
+    from demorec.datasets.options import parse_episodes
+    from demorec.extensions.remake.demonstration import dataset_demonstrations, open_file
+
+    wanted = parse_episodes(episodes)
+    for path in paths:
+        found = _replayable(path)
+        if found.kind == "dataset":
+            yield from dataset_demonstrations(path, wanted, options)
+            continue
+        for file in found.recordings:
+            demonstration = open_file(file, options)
+            if wanted(demonstration.info.episode_index):
+                yield demonstration
+
+
+def _replayable(path: Path) -> Found:
+    """What a path holds to be replayed: a dataset, or recordings."""
+    found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
+    if found.kind != "dataset":
+        expect_recordings(found, found.recordings)
+    return found
+
+
+def describe_replay(report: ReplayReport) -> str:
+    """One line about a replay."""
+    if report.tracking:
+        return f"{report.name}: {report.num_steps} steps; {_tracked(report.tracking)}"
+    if report.is_identical:
+        how = "identical"
+    else:
+        assert report.first_difference is not None
+        step, what = report.first_difference
+        how = (
+            f"differs from step {step} on ({what}); at most {report.joint_error:.2g} rad at step "
+            f"{report.joint_error_step}, gripper {report.gripper_error * 1e3:.2g} mm"
+        )
+        if report.object_error_name:
+            how += f", {report.object_error_name} {report.object_error * 1e3:.3g} mm at step {report.object_error_step}"
+    outcome = {None: "", True: ", succeeds", False: f", fails ({', '.join(report.failed_checks)})"}[report.success]
+    if not report.is_outcome_as_recorded:
+        outcome += f" where the recording {'succeeded' if report.recorded_success else 'failed'}"
+    lost = f", {report.unreachable} poses out of reach" if report.unreachable else ""
+    return f"{report.name}: {how}{outcome}{lost}"
+
+
+def _tracked(tracking: Mapping[str, tuple[float, float]]) -> str:
+    """Median and largest difference of each joint."""
+    parts = [
+        f"{name} {1e3 * median:.1f}, {1e3 * largest:.1f} mm"
+        if name == "gripper"
+        else f"{name} {math.degrees(median):.2f}, {math.degrees(largest):.2f}"
+        for name, (median, largest) in tracking.items()
+    ]
+    return f"off what was measured, median and largest, degrees: {'; '.join(parts)}"
+
+
+def _compared(reports: Sequence[ReplayReport]) -> str:
+    """What "identical" means."""
+    from demorec.extensions.remake.demonstration import POSE_OF
+
+    found = dict.fromkeys(name for report in reports for name in report.compared)
+    names = [name for name in found if not name.startswith(POSE_OF)]
+    objects = ["poses of objects"] if any(report.compares_objects for report in reports) else []
+    return (
+        f"Compared: {', '.join([name.removeprefix('the ') for name in names] + objects)}; not labels, phases, images."
+    )
+
+
+def _summary(reports: Sequence[ReplayReport], good: int) -> str:
+    judged = [report for report in reports if report.success is not None]
+    parts = [f"{len(reports)} replayed, {sum(r.is_identical for r in reports)} identical, {good} as recorded"]
+    if judged:
+        parts.append(f"success {sum(bool(r.success) for r in judged)} of {len(judged)}")
+    largest = [
+        f"{max(report.joint_error for report in reports):.2g} rad",
+        f"gripper {max(report.gripper_error for report in reports) * 1e3:.2g} mm",
+    ]
+    if any(report.compares_objects for report in reports):
+        largest.append(f"objects {max(report.object_error for report in reports) * 1e3:.2g} mm")
+    parts.append(f"largest difference {', '.join(largest)}")
+    return "; ".join(parts) + "."
+
+
+def _show(pairs: Sequence[tuple[Path, Path]]) -> None:
+    from demorec.cli import COMMANDS, run_command
+
+    if not pairs:
+        raise ConfigError("There is nothing to show: --view needs recordings, since a dataset holds no scene to draw.")
+    recorded, replayed = pairs[0]
+    run_command(COMMANDS.load("view"), [str(recorded), str(replayed), "--compare"], prog="demorec view")

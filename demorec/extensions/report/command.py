@@ -1,0 +1,85 @@
+"""`demorec report`: a run or a dataset on one page."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated
+
+from demorec.cli.shared.flags import Positional, arg
+from demorec.cli.shared.output import counted, say, size_in_words
+from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
+from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.core.atomic import atomic_write
+from demorec.core.errors import ConfigError, check_option
+from demorec.core.replacing import REPORT
+from demorec.core.targets import Target
+from demorec.extensions.imports.formats import IMPORTED
+from demorec.runs.find import EPISODE_FOLDERS, expect
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReportCommand:
+    """Write a self-contained HTML page about a run, recordings or a dataset.
+
+    It shows outcomes, the results of the checks, the distributions of states and actions, and a filmstrip of every
+    episode, failed ones first. It needs no network. Exit code 0 means that the page was written, whatever the results;
+    use demorec check for a verdict.
+
+    Examples:
+      demorec report recordings/cubes --out cubes.html
+      demorec report datasets/cubes --out cubes.html --camera wrist
+      demorec report recordings/cubes --out cubes.html --images --workers 4
+    """
+
+    path: Annotated[Positional[Path], arg(help=f"One of: {WHAT_IS_READ}, evaluations.")]
+    mapping: MappingFile = None
+    out: Target
+    """The page (.html)."""
+    camera: str = ""
+    """Camera for the filmstrips; default: the first one."""
+    checks: bool = True
+    """Run the checks."""
+    images: bool = False
+    """Also run the checks that decode all images."""
+    workers: int = 1
+    """Processes that read and check recordings."""
+    overwrite: bool = False
+    """Replace an existing report."""
+    roles: NamedByFlags = field(default_factory=RoleFlags)
+
+    def run(self) -> int:
+        """Gather, then write."""
+        if self.out.suffix.lower() not in (".html", ".htm"):
+            raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
+        check_option("workers", self.workers, 1, 1024)
+        if self.images and not self.checks:
+            raise ConfigError("--images chooses checks, and --no-checks runs none: leave one of them out.")
+        expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
+        if not self.out.absolute().parent.is_dir():
+            raise ConfigError(f"--out: there is no folder {self.out.parent}.")
+        refuse_inside([self.out])
+        from demorec.check.report import CheckOptions
+        from demorec.extensions.doctor.from_dataset import ReadOptions
+        from demorec.extensions.report.gather import gather
+        from demorec.extensions.report.judgement import results_of
+        from demorec.extensions.report.page import write_page
+
+        named = self.roles.named
+        checks = CheckOptions(images=self.images) if self.checks else None
+        with atomic_write(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path])) as part:
+            with reading([self.path], self.mapping) as (path,), ProgressBar("reading", unit="item") as bar:
+                judged = results_of(path, ReadOptions(images=self.images, named=named)) if self.checks else ()
+                report = gather(
+                    path,
+                    camera=self.camera,
+                    checks=checks,
+                    judged=judged,
+                    workers=self.workers,
+                    named=named,
+                    advance=bar.set,
+                )
+            size = write_page(report, part)
+        say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
+        return 0

@@ -1,0 +1,226 @@
+"""Content of a report as plain data, gathered from recordings or a dataset; `page.py` lays it out."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.check.base import Level, Result
+from demorec.episode.element_names import is_numbered
+from demorec.episode.episode import Outcome
+from demorec.episode.roles import Roles
+from demorec.extensions.policies.statistics import Rate
+from demorec.extensions.report.filmstrip import Filmstrip
+
+LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
+State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
+"""Of an episode. "flagged" is a success for which a check failed or warned."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportedEpisode:
+    """One attempt at one episode. What the source does not state is None or empty.
+
+    Attributes:
+        name: "episode 3", or "episode 3, attempt 0" for one that failed.
+        source: Its file, relative to the path of the report.
+        problem: Why it cannot be read, or why nothing was recorded.
+        instruction: As text.
+        outcome: None when unknown.
+        num_frames, fps: Length and frame rate.
+        seed: Root seed of the run.
+        phases: (name, first frame, frame after the last) of each phase, in order.
+        flags: Results of checks that failed or warned, failures first.
+        filmstrip: None without images, and for some successes in a long report.
+        facts: (name, value) of what the summary says of all episodes together: robot, cameras, ...
+    """
+
+    name: str
+    source: str = ""
+    problem: str = ""
+    instruction: str = ""
+    outcome: Outcome | None = None
+    num_frames: int = 0
+    fps: int = 1
+    seed: int | None = None
+    phases: tuple[tuple[str, int, int], ...] = ()
+    flags: tuple[Result, ...] = ()
+    filmstrip: Filmstrip | None = None
+    facts: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def success(self) -> bool | None:
+        """None when unknown."""
+        return None if self.outcome is None else self.outcome.success
+
+    @property
+    def state(self) -> State:
+        """Its status in one word."""
+        if self.success is False:
+            return "failed"
+        if self.problem:
+            return "unreadable"
+        if self.flags:
+            return "flagged"
+        return "unknown" if self.success is None else "succeeded"
+
+    @property
+    def failure(self) -> str:
+        """Why it failed and in which phase; "" of any other."""
+        if self.outcome is None or self.outcome.success is not False:
+            return ""
+        reason, phase = self.outcome.failure_reason or "no reason recorded", self.outcome.failure_phase
+        return f"{reason} in phase {phase}" if phase else reason
+
+
+MAX_COMPONENTS = 64
+"""Components of the state or of the action that are drawn."""
+MAX_SAMPLES = 200
+"""Frames of each episode that a distribution is drawn from, beside its extremes."""
+
+Components = dict[tuple[Literal["state", "action"], str], list[NDArray[np.float32]]]
+"""(role, name of the component) -> its sampled values, episode by episode."""
+
+
+def motion_components(roles: Roles, columns: Mapping[str, NDArray[Any]]) -> Components:
+    """Sample the state and the action of one episode: finite values, evenly spaced, and the extremes.
+
+    Args:
+        roles: Roles of its features.
+        columns: Feature -> (T, D).
+    """
+    found: Components = {}
+    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
+    for role, parts in drawn.items():
+        names = roles.elements(parts)[:MAX_COMPONENTS]
+        if is_numbered(names):
+            names = tuple(f"component {name}" for name in names)
+        values = np.hstack([columns[part] for part in parts]) if parts else np.zeros((0, 0))
+        for name, column in zip(names, values.T, strict=False):
+            finite = column[np.isfinite(column)]
+            if len(finite):
+                sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
+                found[role, name] = [np.array([*sampled, finite.min(), finite.max()], dtype=np.float32)]
+    return found
+
+
+def add_components(into: Components, found: Components) -> None:
+    """Add the components of one more episode."""
+    for key, parts in found.items():
+        into.setdefault(key, []).extend(parts)
+
+
+class EpisodeResult(NamedTuple):
+    """A result of the doctor, and the number of its episode; None for the whole set."""
+
+    episode: int | None
+    result: Result
+
+
+def flags_of(judged: Iterable[EpisodeResult]) -> dict[int, tuple[Result, ...]]:
+    """Number of an episode -> its results."""
+    found: dict[int, tuple[Result, ...]] = {}
+    for episode, result in judged:
+        if episode is not None:
+            found[episode] = (*found.get(episode, ()), result)
+    return found
+
+
+class CheckSummaries:
+    """The checks over everything that they looked at, in the order of the first results.
+
+    Attributes:
+        worst: Name of a check -> the result shown, and what that was found in: of the highest level, and of those the
+            one with the largest value.
+        counts: Name of a check -> number of its results of each level.
+        num_subjects: How many recordings, runs and datasets there were.
+    """
+
+    def __init__(self) -> None:
+        self.worst: dict[str, tuple[Result, str]] = {}
+        self.counts: dict[str, Counter[Level]] = {}
+        self.num_subjects = 0
+
+    def add(self, results: Iterable[Result], where: str) -> None:
+        """Count the results for one recording, run or dataset."""
+        self.num_subjects += 1
+        for result in results:
+            self.counts.setdefault(result.check, Counter())[result.level] += 1
+            if result.check not in self.worst or _rank(result) > _rank(self.worst[result.check][0]):
+                self.worst[result.check] = result, where
+
+    def count(self, result: Result, where: str) -> None:
+        """Count one more result of something that was counted before."""
+        self.num_subjects -= 1
+        self.add([result], where)
+
+    def of(self, *levels: Level) -> list[tuple[Result, str]]:
+        """The worst results that have one of these levels, level by level, and what each was found in."""
+        return [item for level in levels for item in self.worst.values() if item[0].level == level]
+
+
+def add_judged(summaries: CheckSummaries, judged: Iterable[EpisodeResult]) -> None:
+    """Count what the doctor found."""
+    for episode, result in judged:
+        summaries.count(result, "the whole set" if episode is None else f"episode {episode}")
+
+
+def _rank(result: Result) -> tuple[int, float]:
+    unknown = float("inf") if result.level == "fail" else float("-inf")
+    return LEVELS.index(result.level), unknown if result.value is None else result.value
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Report:
+    """Everything that a page shows.
+
+    Attributes:
+        title: Name of the run, recording or dataset.
+        kind: What it is, in words.
+        facts: (name, value) of the summary.
+        episodes: Every attempt, in order.
+        distributions: Of actions and states.
+        has_units: Whether their components have demorec's names, and so known units.
+        checks: None when no checks were run.
+        missing: Sentences about what the source does not contain.
+    """
+
+    title: str
+    kind: str
+    facts: tuple[tuple[str, str], ...]
+    episodes: tuple[ReportedEpisode, ...]
+    distributions: Components
+    has_units: bool
+    checks: CheckSummaries | None
+    missing: tuple[str, ...]
+
+
+def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:
+    """Over the attempts whose outcome is known."""
+    known = [episode.success for episode in episodes if episode.success is not None]
+    return Rate(successes=sum(known), trials=len(known))
+
+
+def common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) -> Iterator[tuple[str, str]]:
+    """Facts that recordings and datasets share; of the size, their files."""
+    rate = success_rate(episodes)
+    if rate.trials:
+        yield "success", f"{rate}"
+    seconds = sum(episode.num_frames / episode.fps for episode in episodes)
+    unit, factor = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
+    rates = few(f"{episode.fps} Hz" for episode in episodes if episode.num_frames)
+    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds / factor:.1f} {unit} at {rates})"
+    size = sum(file.stat().st_size for file in files)
+    yield "size", f"{size / 1000:.0f} kB" if size < 1_000_000 else f"{size / 1e6:.1f} MB"
+
+
+def few(values: Iterable[str]) -> str:
+    """The first three distinct values."""
+    distinct = list(dict.fromkeys(values))
+    return (", ".join(distinct[:3]) + (", ..." if len(distinct) > 3 else "")) or "unknown"

@@ -1,1 +1,0 @@
-"""Policies: evaluation in held-out scenes, and correction by the expert."""
