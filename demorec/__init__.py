@@ -11,7 +11,7 @@ __all__ = ["Recorder"]
 
 
 def __getattr__(name: str) -> Any:
-    """`from demorec import Recorder`, without loading the recorder for those who do not ask for it."""
+    """Load `Recorder` for `from demorec import Recorder`; other imports do not pay for it."""
     if name == "Recorder":
         from demorec.mcap.recorder import Recorder
 

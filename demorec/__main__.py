@@ -1,7 +1,7 @@
 """Entry points of the programs `demorec` and `generate-dataset`, and of `python -m demorec`.
 
-Commands that read files continue in a limited child process, forked before anything heavy is imported. Ctrl-C while
-the command line loads, a third of a second, is an exit code.
+Commands that read files continue in a limited child process, forked before any heavy import. Ctrl-C while the command
+line loads (about 0.3 s) gives an exit code.
 """
 
 from __future__ import annotations
@@ -10,12 +10,12 @@ import sys
 
 
 def main() -> None:
-    """`demorec`."""
+    """Run `demorec`."""
     _start("main", is_limited=True)
 
 
 def generate_dataset() -> None:
-    """`generate-dataset`."""
+    """Run `generate-dataset`."""
     _start("generate_dataset_main", is_limited=False)
 
 

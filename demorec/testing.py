@@ -1,4 +1,4 @@
-"""What every task and every robot must hold, as tests for pytest; somebody's own runs them in three lines:
+"""Contracts of every task and every robot, as pytest tests. Custom ones run them in three lines:
 
 from demorec.testing import RobotContract, TaskContract
 
@@ -44,15 +44,15 @@ __all__ = ["RobotContract", "TaskContract"]
 
 
 class TaskContract:
-    """Layouts, words, success and recordings of one task with one robot, without images.
+    """Layouts, instructions, success and recordings of one task with one robot, without images.
 
     Attributes:
         task: Name of a row of `demorec list tasks`, or "package.module:Name".
-        robot: The same of a robot.
-        seed: Root of all episodes.
-        num_layouts: How many are drawn and looked at.
-        num_episodes: How many the expert tries.
-        min_success: Least share of them that must succeed at the first try.
+        robot: Name of a row of `demorec list robots`, or "package.module:NAME".
+        seed: Root seed of all episodes.
+        num_layouts: Number of layouts to draw and examine.
+        num_episodes: Number of episodes that the expert attempts.
+        min_success: Minimum ratio of episodes that succeed at the first attempt.
     """
 
     task: ClassVar[str]
@@ -63,11 +63,11 @@ class TaskContract:
     min_success: ClassVar[float] = 0.9
 
     def test_scenes_and_words_follow_from_the_plan_alone(self) -> None:
-        """The same plan gives the same description, another episode or attempt gives another scene."""
+        """Check that equal plans give equal descriptions, and another episode or attempt another scene."""
         infos = [self._episode(index).info for index in range(4)]
         for index, info in enumerate(infos):
             again = self._episode(index).info
-            assert again == info, f"episode {index} is another when it is drawn again: is everything drawn from rng?"
+            assert again == info, f"episode {index} differs when it is drawn again: is everything drawn from rng?"
         for first, second in itertools.combinations(infos, 2):
             assert first.simulated.scene != second.simulated.scene, "two episodes have the same scene"
         assert self._episode(2, attempt=1).info.simulated.scene != infos[2].simulated.scene, (
@@ -75,16 +75,16 @@ class TaskContract:
         )
 
     def test_scenes_come_back_from_their_description(self) -> None:
-        """A recording's metadata rebuild the scene; it has goals, all for movable bodies, and an instruction."""
+        """Rebuild the scene from a recording's metadata; it has an instruction, and goals for movable bodies only."""
         for index in range(self.num_layouts):
             info = self._episode(index).info
-            assert read_episode_info(to_json(info)) == info, f"episode {index} is another when it is read back"
+            assert read_episode_info(to_json(info)) == info, f"episode {index} differs when it is read back"
             assert info.simulated.scene.goals, f"episode {index} has no goal"
             assert info.instruction.strip(), f"episode {index} has no instruction"
             assert info.instruction.isprintable(), f"the instruction of episode {index} is not one line of text"
 
     def test_objects_stand_apart(self) -> None:
-        """No two movable bodies that stand on the table are in each other."""
+        """Check that no two movable bodies on the table overlap."""
         for index in range(self.num_layouts):
             movable = self._episode(index).info.simulated.scene.movable
             standing = [body for body in movable if body.world_from_body.position[2] < 0.05]
@@ -94,7 +94,7 @@ class TaskContract:
                 assert gap > reach, f"{a.name} and {b.name} of episode {index} are {gap:.3f} m apart"
 
     def test_objects_and_goals_are_within_reach(self) -> None:
-        """The hand, pointing down, gets to where each object is and to where it shall be, at one yaw at least."""
+        """Check that the hand, pointing down, reaches each object and its target at one yaw at least."""
         for index in range(self.num_layouts):
             info = self._episode(index).info
             for goal in info.simulated.scene.goals:
@@ -104,7 +104,7 @@ class TaskContract:
                     assert _is_within_reach(info, at), f"the {what} of {goal.object} of episode {index}, {at}"
 
     def test_doing_nothing_is_a_failure(self) -> None:
-        """The conditions of success do not hold at the start, so they cannot hold by chance."""
+        """Check that the success conditions do not hold at the start, so that they cannot hold by chance."""
         episode = self._episode(0)
         with make_world(episode.info) as world:
             world.reset(episode.info.simulated.scene)
@@ -113,7 +113,7 @@ class TaskContract:
         assert not all(check.passed for check in checks), "the task is done before anything has moved"
 
     def test_the_expert_succeeds(self) -> None:
-        """Strictly, at the first try, in most episodes."""
+        """Check that the expert strictly succeeds at the first attempt in most episodes."""
         outcomes = [run_expert(self.task, self.robot, self.seed, index)[1] for index in range(self.num_episodes)]
         failed = [
             f"{index}: {outcome.failure_reason} in phase {outcome.failure_phase}"
@@ -124,7 +124,7 @@ class TaskContract:
         assert share >= self.min_success, f"{share:.0%} of {self.num_episodes} episodes succeed; {'; '.join(failed)}"
 
     def test_commands_stay_within_the_limits_of_the_robot(self) -> None:
-        """Joint positions and velocities that the expert asks for, and the opening of the gripper."""
+        """Check the expert's joint positions and velocities, and the gripper opening."""
         robot = self._episode(0).info.simulated.robot
         frames, _ = run_expert(self.task, self.robot, self.seed, 0)
         targets = np.array([frame.action.joint_target for frame in frames])
@@ -132,14 +132,14 @@ class TaskContract:
         speeds = np.abs(np.diff(targets, axis=0)) * self._episode(0).info.fps
         for joint, name in enumerate(robot.arm_joints):
             low, high = robot.position_lower[joint], robot.position_upper[joint]
-            assert low - 1e-9 <= targets[:, joint].min(), f"{name} is sent below its limit"
-            assert targets[:, joint].max() <= high + 1e-9, f"{name} is sent above its limit"
+            assert low - 1e-9 <= targets[:, joint].min(), f"{name} is commanded below its limit"
+            assert targets[:, joint].max() <= high + 1e-9, f"{name} is commanded above its limit"
             assert speeds[:, joint].max() <= robot.velocity_limit[joint] * (1 + 1e-9), f"{name} is sent too fast"
-        assert widths.min() >= 0, "the gripper is told a negative opening"
-        assert widths.max() <= robot.gripper.max_width + 1e-9, "the gripper is told to open wider than it can"
+        assert widths.min() >= 0, "the gripper command is negative"
+        assert widths.max() <= robot.gripper.max_width + 1e-9, "the gripper command exceeds its maximum opening"
 
     def test_an_episode_repeats_to_the_bit(self) -> None:
-        """The script draws nothing of its own and leaves nothing behind: in a used world all is as in a fresh one."""
+        """Check that the script has no other source of randomness and leaves no state behind in a used world."""
         frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
         episode = self._episode(0)
         with make_world(episode.info) as world:
@@ -149,14 +149,14 @@ class TaskContract:
         assert session.outcome == outcome, "the outcome differs when the episode is run again"
         for old, new in zip(frames, again, strict=True):
             assert np.array_equal(old.command.joint_target, new.command.joint_target), (
-                f"another command at frame {old.frame_index} when the episode is run again"
+                f"the command at frame {old.frame_index} differs when the episode is run again"
             )
             assert np.array_equal(old.observation.joint_position, new.observation.joint_position), (
-                f"the arm is elsewhere at frame {old.frame_index} when the episode is run again"
+                f"the arm's position at frame {old.frame_index} differs when the episode is run again"
             )
 
     def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
-        """`demorec check` finds no fault, and the recorded commands do the task again."""
+        """Check that `demorec check` finds no fault, and that replaying the commands repeats the task."""
         frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
         path, allowed = tmp_path / "episode_000000.mcap", modules_of([self.task, self.robot])
         with EpisodeWriter(path, self._episode(0).info) as writer:
@@ -169,25 +169,25 @@ class TaskContract:
         options = ReplayOptions(allowed=allowed)
         ((replayed, _),) = replay_all([open_file(path, options)], options)
         assert replayed.is_identical, f"the replay differs: {replayed.first_difference}"
-        assert replayed.success == outcome.success, "the replay ends otherwise"
+        assert replayed.success == outcome.success, "the replay has a different outcome"
 
     def _episode(self, index: int, *, attempt: int = 0) -> PreparedEpisode:
         return prepare(replace(plan_of(self.task, self.robot, self.seed, index), attempt=attempt))
 
 
 class RobotContract:
-    """That a robot's description fits its URDF, and that the arm does the job of the tasks.
+    """Agreement of a robot's description with its URDF, and the arm's ability to do the tasks.
 
     Attributes:
         robot: Name of a row of `demorec list robots`, or "package.module:NAME".
-        seed: Root of the episode of pick_place that it makes.
+        seed: Root seed of the test's pick_place episode.
     """
 
     robot: ClassVar[str]
     seed: ClassVar[int] = 0
 
     def test_the_spec_names_what_the_urdf_has(self) -> None:
-        """Links and joints are there, of the right kinds, with limits within the URDF's."""
+        """Check that links and joints exist, are of the right kinds, and have limits within the URDF's."""
         spec = self._spec()
         text = asset_path(spec.urdf).read_text()
         urdf = Urdf.parse(text)
@@ -198,10 +198,10 @@ class RobotContract:
             widest = spec.gripper.joint_position(spec.gripper.max_width).tolist()
             for name, position in zip(spec.gripper.joints, widest, strict=True):
                 assert math.isclose(joints[name].upper, position), f"{name} at full opening is {position}"
-        assert from_json(to_json(spec), RobotSpec) == spec, "the spec is another when it is read back from a file"
+        assert from_json(to_json(spec), RobotSpec) == spec, "the spec differs when it is read back from a file"
 
     def test_home_points_the_hand_down_with_the_fingers_across(self) -> None:
-        """The rest configuration holds the hand upright over the table ahead."""
+        """Check that the hand is upright over the table ahead in the rest configuration."""
         spec = self._spec()
         pose = arm_kinematics(spec).forward(np.array(spec.home_q))
         off = np.abs(pose.rotation - hand_down((0, 0, 0), 0.0).rotation).max()
@@ -210,25 +210,25 @@ class RobotContract:
         assert abs(pose.position[1]) < 0.015, f"the hand at home_q is {pose.position[1]:.2f} m to the side"
 
     def test_the_fingers_move_along_y_of_the_tcp_and_reach_as_far_as_the_spec_says(self) -> None:
-        """Their boxes in the simulator, opened as tasks open them."""
+        """Check the fingers' boxes in the simulator, opened as tasks open them."""
         spec = self._spec()
         gripper, fingers = spec.gripper, finger_boxes(spec)
-        assert np.abs(fingers.centres[:, 0]).max() < 0.01, "a finger is beside the TCP's y axis"
+        assert np.abs(fingers.centres[:, 0]).max() < 0.01, "a finger is off the TCP's y axis"
         if isinstance(gripper, ParallelGripper):
             half = gripper.open_width / 2
             for y in np.abs(fingers.centres[:, 1]):
                 assert half - 0.005 < y < half + 0.025, f"a finger is {y:.3f} m from the TCP"
-        # PyBullet's boxes are some millimetres too large.
+        # PyBullet's boxes are a few millimetres too large.
         depth = fingers.depth
         assert abs(depth - gripper.finger_depth) < 0.005, f"the finger tips reach {depth:.3f} m beyond the TCP"
 
     def test_the_workspace_is_within_reach(self) -> None:
-        """The hand down at one of a grasp's two yaws, wherever tasks put objects, up to 22 cm above the table."""
+        """Check that the hand, pointing down at one of a grasp's two yaws, reaches the objects up to 22 cm high."""
         unreachable = unreachable_poses(self._spec())
         assert not unreachable, unreachable[0]
 
     def test_it_picks_and_places(self) -> None:
-        """One episode of pick_place succeeds."""
+        """Check that one episode of pick_place succeeds."""
         _, outcome = run_expert("pick_place", self.robot, self.seed, 0)
         assert outcome.success, f"{outcome.failure_reason} in phase {outcome.failure_phase}"
 
@@ -239,16 +239,16 @@ class RobotContract:
 
 
 def plan_of(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
-    """An episode's plan, without images."""
+    """Return an episode's plan, without images."""
     config = GenerateConfig(task=task, robot=robot, seed=seed, cameras=())
     config.validate()
     return EpisodePlan(config=config, episode_index=index)
 
 
-# The tests of a class come one after the other: what one has simulated, the next ones need not.
+# The tests of a class run in sequence and share simulated episodes.
 @lru_cache(maxsize=16)
 def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Frame, ...], Outcome]:
-    """All frames of an episode, and its outcome."""
+    """Simulate an episode; returns all frames and the outcome."""
     episode = prepare(plan_of(task, robot, seed, index))
     with make_world(episode.info) as world:
         session = Session.of_episode(world, episode)
@@ -257,7 +257,7 @@ def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Fram
 
 
 def _is_within_reach(info: EpisodeInfo, point: list[float]) -> bool:
-    """Whether the TCP gets to a point of the world (3,), metres, with the hand pointing down."""
+    """Check whether the TCP reaches a point in the world (3,), metres, with the hand pointing down."""
     base_from_world = info.simulated.scene.robot.world_from_base.inverse()
     arm = arm_kinematics(info.simulated.robot, scale=info.simulated.scene.robot.scale)
     start = np.array(info.simulated.robot.home_q)

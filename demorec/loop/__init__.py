@@ -1,4 +1,4 @@
-"""The closed loop, the only place that steps a world: an agent says what to do, a session does it and gives frames.
+"""The closed loop, the only place that steps a world: an agent decides, a session executes and yields frames.
 
     episode = prepare(EpisodePlan(config=GenerateConfig(), episode_index=0))  # info, task, behaviour; no simulator
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:  # both reusable
@@ -7,8 +7,8 @@
             print(frame.frame_index, frame.phase, frame.observation.gripper_width)
         print(session.outcome)
 
-Generating, replaying and the gymnasium environment, through which policies are evaluated, are its callers. An episode
-is a pure function of its plan: whatever ran before in the same world, on any worker, the bits are equal.
+Its callers are generation, replay and the gymnasium environment that evaluates policies. An episode is a pure function
+of its plan: its bits depend neither on the worker nor on earlier runs in the same world.
 """
 
 from demorec.loop.prepare import PreparedEpisode, SimulatorCache, load_task, make_renderer, make_world, prepare

@@ -1,4 +1,4 @@
-"""From what a policy says to what the motors get: the inverse of `demorec.episode.features.action_vectors`."""
+"""Decoding of actions into motor commands: the inverse of `demorec.episode.features.action_vectors`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from demorec.sim.world import World
 ACTION_KINDS: tuple[ActionKind, ...] = get_args(ActionKind)
 
 NULL_GAIN = 0.05
-"""Pull of the elbow towards where the expert has it, when a policy commands poses."""
+"""Gain that pulls the elbow towards the expert's posture while a policy commands poses."""
 
 
 def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Array, Array]:
-    """Lowest and highest value (D,) of every component of an action; units as of `features.action_vectors`."""
+    """Lower and upper bound (D,) of each component of an action; units as in `features.action_vectors`."""
     if kind == "joint":
         low, high = np.array(robot.position_lower), np.array(robot.position_upper)
     elif kind == "joint_increment":
@@ -31,27 +31,27 @@ def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Arra
         high = np.array([2.0] * 3 + [1.0] * 4)
         low = -high
     else:
-        # 2 m/s and pi rad/s are more than the arm can follow.
+        # The arm cannot follow 2 m/s or pi rad/s.
         high = np.array([2.0] * 3 + [math.pi] * 3) / fps
         low = -high
     return np.append(low, 0.0), np.append(high, robot.gripper.max_width)
 
 
 class ActionDecoder:
-    """Turns the actions of one episode into commands, from the world's present targets on.
+    """Decoder of one episode's actions into commands, starting from the world's current targets.
 
-    For a pose out of reach the last joint targets stay.
+    An unreachable pose keeps the last joint targets.
 
     Args:
         world: At the episode's start.
-        kind: What the actions mean (`demorec.episode.features.action_vectors`).
-        is_limited: True for what a policy says: every command is held within the joint limits in position and velocity
-            (from the last command) and the gripper within its opening, the elbow is pulled towards where the expert
-            has it, and deltas go on from the last pose that was reached. False for recorded actions, which are sent as
-            they are, so that a replay shows what they do.
+        kind: Meaning of the actions (`demorec.episode.features.action_vectors`).
+        is_limited: True for a policy's actions: each command is clamped to the joint limits in position and velocity
+            (from the last command) and to the gripper's opening, the elbow is pulled towards the expert's posture, and
+            deltas continue from the last pose that was reached. False for recorded actions, which are sent unchanged so
+            that a replay shows their effect.
 
     Attributes:
-        num_unreachable: Poses that inverse kinematics has not reached so far.
+        num_unreachable: Poses that inverse kinematics has failed to reach.
     """
 
     def __init__(self, world: World, kind: ActionKind, *, is_limited: bool = True) -> None:
@@ -64,7 +64,7 @@ class ActionDecoder:
         self._given: Action | None = None
 
     def command(self, values: Array) -> Action:
-        """The command for an action (D,), float64."""
+        """Decode an action (D,), float64, into a command."""
         wanted, gripper = self._wanted(values), float(values[-1])
         if self._is_limited:
             wanted = np.clip(wanted, self._kinematics.lower, self._kinematics.upper)
@@ -75,7 +75,7 @@ class ActionDecoder:
         return self._given
 
     def follow(self, command: Action) -> None:
-        """Go on from a command that somebody else has sent; nothing changes after one that was decoded here."""
+        """Continue from a command that another source sent; after a command decoded here, nothing changes."""
         if command is not self._given:
             self._joint_target, self._tcp_target = command.joint_target, command.base_from_tcp_target
 
@@ -101,7 +101,7 @@ class ActionDecoder:
 
 
 def _pose(values: Array, *, otherwise: Pose) -> Pose:
-    """Position and quaternion of any length; the given pose where the quaternion is (nearly) zero."""
+    """Build a pose from a position and a quaternion of any length; `otherwise` if the quaternion is (nearly) zero."""
     length = math.sqrt(float((values[3:7] * values[3:7]).sum()))
     if length < 1e-3:
         return otherwise

@@ -1,4 +1,4 @@
-"""An `EpisodePlan` becomes an episode: scene, words and behaviour, and the world and renderer that it needs."""
+"""Preparation of an `EpisodePlan`: scene, instruction and behaviour, and the world and renderer to run it."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from demorec.tasks.vary import calibration_errors, draw_behaviour, moved_camera,
 
 EVAL_SEED_OFFSET = 2**63
 MAX_LAYOUTS = 10
-"""How many layouts are drawn at most until the arm reaches all that is asked of it."""
+"""Maximum number of layouts drawn until the arm reaches everything that the task requires."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +42,12 @@ class PreparedEpisode:
     """One attempt at one episode, ready to run.
 
     Attributes:
-        plan: What it was made from.
-        info: What is recorded about it.
+        plan: Plan of the attempt.
+        info: Recorded description of the episode.
         task: The task.
-        behaviour: How the expert does it.
-        cameras: Where the cameras really are: `info.simulated.scene.cameras` holds the same with the calibration error.
-        true_from_recorded: Camera name -> calibration error, of the cameras that have one.
+        behaviour: Variation in how the expert does it.
+        cameras: True camera poses; `info.simulated.scene.cameras` has them with the calibration error.
+        true_from_recorded: Camera name -> calibration error; only cameras that have one.
     """
 
     plan: EpisodePlan
@@ -58,12 +58,12 @@ class PreparedEpisode:
     true_from_recorded: Mapping[str, Pose] = field(default_factory=dict)
 
     def rng(self, purpose: Purpose) -> np.random.Generator:
-        """A fresh stream of this attempt."""
+        """Start a fresh random stream of this attempt."""
         return _rng(self.plan, purpose)
 
 
 def _root_seed(config: GenerateConfig) -> int:
-    """Seeds of the eval split lie beyond all that a user can give, so that no training episode shares one."""
+    """Offset the seeds of the eval split beyond all valid user seeds, so that no training episode shares one."""
     return config.seed + (EVAL_SEED_OFFSET if config.split == "eval" else 0)
 
 
@@ -74,28 +74,28 @@ def _rng(plan: EpisodePlan, purpose: Purpose) -> np.random.Generator:
 
 
 def load_task(config: GenerateConfig) -> type[Task]:
-    """The task that a config names.
+    """Load the task that a config names.
 
     Raises:
-        ConfigError: There is none of that name, it cannot be imported, the config asks for what it does not have, or
-            the robot cannot do it.
+        ConfigError: The name is unknown, it cannot be imported, the task lacks a requested feature, or the robot cannot
+            do it.
     """
     task: type[Task] = TASKS.load(config.task, config.modules)
     if config.fixed and not task.has_fixed_layout:
         raise ConfigError(f"--fixed was given, but the task {config.task!r} has no fixed layout: leave it out.")
     if (config.objects or config.object_split != "all") and not task.shelves:
         flag = "--objects" if config.objects else "--object-split"
-        raise ConfigError(f"{flag} was given, but the task {config.task!r} has things of its own: leave it out.")
+        raise ConfigError(f"{flag} was given, but the task {config.task!r} defines its own objects: leave it out.")
     if why := task.refusal(load_robot(config.robot, config.modules)):
         raise ConfigError(f"The robot {config.robot!r} cannot do the task {config.task!r}: {why}; choose another.")
     return task
 
 
 def prepare(plan: EpisodePlan) -> PreparedEpisode:
-    """Draw an episode's scene, words and behaviour; a pure function of the plan, without a simulator.
+    """Draw an episode's scene, instruction and behaviour; a pure function of the plan, without a simulator.
 
-    Imports the user's own modules that the plan's config names: one that was read from a file must have passed
-    `GenerateConfig.check_names` before.
+    Imports the user modules that the plan's config names: a config read from a file must have passed
+    `GenerateConfig.check_names` first.
 
     Raises:
         ConfigError: As `load_task`.
@@ -146,7 +146,7 @@ def prepare(plan: EpisodePlan) -> PreparedEpisode:
 
 
 def _layout(plan: EpisodePlan, robot: RobotSpec, ranges: Ranges, task: Task, behaviour: Behaviour) -> Scene:
-    """The first layout that the arm can serve, with its physics, or the last one: there the expert says why not."""
+    """Draw layouts, with physics, until the arm can serve one; else return the last, where the expert fails."""
     config, sampler = plan.config, _sampler(plan, ranges, task)
     for _ in range(MAX_LAYOUTS):
         scene = task.sample_scene(robot, sampler)
@@ -165,14 +165,14 @@ def _layout(plan: EpisodePlan, robot: RobotSpec, ranges: Ranges, task: Task, beh
 
 
 def _cameras(task: Task, robot: RobotSpec, config: GenerateConfig) -> Iterator[SceneCamera]:
-    """The cameras that the config names, the task's own before those that everybody has."""
+    """Yield the cameras that the config names, the task's own before the shared ones."""
     for name in config.cameras:
         preset = task.camera_presets.get(name) or CAMERAS.load(name, config.modules)
         yield preset.camera(camera_name(name), robot, width=config.width, height=config.height)
 
 
 def _with_model_names(scene: Scene, module: str) -> Scene:
-    """The scene of a task of the user's own, its models named as recordings name them."""
+    """Rename the models in the scene of a user's task to the names that recordings use."""
     shapes = [
         replace(body.shape, file=model_name(body.shape.file, module)) if body.shape.file else body.shape
         for body in scene.bodies
@@ -182,7 +182,7 @@ def _with_model_names(scene: Scene, module: str) -> Scene:
 
 def _sampler(plan: EpisodePlan, ranges: Ranges, task: Task) -> Sampler:
     config = plan.config
-    # Another attempt would only fail at the same point again.
+    # A later attempt with the same method would fail at the same point again.
     method = config.sampling if plan.attempt == 0 else "random"
     point = stratified_point(
         method, root_seed=_root_seed(config), episode_index=plan.episode_index, block=config.sampling_block
@@ -199,16 +199,16 @@ def _sampler(plan: EpisodePlan, ranges: Ranges, task: Task) -> Sampler:
 
 
 def make_world(info: EpisodeInfo) -> World:
-    """An empty world for episodes like this one (same robot, rates and joint sampling)."""
+    """Create an empty world for episodes like this one (same robot, rates and joint sampling)."""
     return World(info.simulated.robot, fps=info.fps, sample_joints=info.simulated.config.get("joint_rate") == "physics")
 
 
 def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
-    """The renderer that an episode's config names, or None without cameras; a context manager either way.
+    """Create the renderer that an episode's config names, or None without cameras; a context manager in both cases.
 
     Raises:
-        ConfigError: An unknown renderer.
-        MissingDependencyError, RenderError: It cannot work on this machine.
+        ConfigError: Unknown renderer.
+        MissingDependencyError, RenderError: It does not work on this machine.
     """
     if not info.simulated.scene.cameras:
         return nullcontext(None)
@@ -216,7 +216,7 @@ def make_renderer(info: EpisodeInfo) -> AbstractContextManager[Renderer | None]:
 
 
 class SimulatorCache:
-    """Makes world and renderer for the first episode, and others only for one that needs others; `close` frees both."""
+    """World and renderer reused across episodes, remade only for one that needs different ones; `close` frees both."""
 
     def __init__(self) -> None:
         self._world: World | None = None
@@ -229,11 +229,11 @@ class SimulatorCache:
         return self._world is not None
 
     def acquire(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
-        """A world and a renderer (None without cameras) for episodes like this one; the present ones where they fit.
+        """Return a world and a renderer (None without cameras) for this kind of episode, reusing the current ones.
 
         Raises:
-            ConfigError: An unknown renderer.
-            MissingDependencyError, RenderError: It cannot work on this machine.
+            ConfigError: Unknown renderer.
+            MissingDependencyError, RenderError: It does not work on this machine.
         """
         key = (info.simulated.robot, info.fps, info.simulated.config.get("joint_rate"))
         if self._world is None or key != self._key:
@@ -244,7 +244,7 @@ class SimulatorCache:
         return self._world, renderer
 
     def close(self) -> None:
-        """Free both; harmless when called twice."""
+        """Free both; safe to call twice."""
         self._renderers.close()
         if self._world is not None:
             self._world.close()

@@ -1,6 +1,6 @@
-"""One episode in a simulated world, step by step: an agent says what to do, a session does it.
+"""One episode in a simulated world, step by step: an agent decides, a session executes.
 
-The agent of demonstrations follows a task's script; exploration noise is on its commands.
+The agent of demonstrations follows a task's script, with exploration noise on its commands.
 """
 
 from __future__ import annotations
@@ -35,34 +35,34 @@ from demorec.tasks.skills import Expert
 
 
 class Agent(Protocol):
-    """Acts in a run of a session."""
+    """Source of decisions in a run of a session."""
 
     @property
     def num_retries(self) -> int:
-        """How often something had to be tried again."""
+        """Number of repeated attempts at a step."""
 
     def decide(self, world: World) -> Iterator[Step]:
-        """What to do, step by step, from a reset world on; the world has advanced when the iterator resumes."""
+        """Yield decisions step by step from a reset world; the world has advanced when the iterator resumes."""
 
     def failure(self, failed: Sequence[str]) -> tuple[str, str]:
-        """Phase and reason of a failure, ("", "") for a success.
+        """Return phase and reason of a failure; ("", "") for a success.
 
         Args:
-            failed: Names of the task's conditions that do not hold in the end.
+            failed: Names of the task's conditions that do not hold at the end.
         """
 
 
 class Session:
-    """Resets a world, steps it, and tells what is seen; nothing else does.
+    """The only component that resets a world, steps it and observes it.
 
-    `run` lets an agent act until it is done. A caller that acts from outside, as gymnasium's does, calls `reset`, then
-    `frame` and `step` in turn.
+    `run` lets an agent act until it is done. A caller that acts from outside, such as gymnasium, calls `reset`, then
+    alternates `frame` and `step`.
 
     Args:
-        world: Of the scene's robot; left open.
-        scene: What the world is reset to.
-        task: Whose conditions are judged; None for none.
-        painter: For the images, or None.
+        world: World with the scene's robot; not closed by the session.
+        scene: Scene that each reset builds.
+        task: Task that provides the success conditions, or None.
+        painter: Source of the images, or None.
         max_frames: Time limit of `run`; None: until the agent is done.
 
     Attributes:
@@ -90,9 +90,9 @@ class Session:
     def of_episode(
         cls, world: World, episode: PreparedEpisode, renderer: Renderer | None = None, *, only_color: bool = False
     ) -> Self:
-        """A session of a prepared episode with its cameras and time limit; without a renderer it has no images.
+        """Create a session of a prepared episode with its cameras and time limit; images need a renderer.
 
-        `only_color` leaves out the depth and the segmentation that its config asks for.
+        `only_color` omits the depth and segmentation images that the config requests.
         """
         config = episode.plan.config
         painter = None
@@ -110,27 +110,27 @@ class Session:
 
     @property
     def observation(self) -> Observation:
-        """What is sensed now."""
+        """Current observation."""
         if self._observation is None:
             self._observation = self.world.observe()
         return self._observation
 
     @property
     def images(self) -> Mapping[str, CameraImages]:
-        """Camera name -> images now; RenderError when something cannot be drawn."""
+        """Camera name -> current images; RenderError if a camera or body cannot be drawn."""
         if self._images is None:
             self._images = {} if self._painter is None else self._painter.images()
         return self._images
 
     @property
     def outcome(self) -> Outcome:
-        """How the last run ended; RuntimeError before its end."""
+        """Outcome of the last run; RuntimeError before its end."""
         if self._outcome is None:
             raise RuntimeError("the episode has not ended: take all frames of the run first")
         return self._outcome
 
     def checks(self) -> tuple[SuccessCheck, ...]:
-        """The task's conditions with the values found now."""
+        """The task's conditions with their current values."""
         return () if self._task is None else self._task.evaluate(self.world)
 
     def run(self, agent: Agent) -> Iterator[Frame]:
@@ -161,7 +161,7 @@ class Session:
         )
 
     def reset(self) -> None:
-        """Build the scene anew; errors as `run`."""
+        """Rebuild the scene; raises as `run`."""
         self.world.reset(self._scene)
         if self._painter is not None:
             self._painter.setup(self.world)
@@ -169,7 +169,7 @@ class Session:
         self._arrive(0)
 
     def frame(self, step: Step) -> Frame:
-        """The present frame: what is seen now, and what the agent does about it."""
+        """Return the current frame: the observation, and the agent's decision."""
         return Frame(
             frame_index=self.frame_index,
             time_ns=frame_time_ns(self.frame_index, self.world.fps),
@@ -189,7 +189,7 @@ class Session:
         self._arrive(self.frame_index + 1)
 
     def place(self, frame_index: int, *, joint_position: Array, object_poses: Mapping[str, Pose]) -> None:
-        """Put the world where a recording has it at a frame, without physics; arguments as of `World.set_state`."""
+        """Set the world to a recorded frame, without physics; arguments as in `World.set_state`."""
         self.world.set_state(joint_position=joint_position, object_poses=object_poses)
         self._arrive(frame_index)
 
@@ -199,12 +199,12 @@ class Session:
 
 
 class ActionNoise:
-    """Ornstein-Uhlenbeck noise on the executed joint targets; nothing is added except in free motion.
+    """Ornstein-Uhlenbeck noise on the executed joint targets, added in free motion only.
 
     The label stays clean, so that a policy learns how to come back (DART, Laskey et al. 2017,
-    https://arxiv.org/abs/1703.09327). The noise lets go at the same rate whether more is added or not
-    (`demorec.episode.features.NOISE_DECAY`), so that there is one way back from it, which increments of the command can
-    hold. Every command stays within the joint limits in position and velocity.
+    https://arxiv.org/abs/1703.09327). The noise decays at the same rate whether more is added or not
+    (`demorec.episode.features.NOISE_DECAY`): the return from it is unique, which increments of the command can express.
+    Every command stays within the joint limits in position and velocity.
     """
 
     def __init__(self, world: World, *, sigma: float, rng: np.random.Generator, fps: int) -> None:
@@ -216,7 +216,7 @@ class ActionNoise:
         self._last: Array = world.arm.target.copy()
 
     def command(self, step: Step) -> Action:
-        """What is sent to the motors for a step: its clean action plus the noise."""
+        """Return the command sent to the motors for a step: its clean action plus the noise."""
         if self._sigma == 0.0:
             return step.action
         drawn = self._rng.normal(0.0, self._sigma, len(self._noise))
@@ -231,7 +231,7 @@ class ActionNoise:
 
 
 class ScriptAgent:
-    """The expert, who follows the task's script; exploration noise is on the commands, never on the labels."""
+    """The expert, which follows the task's script; exploration noise is on the commands, never on the labels."""
 
     def __init__(self, episode: PreparedEpisode) -> None:
         self._episode = episode
@@ -252,9 +252,9 @@ class ScriptAgent:
             yield replace(step, command=noise.command(step))
 
     def _steps(self, expert: Expert) -> Iterator[Step]:
-        """The script; when the expert gives up, one step more, which carries the events that say why.
+        """Yield the script's steps; when the expert gives up, one more step with the events that explain why.
 
-        It goes on only as long as the hand does what a real one could: a demonstration that crushes things is none.
+        Stops when the hand presses harder than a real one could: a demonstration that crushes objects is invalid.
         """
         try:
             for step in self._episode.task.script(expert):

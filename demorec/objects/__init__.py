@@ -1,1 +1,1 @@
-"""Things to handle: shelves of shapes, and where a gripper takes hold of any of them."""
+"""Objects to handle: sets of shapes, and grasps for any of them."""

@@ -1,9 +1,9 @@
-"""Where a gripper that comes from above takes hold of a solid, from its mesh alone.
+"""Grasps of a solid for a gripper that comes from above, computed from its mesh alone.
 
-Points are drawn from the surface where it is steep; at each one the fingers close along its normal. What they would
-touch first is looked up in a cloud of surface points, within the strip that a finger's pad sweeps: both contacts have
-to face the fingers (friction holds nothing steeper), across a width that fits, with no other part of the solid where
-the open fingers come down or where the palm is.
+Points are sampled on the steep parts of the surface; at each one the fingers close along the normal. The first contact
+is looked up in a cloud of surface points, within the strip that a finger's pad sweeps. Both contacts must face the
+fingers (friction cannot hold steeper ones) across a width that fits, and no other part of the solid may be where the
+open fingers descend or where the palm is.
 """
 
 from __future__ import annotations
@@ -21,36 +21,35 @@ from demorec.robots.robot import Gripper
 CANDIDATES = 300
 CLOUD = 3000
 KEPT = 40
-"""Grasps, the best of all."""
+"""Number of grasps kept, best first."""
 PAD = 0.010
 """Half the width of a finger's pad, metres."""
 FINGER = 0.015
-"""Half the width of a finger, and what it has to be clear of, metres."""
+"""Half the width of a finger including its clearance, metres."""
 PAD_ABOVE = 0.010
-"""How far the pad reaches above the TCP, metres."""
+"""Height of the pad above the TCP, metres."""
 _SKIN = 0.0015
-"""Surface points that are so near to the outermost one touch the finger, metres."""
+"""Maximum distance behind the outermost surface point at which a point still touches the finger, metres."""
 LEAST_FACING = math.cos(math.radians(25.0))
-"""Cosine of the angle between a finger's motion and what it touches, in the mean."""
+"""Minimum mean cosine of the angle between a finger's motion and the inward contact normals."""
 TIP_CLEARANCE = 0.005
-"""Air between the finger tips and the support, metres (of an arm of task_scale 1)."""
+"""Gap between the finger tips and the support, metres (for an arm of task_scale 1)."""
 LEAST_WIDTH = 0.015
-"""Of what is gripped, beyond the closed gripper's own, metres (of such an arm): the expert takes anything narrower for
-an empty hand."""
+"""Minimum gripped width beyond the closed gripper's, metres (for such an arm); below it, the hand counts as empty."""
 PLAY = 0.01
-"""How much narrower than the opening what is gripped has to be, metres."""
+"""Minimum difference between the opening and the gripped width, metres."""
 _STEEP = 0.5
-"""Largest vertical part of the normal where a finger may touch."""
+"""Maximum vertical component of the normal where a finger may touch."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Grasp:
-    """One grasp, relative to the solid's origin; x, y, yaw in axes that turn with it about the vertical.
+    """One grasp, relative to the solid's origin; x, y and yaw in axes that turn with it about the vertical.
 
     Attributes:
-        x, y, z: Where the TCP is to be, metres.
+        x, y, z: Position of the TCP, metres.
         yaw: Angle, rad, of the hand's x axis, which runs along the pads; the fingers close across it.
-        width: Between the contacts, metres.
+        width: Distance between the contacts, metres.
         cost: Smaller is better.
     """
 
@@ -66,14 +65,14 @@ class Grasp:
 def antipodal_grasps(
     text: str, gripper: Gripper, *, task_scale: float = 1.0, scale: float = 1.0, up: tuple[float, float, float]
 ) -> tuple[Grasp, ...]:
-    """The best grasps of a solid with the hand pointing down, best first; none when nothing fits.
+    """Compute the best grasps of a solid with the hand pointing down, best first; empty if none fits.
 
     Args:
-        text: As of `Shape.mesh`.
-        gripper: Of the hand.
-        task_scale: As of `RobotSpec`.
-        scale: Of the solid.
-        up: The world's vertical in the solid's axes.
+        text: Solid as text, as in `Shape.mesh`.
+        gripper: Gripper of the hand.
+        task_scale: As in `RobotSpec`.
+        scale: Scale of the solid.
+        up: Vertical of the world in the solid's axes.
     """
     mesh = decode_mesh(text)
     points, normals = _surface(mesh, CLOUD)
@@ -87,7 +86,7 @@ def antipodal_grasps(
 
 
 def standing_rotation(up: tuple[float, float, float]) -> Array:
-    """(3, 3) the smallest rotation that turns a direction of the solid (of unit length) into the vertical."""
+    """Smallest rotation (3, 3) that turns a direction of the solid (unit length) into the vertical."""
     x, y, z = up
     if z < -0.999:
         return np.diag([1.0, -1.0, -1.0])
@@ -96,9 +95,9 @@ def standing_rotation(up: tuple[float, float, float]) -> Array:
 
 
 def _grasp(points: Array, normals: Array, row: int, gripper: Gripper, task_scale: float) -> Grasp | None:
-    """The grasp that closes along the normal at a point of the cloud; None when it does not hold or fit."""
+    """Compute the grasp that closes along the normal at a point of the cloud; None if it does not hold or fit."""
     length = math.hypot(*normals[row, :2].tolist())
-    across = normals[row, :2] / -length  # (2,) in the direction of which the first finger moves
+    across = normals[row, :2] / -length  # (2,) motion of the first finger
     along = np.array([across[1], -across[0]])  # x of a hand that points down, its y being `across`
     u = points[:, 0] * along[0] + points[:, 1] * along[1]
     v = points[:, 0] * across[0] + points[:, 1] * across[1]
@@ -115,7 +114,7 @@ def _grasp(points: Array, normals: Array, row: int, gripper: Gripper, task_scale
         return None
     swept = (np.abs(u - middle) < FINGER) & (w > z - depth - clearance / 2)
     if float(np.abs(v[swept] - centre).max()) > opening / 2 - 0.003:
-        return None  # a finger would come down on it
+        return None  # a finger would collide with it from above
     facing = normals[:, 0] * across[0] + normals[:, 1] * across[1]
     near, far = pad & (v < first + _SKIN), pad & (v > last - _SKIN)
     least = min(-float(facing[near].mean()), float(facing[far].mean()))
@@ -123,7 +122,7 @@ def _grasp(points: Array, normals: Array, row: int, gripper: Gripper, task_scale
         return None
     apart = max(abs(float(u[side].mean()) - middle) for side in (near, far))
     height = max(float(w[near].mean()), float(w[far].mean()))
-    # Off the centre of mass it turns about the fingers when it is lifted; below it, it may topple.
+    # Off the centre of mass, the solid turns about the fingers when lifted; gripped below it, it may topple.
     off = math.hypot(middle, centre)
     tight = max(0.0, width - opening + 0.02)
     cost = 4 * (1 - least) + 60 * off + 60 * apart + 10 * max(0.0, -height) + 20 * tight
@@ -133,13 +132,13 @@ def _grasp(points: Array, normals: Array, row: int, gripper: Gripper, task_scale
 
 @functools.lru_cache(maxsize=2)
 def _shares(count: int) -> tuple[Array, Array]:
-    """(count,) and (count, 2) random numbers in 0..1, always the same."""
+    """Random numbers in 0..1, (count,) and (count, 2), always the same."""
     rng = np.random.default_rng(0)
     return np.sort(rng.uniform(size=count)), rng.uniform(size=(count, 2))
 
 
 def _surface(mesh: SolidMesh, count: int) -> tuple[Array, Array]:
-    """(count, 3) points spread evenly over the surface, and the unit normals there."""
+    """Sample (count, 3) points evenly on the surface, with their unit normals."""
     a, b, c = (mesh.points[mesh.faces[:, corner]] for corner in range(3))
     normals = np.cross(b - a, c - a)
     double = np.sqrt((normals * normals).sum(axis=1))

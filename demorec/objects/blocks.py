@@ -1,4 +1,4 @@
-"""Toy blocks: twenty-five shapes each of eight kinds, and plain cubes."""
+"""Toy blocks: 25 shapes each of eight kinds, and plain cubes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ SHAPES = 25
 
 
 def _sizes(rng: Rng) -> tuple[float, float, float]:
-    """Width of a bar, side of the whole, depth, metres."""
+    """Draw the width of a bar, the side of the whole and the depth, metres."""
     return rng.uniform(0.02, 0.026), rng.uniform(0.055, 0.075), rng.uniform(0.022, 0.04)
 
 

@@ -1,4 +1,4 @@
-"""A folder of meshes as a shelf: one of the user's own, or the random shapes that PyBullet comes with."""
+"""Object sets from a folder of meshes: the user's, or the random shapes that come with PyBullet."""
 
 from __future__ import annotations
 
@@ -26,31 +26,31 @@ from demorec.robots.obj import read_obj
 SUFFIXES = (".obj", ".stl", ".glb")
 MAX_BYTES = 50_000_000
 WIDEST = 0.07
-"""Of the narrowest side, metres: what a hand of 8 cm takes."""
+"""Maximum length of the narrowest side, metres; a hand of 8 cm can grip it."""
 FLAT = 2e-4
-"""Out of plane, metres, up to which points belong to one face."""
+"""Maximum distance from the plane of a face, metres, at which points belong to it."""
 RANDOM_SCALE = 0.015
-"""Of the files in `random_urdfs`, as their URDFs have it."""
+"""Scale of the files in `random_urdfs`, as in their URDFs."""
 
 
 def load_shelf(name: str, allowed: Collection[str] = ()) -> Shelf:
-    """`OBJECTS.load`, or with a slash in its name a folder of meshes.
+    """Load a set from `OBJECTS`, or from a folder of meshes if its name contains a slash.
 
     Raises:
-        ConfigError: As `Registry.load`, or as `folder_shelf`.
+        ConfigError: As `Registry.load` or `folder_shelf`.
     """
     return folder_shelf(Path(name)) if "/" in name else OBJECTS.load(name, allowed)
 
 
 @functools.lru_cache(maxsize=16)
 def folder_shelf(folder: Path) -> Shelf:
-    """The .obj, .stl and .glb files of a folder, in metres; of one name but for numbers and colours is one kind.
+    """Read a folder's .obj, .stl and .glb files, in metres; names that differ in numbers and colours are one kind.
 
     Raises:
-        ConfigError: There is no such folder, it has no such file, or one cannot be handled.
+        ConfigError: The folder does not exist, it has no such file, or one cannot be handled.
     """
     if not folder.is_dir():
-        raise ConfigError(f"The folder of objects was not found: {folder}")
+        raise ConfigError(f"The folder of objects does not exist: {folder}")
     kinds: dict[str, list[Path]] = {}
     for path in sorted(folder.iterdir()):
         if path.suffix.lower() in SUFFIXES:
@@ -72,7 +72,7 @@ def _reader(files: list[Path]) -> Callable[[int], SolidMesh]:
 
 
 def __getattr__(name: str) -> Shelf:
-    """`RANDOM`, found when it is first asked for: that reads a thousand files."""
+    """Load `RANDOM` at its first use, since that reads a thousand files."""
     if name != "RANDOM":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     return _random_urdfs()
@@ -80,7 +80,7 @@ def __getattr__(name: str) -> Shelf:
 
 @functools.cache
 def _random_urdfs() -> Shelf:
-    """The shapes of pybullet_data's `random_urdfs` that are, as they are made, narrow enough for a hand from above.
+    """Select the shapes of pybullet_data's `random_urdfs` that are narrow enough for a hand from above.
 
     Raises:
         MissingDependencyError: pybullet_data is not installed.
@@ -100,8 +100,8 @@ def _random_urdfs() -> Shelf:
 
 
 def on_steadiest_side(mesh: SolidMesh) -> SolidMesh:
-    """The solid turned so that it lies on that face of its hull from which it has to be tilted farthest to fall."""
-    from scipy.spatial import ConvexHull  # takes a while to load
+    """Turn the solid onto the face of its hull that needs the largest tilt to topple."""
+    from scipy.spatial import ConvexHull  # slow import
 
     mesh = mesh.centred()
     hull = ConvexHull(mesh.points)
@@ -128,30 +128,30 @@ def _noun(stem: str) -> str:
 
 @functools.lru_cache(maxsize=1024)
 def read_solid(path: Path, scale: float = 1.0) -> SolidMesh:
-    """The solid in a mesh file of so many metres a unit, without parts, its middle at the origin.
+    """Read the solid in a mesh file (`scale` metres per unit) without convex parts, its middle at the origin.
 
     Raises:
         ConfigError: The file cannot be read, or its mesh is open, huge, too wide or has too many points.
     """
     try:
         points, faces = _read(path)
-    except Exception as error:  # trimesh raises what it happens to stumble over
+    except Exception as error:  # trimesh raises many types
         raise ConfigError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
     if not len(faces) or not np.isfinite(points).all():
-        raise ConfigError(f"The mesh has no triangles, or points that are no numbers: {path}")
+        raise ConfigError(f"The mesh has no triangles, or points that are not finite: {path}")
     points = scale * points
     extents = points.max(axis=0) - points.min(axis=0)
     size = " x ".join(f"{side:.3g}" for side in extents.tolist())
     if float(extents.max()) > MAX_EXTENT:
-        raise ConfigError(f"The mesh is {size} m, at most {MAX_EXTENT} are allowed: is it in millimetres? {path}")
+        raise ConfigError(f"The mesh is {size} m, the maximum is {MAX_EXTENT}: is it in millimetres? {path}")
     if float(extents.min()) > WIDEST:
-        raise ConfigError(f"The mesh is {size} m, a gripper takes {WIDEST} at most: scale it down: {path}")
+        raise ConfigError(f"The mesh is {size} m, a gripper takes up to {WIDEST}: scale it down: {path}")
     grid = np.round((points - (points.max(axis=0) + points.min(axis=0)) / 2) / UNIT).astype(np.int64)
     welded, rows = np.unique(grid, axis=0, return_inverse=True)
     faces = rows.reshape(-1)[faces]
     faces = faces[(faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])]
     if len(welded) > MAX_POINTS or len(faces) > 2 * MAX_POINTS:
-        raise ConfigError(f"The mesh has {len(welded):,} points, {MAX_POINTS:,} are allowed: simplify it: {path}")
+        raise ConfigError(f"The mesh has {len(welded):,} points, the maximum is {MAX_POINTS:,}: simplify it: {path}")
     solid = SolidMesh(points=welded * UNIT, faces=faces, parts=())
     if not solid.is_closed() or solid.mass_properties()[0] <= 0:
         raise ConfigError(f"The mesh is open or inside out, so it has no volume: close its surface: {path}")
@@ -159,11 +159,11 @@ def read_solid(path: Path, scale: float = 1.0) -> SolidMesh:
 
 
 def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
-    """(V, 3) points and (F, 3) triangles."""
+    """Read (V, 3) points and (F, 3) triangles."""
     with open_regular(path) as file:
         data = file.read(MAX_BYTES + 1)
     if len(data) > MAX_BYTES:
-        raise ValueError(f"it has more than {MAX_BYTES:,} bytes")
+        raise ValueError(f"the file has more than {MAX_BYTES:,} bytes")
     if path.suffix.lower() == ".obj":
         found = read_obj(path)
         return found.points, found.faces
@@ -173,7 +173,7 @@ def _read(path: Path) -> tuple[Array, NDArray[np.int64]]:
     mesh = trimesh.load(io.BytesIO(data), file_type=kind, force="mesh", process=False, skip_materials=True)
     points, faces = np.asarray(mesh.vertices, dtype=np.float64), np.asarray(mesh.faces, dtype=np.int64)
     if len(faces) and not 0 <= faces.min() <= faces.max() < len(points):
-        raise ValueError("a face names a point that it does not have")
-    if kind == "glb":  # whose y axis points up
+        raise ValueError("a face refers to a missing point")
+    if kind == "glb":  # y axis points up
         points = points[:, [0, 2, 1]] * (1.0, -1.0, 1.0)
     return points, faces

@@ -1,4 +1,4 @@
-"""What stands on a kitchen table: thirty shapes each of eleven kinds, small enough for a hand of 8 cm."""
+"""Kitchen objects: thirty shapes each of eleven kinds, small enough for a hand of 8 cm."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def _banana(rng: Rng) -> SolidMesh:
     radius, bend = rng.uniform(0.011, 0.014), rng.uniform(0.055, 0.07)
     spine = arc((0.0, -bend), bend, math.radians(145), math.radians(35), 9)
     thick = [radius * share for share in (0.45, 0.75, 0.95, 1.0, 1.0, 1.0, 0.95, 0.75, 0.4)]
-    # It lies on its whole length: the ends are bent upward by as much as they are thinner.
+    # Its whole length touches the table: the ends are bent upward as far as they taper.
     return rod([(x, y, r) for (x, y), r in zip(spine, thick, strict=True)], thick, (0.0, 0.0, 1.0))
 
 

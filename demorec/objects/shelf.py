@@ -1,4 +1,4 @@
-"""What a shelf is: kinds of things, each in many shapes, of a material, in colours that have a name."""
+"""Object sets: kinds of objects, each with many shapes, a material and named colours."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from demorec.episode.scene import Pattern
 
 Split = Literal["all", "train", "eval"]
 HELD_OUT = 5
-"""Each shape whose number is one less than a multiple of this is kept for `eval`."""
+"""Period of shape numbers reserved for `eval`: number 4, 9, 14, ..."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """How heavy and how slippery, and what it looks like.
+    """Density, friction and appearance.
 
     Attributes:
-        density: (low, high) kg/m^3 of the whole solid, what is in a tin or a bottle included.
+        density: (low, high) kg/m^3 of the whole solid, including the content of a tin or bottle.
         friction: (low, high) lateral coefficient.
-        patterns: Of its textures, one of which a thing gets.
+        patterns: Textures, one of which an object gets.
     """
 
     density: tuple[float, float]
@@ -45,15 +45,15 @@ MATERIALS: Mapping[str, Material] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """Things of one name.
+    """Objects of one name.
 
     Attributes:
         noun: Its word in instructions.
         material: Row of `MATERIALS`.
-        shape: Number 0 .. count - 1 -> that shape, about as it is to lie on a table; always the same.
-        count: How many different shapes there are.
-        colors: Words of the colours that it may have; empty for all.
-        yaw_symmetry: As `Body.yaw_symmetry`.
+        shape: Number 0 .. count - 1 -> that shape, roughly in its resting pose; always the same.
+        count: Number of different shapes.
+        colors: Names of its possible colours; empty for all.
+        yaw_symmetry: As in `Body.yaw_symmetry`.
     """
 
     noun: str
@@ -64,7 +64,7 @@ class Kind:
     yaw_symmetry: int = 1
 
     def numbers(self, split: Split) -> Sequence[int]:
-        """The shapes of a split; with fewer than `HELD_OUT` none is held out."""
+        """Numbers of the shapes of a split; with fewer than `HELD_OUT` shapes none is held out."""
         held_out = range(HELD_OUT - 1, self.count, HELD_OUT)
         return {"all": range(self.count), "eval": held_out}.get(
             split, [n for n in range(self.count) if n not in held_out]
@@ -93,6 +93,6 @@ def drawn(
 
 @dataclass(frozen=True, kw_only=True)
 class Shelf:
-    """Kinds of things that one draws from."""
+    """Set of kinds to draw objects from."""
 
     kinds: tuple[Kind, ...]

@@ -1,6 +1,6 @@
-"""Closed meshes from a few numbers: turned on a lathe, cut from a board, bent from a rod; each with its convex parts.
+"""Closed meshes from a few numbers, each with its convex parts: lathed, cut from a board, or bent from a rod.
 
-Angles come from `math`, and points are rounded to what a recording stores, so that the same numbers give the same mesh
+Angles come from `math`, and points are rounded to the recorded precision, so that the same numbers give the same mesh
 on every machine.
 """
 
@@ -17,16 +17,16 @@ from demorec.episode.mesh import SolidMesh
 
 Point2 = tuple[float, float]
 SIDES = 24
-"""Of each ring of a solid of revolution."""
+"""Number of points in each ring of a solid of revolution."""
 
 
 def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = ()) -> SolidMesh:
-    """A solid of revolution about z.
+    """Make a solid of revolution about z.
 
     Args:
-        profile: (radius, z) of the outside from below to above, metres; radius 0 at an end is a point on the axis.
-        cavity: The same of the inside of a vessel, from the rim down to its floor. As physics has it, it is filled:
-            fingers that cannot grip a wall do not go in.
+        profile: (radius, z) of the outside from bottom to top, metres; radius 0 at an end is a point on the axis.
+        cavity: (radius, z) of the inside of a vessel, from the rim down to its floor. Physics treats it as filled:
+            fingers that cannot grip a wall do not enter.
     """
     points: list[tuple[float, float, float]] = []
     rings: list[list[int]] = []
@@ -40,12 +40,12 @@ def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = ()) -> SolidM
 
 
 def dish(floor: float, rim: float, height: float, *, thickness: float) -> SolidMesh:
-    """A vessel with a flat floor and a wall that leans outward, hollow as physics has it too, standing on z = 0.
+    """Make a vessel with a flat floor and an outward-leaning wall, hollow in physics too, its floor at z = 0.
 
     Args:
-        floor, rim: Inner radii of its floor and of its rim, metres.
-        height: Of the rim, metres.
-        thickness: Of floor and wall, metres.
+        floor, rim: Inner radii of floor and rim, metres.
+        height: Height of the rim, metres.
+        thickness: Thickness of floor and wall, metres.
     """
     solid = lathe([(floor, 0.0), (rim, height)], cavity=[(rim - thickness, height), (floor, thickness)])
     rings = np.arange(4 * SIDES).reshape(4, SIDES)
@@ -56,13 +56,13 @@ def dish(floor: float, rim: float, height: float, *, thickness: float) -> SolidM
 def board(
     outline: Sequence[Point2], pieces: Sequence[Sequence[int]], depth: float, *, upright: bool = False
 ) -> SolidMesh:
-    """A flat shape of even depth.
+    """Make a flat shape of even depth.
 
     Args:
         outline: (x, y) corners, counter-clockwise, metres.
-        pieces: Rows of `outline`, counter-clockwise, of convex pieces that make it up.
-        depth: Along z, metres; with `upright` along y, the outline's y being up.
-        upright: Whether it stands on an edge of the outline instead of lying flat.
+        pieces: Convex pieces of the shape, each as rows of `outline`, counter-clockwise.
+        depth: Extent along z, metres; with `upright` along y, with the outline's y pointing up.
+        upright: Whether it rests on an edge of the outline instead of flat.
     """
     n = len(outline)
     if upright:
@@ -79,11 +79,11 @@ def board(
 def rod(
     path: Sequence[tuple[float, float, float]], radii: Sequence[float], up: Sequence[float], *, sides: int = 10
 ) -> SolidMesh:
-    """A bent rod of round section, its ends flat; each stretch is one convex part.
+    """Make a bent rod of round section with flat ends; each segment is one convex part.
 
     Args:
         path: (x, y, z) of its axis, metres, in one plane.
-        radii: At each point, metres.
+        radii: Radius at each point, metres.
         up: (3,) unit normal of that plane.
     """
     axis, normal = np.array(path), np.array(up)
@@ -102,7 +102,7 @@ def rod(
 
 
 def joined(*solids: SolidMesh) -> SolidMesh:
-    """Several solids as one; where they overlap, they count twice."""
+    """Merge several solids into one; overlaps count twice."""
     starts = np.cumsum([0, *(len(solid.points) for solid in solids)]).tolist()
     return SolidMesh(
         points=np.concatenate([solid.points for solid in solids]),
@@ -124,7 +124,7 @@ def _solid(points: Sequence[Sequence[float]], faces: Sequence[Face], parts: Sequ
 
 
 def _band(below: Sequence[int], above: Sequence[int]) -> list[Face]:
-    """Faces between two rings that run counter-clockwise seen from above; one of them may be a single point."""
+    """Build the faces between two rings, counter-clockwise from above; one of them may be a single point."""
     n = max(len(below), len(above))
     faces: list[Face] = []
     for k in range(n):
@@ -138,13 +138,13 @@ def _band(below: Sequence[int], above: Sequence[int]) -> list[Face]:
 
 
 def _with_ends(faces: list[Face], first: Sequence[int], last: Sequence[int]) -> list[Face]:
-    """The faces and those of flat ends."""
+    """Add the faces of flat ends."""
     lower = [(first[0], b, a) for a, b in pairwise(first[1:])]
     return faces + lower + [(last[0], a, b) for a, b in pairwise(last[1:])]
 
 
 def _convex_runs(profile: Sequence[Point2]) -> list[tuple[int, int]]:
-    """First and last rows of the stretches of a profile whose solids of revolution are convex, in order."""
+    """Split a profile into segments with convex solids of revolution; returns their first and last rows, in order."""
     runs, first = [], 0
     for row in range(1, len(profile) - 1):
         (r0, z0), (r1, z1), (r2, z2) = profile[row - 1 : row + 2]
@@ -155,6 +155,6 @@ def _convex_runs(profile: Sequence[Point2]) -> list[tuple[int, int]]:
 
 
 def arc(centre: Point2, radius: float, start: float, end: float, count: int) -> list[Point2]:
-    """`count` points on a circular arc between two angles, rad, both ends included."""
+    """Compute `count` points on a circular arc between two angles, rad, both ends included."""
     angles = [start + (end - start) * k / (count - 1) for k in range(count)]
     return [(centre[0] + radius * math.cos(a), centre[1] + radius * math.sin(a)) for a in angles]

@@ -1,4 +1,4 @@
-"""An arm with a parallel gripper in the simulator: load it, drive it, read it."""
+"""An arm with a parallel gripper in the simulator: loading, driving and reading it."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from demorec.sim.bodies import load_urdf
 from demorec.sim.lossy_motors import JointMotors
 
 FINGER_DAMPING = 1_000.0
-"""Contact of the finger pads, N s/m (the value of panda.urdf)."""
+"""Contact damping of the finger pads, N s/m (the value of panda.urdf)."""
 FINGER_GAIN = 0.1
-"""Share of the position error that a finger's motor corrects in a physics step (PyBullet's default)."""
+"""Ratio of the position error that a finger's motor corrects in a physics step (PyBullet's default)."""
 
 
 class Arm:
@@ -29,9 +29,9 @@ class Arm:
 
     Attributes:
         spec: The robot.
-        body: PyBullet index.
+        body: Index of the body in PyBullet.
         links: Link name -> PyBullet link index, -1 for the base.
-        kinematics: Of the arm, in the base frame.
+        kinematics: Kinematics of the arm, in the base frame.
         target: (n_arm,) joint targets of the last command, rad.
         gripper_target: Opening of the last command, metres.
         world_from_base: Pose of the base.
@@ -86,7 +86,7 @@ class Arm:
             self._client.changeConstraint(gear, gearRatio=-ratio, erp=0.1, maxForce=50)
 
     def _make_lossy_motors(self) -> JointMotors | None:
-        """The motors of all joints; None where the URDF gives none of them damping or friction."""
+        """Create the motors of all joints; None if the URDF gives none of them damping or friction."""
         found = read_dynamics(asset_path(self.spec.urdf).read_text())
         damping, friction = np.array([found.get(name, JointDynamics()) for name in self.spec.joint_names]).T
         if not damping.any() and not friction.any():
@@ -102,29 +102,29 @@ class Arm:
         )
 
     def _mounted_hand(self) -> int:
-        """The hand's link, with a force-torque sensor on the joint that carries it."""
+        """Return the hand's link, with a force-torque sensor enabled on its joint."""
         hand: int = self.links[self.spec.hand_link]
         self._client.enableJointForceTorqueSensor(self.body, hand, True)
-        # PyBullet tells the wrench along the axes of the link's inertia, not of the link.
+        # PyBullet reports the wrench along the axes of the link's inertia, not of the link.
         self._hand_from_inertia = Pose(quat_xyzw=np.array(self._client.getDynamicsInfo(self.body, hand)[4]))
         return hand
 
     def place(self, joint_position: Array, gripper_width: float) -> None:
-        """Set the arm joints (n_arm,) rad and the opening (m) at once, at rest, without physics."""
+        """Set the arm joints (n_arm,) rad and the opening (m) instantly, at rest, without physics."""
         self.place_joints(np.append(joint_position, self.spec.gripper.joint_position(gripper_width)))
 
     def place_joints(self, joint_position: Array) -> None:
-        """Set all joints (n_joints,), fingers included, at once, at rest, without physics."""
+        """Set all joints (n_joints,), fingers included, instantly, at rest, without physics."""
         for joint, position in zip(self._arm + self._fingers, joint_position.tolist(), strict=True):
             self._client.resetJointState(self.body, joint, position)
 
     def action(self, joint_target: Array, gripper_target: float) -> Action:
-        """The action with these targets, rad and metres; its pose is where they bring the TCP."""
+        """Build the action with these targets, rad and metres; its pose is the TCP's at these targets."""
         pose = self.kinematics.forward(joint_target)
         return Action(joint_target=joint_target, gripper_target=gripper_target, base_from_tcp_target=pose)
 
     def command_gripper(self, width: float) -> None:
-        """Begin a control step: the gripper's motors are set to an opening, in metres, for all of it."""
+        """Set the gripper's motors to an opening, in metres, for a whole control step."""
         self.gripper_target = width
         if self._lossy_motors is not None:
             return
@@ -156,7 +156,7 @@ class Arm:
         )
 
     def joint_states(self) -> tuple[Array, Array, Array]:
-        """Positions, velocities and applied motor torques of all joints, each (n_joints,)."""
+        """Read positions, velocities and applied motor torques of all joints, each (n_joints,)."""
         states = self._client.getJointStates(self.body, self._arm + self._fingers)
         position, velocity, effort = (np.array([state[i] for state in states]) for i in (0, 1, 3))
         if self._lossy_motors is not None:
@@ -164,27 +164,27 @@ class Arm:
         return position, velocity, effort
 
     def hand_wrench(self) -> Array:
-        """Force (N) and torque (N m) with which the arm holds the hand, (6,), along the axes of the hand's link."""
+        """Read force (N) and torque (N m) with which the arm holds the hand, (6,), along the axes of its link."""
         wrench = np.array(self._client.getJointState(self.body, self._hand)[2])
         return self._hand_from_inertia.apply(wrench.reshape(2, 3)).reshape(6)
 
     def gripper_width(self) -> float:
-        """Opening, metres."""
+        """Read the opening, metres."""
         states = self._client.getJointStates(self.body, self._fingers)
         return float(self.spec.gripper.width(np.array([state[0] for state in states])))
 
     def arm_position(self) -> Array:
-        """(n_arm,) joint positions, rad."""
+        """Read the (n_arm,) joint positions, rad."""
         return np.array([state[0] for state in self._client.getJointStates(self.body, self._arm)])
 
     def world_from_tcp(self) -> Pose:
-        """TCP pose as the simulator has it (the link frame, not the centre of mass)."""
+        """Read the TCP pose in the simulator (the link frame, not the centre of mass)."""
         state = self._client.getLinkState(self.body, self._tcp, computeForwardKinematics=True)
         return Pose(position=np.array(state[4]), quat_xyzw=np.array(state[5]))
 
 
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
-    """Kinematics of a robot from its URDF; errors as of `demorec.robots.spec_check.checked_urdf`."""
+    """Build a robot's kinematics from its URDF; raises as `demorec.robots.spec_check.checked_urdf`."""
     return ArmKinematics(
         checked_urdf(spec, scale=scale),
         arm_joints=spec.arm_joints,

@@ -1,4 +1,4 @@
-"""Scene bodies and URDFs into PyBullet bodies, and what a client shows back into plain data for renderers."""
+"""Conversion of scene bodies and URDFs into PyBullet bodies, and of a client's shapes into plain data for renderers."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def add_body(client: Any, body: Body) -> int:
             size = (shape.scale,) * 3
             file, parts = str(surface_file(shape)), str(collision_file(shape))
         collision = -1
-        if body.collides:  # a mesh becomes its convex hull
+        if body.collides:  # PyBullet uses the convex hull of a mesh
             geometry = shape_arguments(client, shape.kind, size, parts, length_name="height")
-            with silence():  # a mesh may be warned of
+            with silence():  # PyBullet may warn about a mesh
                 collision = client.createCollisionShape(**geometry, **{f"collision{k}": v for k, v in place.items()})
         geometry = shape_arguments(client, shape.kind, size, file)
         placed = {f"visual{k}": v for k, v in place.items()}
         visual = client.createVisualShape(**geometry, **placed, rgbaColor=body.rgba)
         index = client.createMultiBody(body.mass, collision, visual, pose.position.tolist(), pose.quat_xyzw.tolist())
-        if shape.mesh and body.movable:  # PyBullet takes the moments of the bounding box
+        if shape.mesh and body.movable:  # PyBullet uses the moments of the bounding box
             inertia = body.mass * shape.scale**2 * decode_mesh(shape.mesh).mass_properties()[2]
             client.changeDynamics(index, -1, localInertiaDiagonal=inertia.tolist())
     for link in range(-1, client.getNumJoints(index)):
@@ -78,15 +78,15 @@ def add_body(client: Any, body: Body) -> int:
 def shape_arguments(
     client: Any, kind: str, size: Sequence[float], file: str = "", *, length_name: str = "length"
 ) -> dict[str, Any]:
-    """Arguments of createVisualShape, or of createCollisionShape (`length_name` "height").
+    """Build the arguments of createVisualShape, or of createCollisionShape (`length_name` "height").
 
     Args:
         client: The PyBullet client.
-        kind, size, file: As of `demorec.render.Visual`.
-        length_name: What the length of a cylinder or capsule is called.
+        kind, size, file: As in `demorec.render.Visual`.
+        length_name: Argument name for the length of a cylinder or capsule.
 
     Raises:
-        SceneError: There is no such shape.
+        SceneError: Unknown shape.
     """
     match kind:
         case "box":
@@ -109,14 +109,14 @@ def load_urdf(
     Args:
         client: The PyBullet client.
         name: As in `demorec.robots.assets.asset_path`.
-        pose: Of its base.
+        pose: Pose of its base.
         scale: Uniform scale.
         is_fixed: Whether physics cannot move its base.
-        what: Whose model it is, for messages ("body 'duck'").
-        is_robot: Whether each link has to say what it weighs, and a frame weighs nothing.
+        what: Name of the model in messages ("body 'duck'").
+        is_robot: Whether each link must specify its mass, and a frame has none.
 
     Raises:
-        ConfigError: A link of a robot does not say what it weighs.
+        ConfigError: A robot's link does not specify its mass.
         SceneError: The URDF or one of its meshes is missing or cannot be loaded.
     """
     if is_robot:
@@ -133,11 +133,11 @@ def load_urdf(
 
 @contextmanager
 def urdf_file(name: str, *, is_robot: bool = False) -> Iterator[str]:
-    """A file that PyBullet can load while the context lasts.
+    """Write a file that PyBullet can load while the context lasts.
 
     Args:
         name: As in `demorec.robots.assets.asset_path`.
-        is_robot: Whether links without `<inertial>` are frames of no mass, and damping is not PyBullet's affair.
+        is_robot: Whether links without `<inertial>` become massless frames and damping is left to `lossy_motors`.
 
     Raises:
         SceneError: The URDF or one of its meshes is missing.
@@ -171,11 +171,11 @@ def _without_visual_meshes(text: str, folder: Path) -> str:
 
 
 ShapeRows = tuple[tuple[Any, ...], ...]
-"""Of every visual shape what PyBullet tells: body, link, kind, dimensions, file, position, orientation, colour."""
+"""Visual shapes as PyBullet reports them: body, link, kind, dimensions, file, position, orientation, colour."""
 
 
 def shape_rows(client: Any) -> ShapeRows:
-    """The visual shapes of a client; equal rows look equal."""
+    """Read the visual shapes of a client; equal rows have equal appearance."""
     return tuple(shape for body in range(client.getNumBodies()) for shape in client.getVisualShapeData(body))
 
 
@@ -187,17 +187,17 @@ def visual_bodies(
     textures: Mapping[int, Texture],
     models: Mapping[int, tuple[str, float]],
 ) -> tuple[VisualBody, ...]:
-    """The bodies of a client.
+    """Collect the visible bodies of a client.
 
     Args:
-        client: Its bodies are numbered without a gap.
+        client: Client with consecutively numbered bodies.
         rows: Its `shape_rows`.
-        names: Body -> name; others are called as PyBullet calls them.
-        textures: Body -> procedural texture: PyBullet cannot be asked for the pixels of one.
-        models: Body -> URDF and scale, of the bodies that `load_urdf` has loaded.
+        names: Body -> name; other bodies keep PyBullet's name.
+        textures: Body -> procedural texture: PyBullet cannot return its pixels.
+        models: Body -> URDF and scale, for the bodies loaded by `load_urdf`.
 
     Raises:
-        RenderError: A shape of a kind that no renderer draws.
+        RenderError: Some shape has a kind that no renderer draws.
     """
     bodies = []
     for body in range(client.getNumBodies()):
@@ -220,7 +220,7 @@ def visual_bodies(
 
 
 def _with_urdf_meshes(client: Any, body: int, visuals: Sequence[Visual], model: str, scale: float) -> Iterator[Visual]:
-    """Yield the visuals of a body with the meshes of its URDF, for which PyBullet has boxes."""
+    """Yield a body's visuals with the URDF's meshes restored in place of PyBullet's boxes."""
     path = asset_path(model)
     shapes = {link.name: iter(link.visuals) for link in read_links(path.read_text(), scale=scale)}
     links = {-1: client.getBodyInfo(body)[0].decode()}
@@ -235,13 +235,13 @@ def _with_urdf_meshes(client: Any, body: int, visuals: Sequence[Visual], model: 
 
 
 def base_from_inertial(client: Any, body: int) -> Pose:
-    """Pose of the base's centre of mass, whose pose PyBullet tells as that of the body."""
+    """Return the pose of the base's centre of mass, which PyBullet reports as the body's pose."""
     dynamics = client.getDynamicsInfo(body, -1)
     return Pose(position=np.array(dynamics[3]), quat_xyzw=np.array(dynamics[4]))
 
 
 def body_poses(client: Any) -> Array:
-    """(n, 7) poses as `Renderer.render` takes them: of each body the base's centre of mass, then its links' frames."""
+    """Read (n, 7) poses for `Renderer.render`: for each body the base's centre of mass, then its links' frames."""
     rows: list[tuple[float, ...]] = []
     for body in range(client.getNumBodies()):
         position, quat = client.getBasePositionAndOrientation(body)
@@ -265,7 +265,7 @@ def _visual(client: Any, row: tuple[Any, ...], name: str, inertial_from_base: Po
     }
     if kind not in known:
         raise RenderError(
-            f"Body {body} ({name!r}), link {link}: a visual shape of PyBullet's kind {kind} cannot be drawn: "
+            f"Body {body} ({name!r}), link {link}: PyBullet's visual shape of kind {kind} cannot be drawn: "
             "use a mesh, box, sphere, cylinder, capsule or plane."
         )
     kind_name, size = known[kind]
@@ -281,6 +281,6 @@ def _visual(client: Any, row: tuple[Any, ...], name: str, inertial_from_base: Po
 
 
 def _mesh_file(name: str) -> str:
-    """PyBullet searches pybullet_data too, and tells names as it was given them."""
+    """Resolve a file name as PyBullet does: it also searches pybullet_data and returns names unresolved."""
     path = Path(name)
     return name if path.is_absolute() or path.exists() else str(asset_path(name))

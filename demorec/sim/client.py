@@ -1,7 +1,7 @@
-"""A PyBullet client without PyBullet's chatter, freed whoever forgets to.
+"""A PyBullet client without PyBullet's console output, freed even without `disconnect`.
 
-PyBullet prints its build time while it is imported, "argv[0]=" when it connects and warnings about models, from C and
-onto the same streams as our tables and JSON.
+PyBullet prints its build time during import, "argv[0]=" when it connects, and warnings about models. It does so from C,
+to the same streams as our tables and JSON.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from typing import Any
 
 @contextmanager
 def silence() -> Iterator[None]:
-    """Send this process's stdout and stderr to nowhere, C's buffers included."""
+    """Redirect this process's stdout and stderr to the null device, including C's buffers."""
     libc = ctypes.CDLL(None)
     for stream in (sys.stdout, sys.stderr):
         if stream is not None:
@@ -31,7 +31,7 @@ def silence() -> Iterator[None]:
         for descriptor in (1, 2):
             try:
                 saved.append((descriptor, os.dup(descriptor)))
-            except OSError:  # closed by whoever started us
+            except OSError:  # closed by the parent process
                 continue
             os.dup2(nowhere, descriptor)
         yield
@@ -44,10 +44,10 @@ def silence() -> Iterator[None]:
 
 
 class BulletClient:
-    """One simulation of this process: PyBullet's functions, each bound to it at its first use.
+    """One simulation of this process; each PyBullet function is bound to it at its first use.
 
-    It is freed by `disconnect`, else when nothing refers to it any more, at the latest before the interpreter ends
-    (`pybullet_utils` has a client that is freed so late that PyBullet is gone, and that binds at every call).
+    `disconnect` frees it, else the garbage collector does, at the latest before the interpreter exits.
+    (`pybullet_utils` has a client that is freed after PyBullet itself, and that binds at every call.)
     """
 
     def __init__(self) -> None:
@@ -66,14 +66,14 @@ class BulletClient:
         return attribute
 
     def disconnect(self) -> None:
-        """Free the simulation; harmless when called twice."""
+        """Free the simulation; safe to call twice."""
         free = self._free
-        vars(self).clear()  # PyBullet gives the number to the next client, which these functions must not reach
+        vars(self).clear()  # PyBullet reuses the number for its next client, which these functions must not reach
         self._number, self._free = -1, free
         free()
 
 
 def connect() -> BulletClient:
-    """A new client without a window."""
+    """Create a client without a window."""
     with silence():
         return BulletClient()

@@ -1,12 +1,12 @@
-"""Motors of joints that lose torque to damping and friction, as the <dynamics> of a URDF says.
+"""Joint motors that lose torque to damping and friction, as specified by a URDF's <dynamics>.
 
-PyBullet applies damping with the velocity before the step, which makes a light joint explode, and never applies
-friction to a joint that a motor drives. A joint's equation of motion with inertia I is
+PyBullet applies damping with the velocity before the step, which makes a light joint unstable, and never applies
+friction to a motor-driven joint. The equation of motion of a joint with inertia I is
 
-    I dv/dt = torque of the motor - damping v - friction sign(v) + everything else,
+    I dv/dt = motor torque - damping v - friction sign(v) + all other torques,
 
-and the motor gives at most its limit. So the solver's motor, which stands for the first three terms, may use what the
-limit leaves after the losses, and the motor's torque is what the solver used plus the losses.
+and the motor torque is limited. The solver's motor represents the first three terms: its limit is the remainder after
+the losses, and the motor torque is the torque used by the solver plus the losses.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import numpy as np
 from demorec.core.geometry import Array
 
 SLOW_SPEED = 1e-3
-"""Below this speed, rad/s or m/s, a joint rests: friction there grows with the speed, instead of jumping."""
+"""Maximum speed of a joint at rest, rad/s or m/s: friction grows with the speed there instead of jumping."""
 
 
 class JointMotors(NamedTuple):
@@ -26,10 +26,10 @@ class JointMotors(NamedTuple):
 
     Attributes:
         joints: PyBullet's indices.
-        limit: Greatest torque or force.
-        speed: Greatest speed; infinite for none.
-        gain: Share of the position error that a motor corrects in a physics step.
-        damping: Torque or force lost for each unit of speed.
+        limit: Maximum torque or force.
+        speed: Maximum speed; infinite if unlimited.
+        gain: Ratio of the position error that a motor corrects in a physics step.
+        damping: Torque or force lost per unit of speed.
         friction: Torque or force lost at any speed.
     """
 
@@ -41,12 +41,12 @@ class JointMotors(NamedTuple):
     friction: Array
 
     def effort(self, used: Array, velocity: Array) -> Array:
-        """Torques or forces (n,) of the motors: what the solver used, (n,), and what is lost at velocities (n,)."""
+        """Compute motor torques or forces (n,): those used by the solver, (n,), plus the losses at velocities (n,)."""
         loss = self.damping * velocity + self.friction * np.clip(velocity / SLOW_SPEED, -1.0, 1.0)
         return np.clip(used + loss, -self.limit, self.limit)
 
     def steady_speed(self) -> Array:
-        """Speeds (n,) that the limits keep up against the losses; infinite without damping, 0 against much friction."""
+        """Speeds (n,) sustainable at the limits; infinite without damping, 0 if friction exceeds the limit."""
         left = self.limit - self.friction
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(left <= 0, 0.0, np.where(self.damping > 0, left / self.damping, np.inf))
@@ -59,7 +59,7 @@ def drive(client: Any, body: int, motors: JointMotors, targets: Array) -> None:
     speed = np.minimum(motors.speed, motors.steady_speed())
     time_step = client.getPhysicsEngineParameters()["fixedTimeStep"]
     wanted = np.clip(motors.gain * (targets - position) / time_step, -speed, speed)
-    # The direction of the motor in this step is that of the last one; it changes where the limit does not matter.
+    # The motor's direction in this step is that of the last one; it changes where the limit does not matter.
     direction = np.sign(np.where(used == 0.0, wanted - velocity, used))
     is_moving = np.abs(velocity) > SLOW_SPEED
     friction = motors.friction * np.where(is_moving, np.sign(velocity) * direction, 1.0)
@@ -77,6 +77,6 @@ def drive(client: Any, body: int, motors: JointMotors, targets: Array) -> None:
 
 
 _STANDSTILL = 1e-12
-"""rad/s or m/s: PyBullet takes 0 for no limit."""
+"""rad/s or m/s: PyBullet interprets 0 as unlimited."""
 _NO_SPEED_LIMIT = 1e30
-"""What Bullet has for a motor without one."""
+"""Bullet's value for a motor without a speed limit."""

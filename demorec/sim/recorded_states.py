@@ -1,4 +1,4 @@
-"""Recorded states as the simulator poses them, so that renderers draw them as they drew the simulation."""
+"""Recorded states posed by the simulator, so that renderers draw them exactly as during the simulation."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from demorec.sim.world import World
 
 
 class RecordedStates:
-    """The recorded states of a scene, one at a time, for `demorec.render.painter.Painter`.
+    """Recorded states of a scene, one at a time, for `demorec.render.painter.Painter`.
 
-    The simulator poses all states at once and is freed before the first image is drawn: it holds 50 MB.
+    The simulator poses all states at once and is freed before the first image is drawn, since it takes 50 MB.
 
     Args:
         robot: The recorded robot.
@@ -25,8 +25,8 @@ class RecordedStates:
         trajectory: The recorded states.
 
     Attributes:
-        scene: As given.
-        frame: Index of the state that is shown, 0 to T - 1.
+        scene: The scene argument.
+        frame: Index of the current state, 0 to T - 1.
 
     Raises:
         SceneError: A model file is missing or broken.

@@ -1,8 +1,8 @@
-"""PyBullet's own renderers: each fills a client of its own with the shapes that it is to draw.
+"""PyBullet's own renderers, each with a separate client that contains the shapes to draw.
 
-PyBullet's renderers draw what a client holds. In a client of its own a renderer works whenever it is started, from a
-recording as well as beside a simulation, and keeps out of the latter. (The EGL plugin could not do otherwise: it sees
-only bodies that were loaded after it, and no second client of the process.)
+PyBullet's renderers draw the content of a client. With a separate one, a renderer works whenever it is started, from a
+recording as well as during a simulation, and does not disturb the latter. (The EGL plugin requires it: it draws only
+bodies that were loaded after it, and no second client of the process.)
 """
 
 from __future__ import annotations
@@ -35,37 +35,37 @@ _NOTHING_HIT = 1.0 - 1e-7
 
 
 class TinyRenderer(Closing):
-    """PyBullet's own CPU renderer, in a client without a window: slow, hard shadows, always there; a context manager.
+    """PyBullet's CPU renderer, in a client without a window: slow, hard shadows, always available; a context manager.
 
-    It samples half a pixel up and to the left of the pixels' centres, and its depth is about a millimetre too small at
-    a metre. Both are left as they are: the images are PyBullet's.
+    It samples half a pixel up and to the left of the pixel centres, and its depth is about a millimetre too small at a
+    metre. Neither is corrected: the images stay PyBullet's.
     """
 
     constant = "ER_TINY_RENDERER"
-    """PyBullet's name of the renderer that draws."""
+    """PyBullet's constant of the renderer."""
 
     def __init__(self) -> None:
         self._client: Any = None
         self._setup: RenderSetup | None = None
-        # By the number of a shape's body in the client: the row of its pose and its pose there; its number in images.
+        # Body number of a shape in the client -> row of its pose and pose relative to it; -> its number in images.
         self._places: dict[int, tuple[int, Pose]] = {}
         self._segments: dict[int, int] = {}
 
     def _connect(self) -> Any:
-        """A new client that can draw; RenderError when there can be none."""
+        """Open a client that can draw; RenderError if that is impossible."""
         return connect()
 
     def close(self) -> None:
-        """Free the client; harmless when called twice."""
+        """Free the client; safe to call twice."""
         if self._client is not None:
             self._client.disconnect()
         self._client = self._setup = None
 
     def setup(self, setup: RenderSetup) -> None:
-        """Take over a scene.
+        """Load a scene.
 
         Raises:
-            RenderError: PyBullet cannot draw here, or cannot draw a camera or load a shape.
+            RenderError: PyBullet cannot draw on this machine, cannot draw a camera, or cannot load a shape.
         """
         check_setup(setup)
         if self._client is None:
@@ -76,7 +76,7 @@ class TinyRenderer(Closing):
             texture = None if body.texture is None else _load_texture(self._client, body.texture)
             for visual in body.visuals:
                 if visual.kind == "plane":
-                    continue  # PyBullet draws none that is made like this
+                    continue  # PyBullet draws no plane that is created this way
                 try:
                     index = _add(self._client, visual, texture)
                 except Exception as error:  # PyBullet raises its own bare pybullet.error
@@ -89,7 +89,7 @@ class TinyRenderer(Closing):
         self._setup = setup
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
-        """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""
+        """Draw camera name -> images, with poses (n, 7) as in `Renderer.render`; RuntimeError without a scene."""
         if self._setup is None:
             raise RuntimeError("the renderer has no scene: call setup first")
         for index, (row, link_from_shape) in self._places.items():
@@ -120,7 +120,7 @@ class TinyRenderer(Closing):
             renderer=getattr(client, self.constant),
         )
         shape = (camera.height, camera.width)
-        # A PyBullet that was built without NumPy gives tuples of numbers.
+        # PyBullet builds without NumPy return tuples of numbers.
         color = np.ascontiguousarray(np.asarray(rgba, np.uint8).reshape(*shape, 4)[:, :, :3])
         buffer = np.asarray(depth, np.float32).reshape(shape)
         labels = np.asarray(segmentation, np.int32).reshape(shape) if setup.segmentation else None
@@ -134,14 +134,14 @@ class TinyRenderer(Closing):
         )
 
     def _labels(self, labels: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Segmentation of the client in the numbers of the setup."""
+        """Convert the client's segmentation to the numbers of the setup."""
         table = np.full(max(self._segments, default=0) + 2, -1, dtype=np.int32)
         table[list(self._segments)] = list(self._segments.values())
         return np.asarray(table[np.where(labels >= 0, labels & 0xFFFFFF, len(table) - 1)], dtype=np.int32)
 
 
 def _add(client: Any, visual: Visual, texture: int | None) -> int:
-    """A body of one visual shape; returns its index."""
+    """Add a body of one visual shape; returns its index."""
     geometry = shape_arguments(client, visual.kind, visual.size, visual.file)
     index = int(client.createMultiBody(0, -1, client.createVisualShape(**geometry, rgbaColor=visual.rgba)))
     if texture is not None:
@@ -150,7 +150,7 @@ def _add(client: Any, visual: Visual, texture: int | None) -> int:
 
 
 def _load_texture(client: Any, texture: Texture) -> int:
-    """PyBullet takes pixels only by way of a file."""
+    """Load a texture by way of a file, PyBullet's only input for pixels."""
     with tempfile.NamedTemporaryFile(suffix=".png", prefix="demorec_texture_") as file:
         Image.fromarray(texture_pixels(texture)).save(file)
         file.flush()
@@ -158,14 +158,14 @@ def _load_texture(client: Any, texture: Texture) -> int:
 
 
 def view_matrix(world_from_camera: Pose) -> list[float]:
-    """OpenGL's camera_from_world, column by column."""
+    """Compute OpenGL's camera_from_world, column by column."""
     matrix: Array = world_from_camera.inverse().matrix()
     matrix[:3] *= _GL_FROM_CV[:, None]
     return [float(v) for v in matrix.T.reshape(-1)]
 
 
 def _metric_depth(buffer: NDArray[np.float32], camera: SceneCamera) -> NDArray[np.float32]:
-    """OpenGL's depth buffer (0..1) in metres along the optical axis; 0 where nothing is hit."""
+    """Convert OpenGL's depth buffer (0..1) to metres along the optical axis; 0 for the background."""
     near, far = camera.near, camera.far
     metres = near * far / (far - (far - near) * buffer.astype(np.float64))
     return np.where(buffer >= _NOTHING_HIT, 0.0, metres).astype(np.float32)
@@ -174,7 +174,7 @@ def _metric_depth(buffer: NDArray[np.float32], camera: SceneCamera) -> NDArray[n
 class EglRenderer(TinyRenderer):
     """PyBullet's OpenGL renderer without a window (EGL plugin): fast on a GPU, needs libEGL.
 
-    One per process, or a client's images are silently wrong.
+    Only one may exist per process: a second client's images are silently wrong.
 
     Raises:
         RenderError: The plugin does not work on this machine.
@@ -203,13 +203,13 @@ class EglRenderer(TinyRenderer):
         return client
 
     def close(self) -> None:
-        """As `TinyRenderer.close`."""
+        """See `TinyRenderer.close`."""
         if self._client is not None:
             self._client.unloadPlugin(self._plugin)
         super().close()
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
-        """As `TinyRenderer.render`."""
+        """See `TinyRenderer.render`."""
         if self._is_first_image:  # it differs from all later ones in some pixels
             super().render(poses)
             self._is_first_image = False
@@ -236,7 +236,7 @@ def _egl_plugin() -> str:
 
 @functools.cache
 def _egl_problem() -> str:
-    """ "" when the plugin works here, else why not; tried in a process of its own, which it kills without libEGL."""
+    """Run the plugin in a separate process (without libEGL it crashes); returns "" if it works, else the reason."""
     try:
         result = subprocess.run(
             [sys.executable, "-c", _EGL_TRIAL, _egl_plugin()], capture_output=True, text=True, timeout=120, check=False

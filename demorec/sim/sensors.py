@@ -1,7 +1,7 @@
-"""Sensors of a simulated arm beside its joints and its gripper: one row each.
+"""Sensors of a simulated arm other than its joints and gripper: one row each.
 
-Recordings list each sensor as a feature with a stream, from which they are read, checked, shown and exported. So a new
-sensor is a row here, and its test.
+Recordings list each sensor as a feature with a stream, from which they are read, checked, shown and exported. A new
+sensor therefore needs a row here, and its test.
 """
 
 from __future__ import annotations
@@ -18,15 +18,15 @@ from demorec.sim.arm import Arm
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sensor:
-    """A vector that is sensed at each frame.
+    """A vector measured at each frame.
 
     Attributes:
-        quantity: Key in `Observation.sensed`; the feature is called "observation." and this, the topic "/" and this.
+        quantity: Key in `Observation.sensed`; the feature is "observation." plus this, the topic "/" plus this.
         meaning: Description with units and coordinate frame.
-        elements: Name of each element -> its unit ("" for none), given the robot.
-        sense: Values at the end of the last physics step, (D,), given the PyBullet client and the robot in it.
+        elements: Robot -> name of each element -> its unit ("" if unitless).
+        sense: PyBullet client and its robot -> values at the end of the last physics step, (D,).
         layout: Message type, as in `SensorStream`.
-        frame: Link along whose axes the vectors of a wrench are, given the robot.
+        frame: Robot -> link along the axes of which a wrench's vectors are given.
     """
 
     quantity: str
@@ -58,8 +58,8 @@ _WRENCH = {
 }
 
 SENSORS: tuple[Sensor, ...] = (
-    # As measured by a force-torque sensor at the hand's mount: about the origin of the hand's link, nothing subtracted.
-    # The weight and the inertia of hand, fingers and what they hold are in it.
+    # As measured by a force-torque sensor at the hand's mount: about the origin of the hand's link, without
+    # compensation. It includes the weight and inertia of hand, fingers and held object.
     Sensor(
         quantity="wrench",
         meaning="force (N) and torque (N m) with which the arm holds the hand, along the axes of the hand's link",

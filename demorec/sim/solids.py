@@ -1,7 +1,7 @@
-"""What a solid needs before it is in a scene: the convex parts that it collides as, and the pose in which it rests.
+"""Preparation of a solid for a scene: its convex collision parts and its resting pose.
 
-Parts are its hull, or what V-HACD cuts it into, where nobody has said them. How it rests on a table is found by
-dropping it in the simulator.
+If no parts are given, they are its hull or V-HACD's decomposition. The resting pose on a table is found by dropping the
+solid in the simulator.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ from demorec.sim.client import connect, silence
 from demorec.sim.world import set_engine
 
 HULL_IS_RIGHT = 1.1
-"""Volume of the hull over that of the solid up to which the hull is taken."""
+"""Maximum ratio of the hull's volume to the solid's at which the hull is used."""
 ROLLING_FRICTION = 0.001
-"""Of what may roll, as felt on a table would slow it down."""
+"""Rolling friction of objects that can roll: it slows them down as felt on a table would."""
 _SECONDS = 4.0
-"""After which a solid has to be at rest."""
+"""Maximum simulated time until a solid is at rest, s."""
 _ASLANT = Pose(quat_xyzw=np.array([0.012, 0.009, 0.0, math.sqrt(1 - 0.015**2)]))
-"""It is let go turned by 1.7 degrees, so that it does not stay balanced on an edge."""
+"""Release pose turned by 1.7 degrees, so that the solid does not stay balanced on an edge."""
 _STILL = 2e-3
-"""m/s and, times 0.05 m, rad/s."""
+"""Maximum speed at rest: m/s, and rad/s times 0.05 m."""
 _UPRIGHT = math.radians(2.0)
-"""A solid that comes to rest so little aslant keeps the axes that it was made with."""
+"""Maximum tilt at rest, rad, at which a solid keeps its original axes."""
 
 
 def with_parts(mesh: SolidMesh) -> SolidMesh:
-    """The solid with convex parts, found once for each content and kept in the user's cache folder."""
+    """Add convex parts to a solid, computed once for each content and kept in the user's cache folder."""
     return mesh if mesh.parts else decode_mesh(_text_with_parts(mesh))
 
 
 @functools.lru_cache(maxsize=1024)
 def _text_with_parts(mesh: SolidMesh) -> str:
-    """The same solid as text (`Shape.mesh`), its parts its hull or those of the cache folder."""
-    from scipy.spatial import ConvexHull  # takes a while to load
+    """Return the solid as text (`Shape.mesh`), with its hull or the cached decomposition as parts."""
+    from scipy.spatial import ConvexHull  # slow import
 
     if ConvexHull(mesh.points).volume < HULL_IS_RIGHT * mesh.mass_properties()[0]:
         return encode_mesh(replace(mesh, parts=(np.unique(mesh.faces),)))
@@ -65,7 +65,7 @@ def _text_with_parts(mesh: SolidMesh) -> str:
 
 
 def _vhacd(surface: str) -> list[Array]:
-    """The points of each convex part that V-HACD finds in an OBJ file's text, rounded to what is stored."""
+    """Find V-HACD's convex parts of an OBJ text; returns the points of each, rounded to the stored precision."""
     import pybullet
 
     with tempfile.TemporaryDirectory(prefix="demorec_") as folder:
@@ -87,13 +87,13 @@ def _vhacd(surface: str) -> list[Array]:
 
 @functools.lru_cache(maxsize=1024)
 def at_rest(text: str) -> tuple[str, float]:
-    """A solid turned about horizontal axes as it rests, with its centre of mass at the origin, and how high that is.
+    """Turn a solid about horizontal axes into its resting pose, with the centre of mass at the origin.
 
     Args:
-        text: As of `Shape.mesh`, in a pose near to one in which it rests.
+        text: Solid as in `Shape.mesh`, near one of its resting poses.
 
     Returns:
-        The same kind of text, and the height of its origin above the table, metres.
+        The turned solid as text, and the height of its origin above the table, metres.
 
     Raises:
         SceneError: It is still moving after four seconds.

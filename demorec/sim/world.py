@@ -1,7 +1,7 @@
 """One simulated world, built from a `Scene` alone and stepped by commands.
 
-An episode is a pure function of scene and commands: everything is built anew at each reset, in a fixed order, with
-every engine parameter set (PyBullet leaks some of them into later clients of the process).
+An episode is a pure function of scene and commands: each reset rebuilds everything in a fixed order and sets every
+engine parameter (PyBullet leaks some of them into later clients of the process).
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from demorec.sim.sensors import SENSORS
 SETTLE_SECONDS = 0.1
 """Physics time before the first frame, so that objects rest on their support."""
 MAX_PRESS_FORCE = 100.0
-"""N; no real hand presses on an object harder."""
+"""Maximum force, N, with which a real hand presses on an object."""
 MAX_PRESS_DEPTH = 1e-3
-"""Metres; no link of a real hand sinks in deeper."""
+"""Maximum depth, metres, to which a link of a real hand sinks into an object."""
 HULL_MARGIN = 1e-3
-"""Metres by which Bullet's hull of a mesh stands out from it; boxes and cylinders have their margin inside."""
+"""Margin of Bullet's hull around a mesh, metres; boxes and cylinders have their margin inside."""
 
 
 class World:
@@ -50,7 +50,7 @@ class World:
         self.fps = fps
         self.client: Any = connect()
         self.joint_samples: tuple[JointSample, ...] = ()
-        """Of the last control step, both ends left out."""
+        """Joint states of the last control step, first and last excluded."""
         self._sample_joints = sample_joints
         self._scene: Scene | None = None
         self._shape_rows: ShapeRows = ()
@@ -64,12 +64,12 @@ class World:
         self.close()
 
     def close(self) -> None:
-        """Free the client; harmless when called twice."""
+        """Free the client; safe to call twice."""
         self.client.disconnect()
 
     @property
     def scene(self) -> Scene:
-        """The scene of the last reset."""
+        """Scene of the last reset."""
         if self._scene is None:
             raise RuntimeError("the world is empty: call reset first")
         return self._scene
@@ -78,14 +78,14 @@ class World:
         """Empty the world, build `scene` and let it settle for 0.1 s.
 
         Raises:
-            SceneError: A model file is missing or broken, two bodies have one name, or the scene's robot is another.
+            SceneError: A model file is missing or broken, two bodies share a name, or the scene has a different robot.
             ConfigError: The frame rate does not divide the physics rate.
         """
         if scene.robot.name != self.robot.name:
-            raise SceneError(f"The scene is for the robot {scene.robot.name!r}, this world has {self.robot.name!r}.")
+            raise SceneError(f"The scene is for the robot {scene.robot.name!r}, the world has {self.robot.name!r}.")
         names = [body.name for body in scene.bodies]
         if len(set(names)) != len(names):
-            raise SceneError(f"Two bodies of the scene have one name: {', '.join(sorted(names))}.")
+            raise SceneError(f"Two bodies of the scene share a name: {', '.join(sorted(names))}.")
         if scene.physics.hz % self.fps:
             raise ConfigError(f"fps is {self.fps}, which does not divide the physics rate of {scene.physics.hz} Hz.")
         self._scene = scene
@@ -111,7 +111,7 @@ class World:
             self.client.stepSimulation()
 
     def hold(self) -> Action:
-        """The command that keeps the present targets."""
+        """Build the command that keeps the current targets."""
         return self.arm.action(self.arm.target.copy(), self.arm.gripper_target)
 
     def apply(self, command: Action) -> None:
@@ -140,10 +140,10 @@ class World:
         self.arm.target = end.copy()
 
     def _hold_by_constraint(self, command: Action) -> None:
-        """Fix a body to the hand once both closing fingers press on it, until the gripper is told to open.
+        """Fix a body to the hand once both closing fingers press on it, until a command opens the gripper.
 
-        The shortcut of many PyBullet tutorials, instead of friction. What happens depends on the world's state and the
-        commands alone, so that a recording replays without being told when the constraint was made.
+        A shortcut of many PyBullet tutorials that replaces friction. It depends only on the world's state and the
+        commands, so that a recording replays without storing when the constraint was made.
         """
         arm, client = self.arm, self.client
         if command.gripper_target > arm.gripper_target + 1e-6:
@@ -159,7 +159,7 @@ class World:
                 tcp = arm.links[self.robot.tcp_link]
                 hand = client.getLinkState(arm.body, tcp, computeForwardKinematics=True)
                 place = client.getBasePositionAndOrientation(index)
-                # The constraint's frames are those of the centres of mass: [0:2] of a link state.
+                # The constraint's frames are at the centres of mass: [0:2] of a link state.
                 position, quat = client.multiplyTransforms(*client.invertTransform(*hand[0:2]), *place)
                 self._constraint = client.createConstraint(
                     arm.body, tcp, index, -1, client.JOINT_FIXED, [0, 0, 0], position, [0, 0, 0], quat
@@ -167,9 +167,9 @@ class World:
                 return
 
     def _set_iterations(self) -> None:
-        """More of them for what the fingers hold: as few as suffice for all else would leave them deep in light things.
+        """Set more solver iterations while the fingers hold a body; the default lets them sink deep into light objects.
 
-        Bullet finds contacts before bodies touch, so that the last step's are in time.
+        Bullet finds contacts before bodies touch, so the contacts of the last step are early enough.
         """
         physics = self.scene.physics
         if not physics.grip_iterations:
@@ -181,7 +181,7 @@ class World:
             self._iterations = wanted
 
     def observe(self) -> Observation:
-        """All that is sensed now."""
+        """Read all sensors."""
         position, velocity, effort = self.arm.joint_states()
         n = len(self.robot.arm_joints)
         return Observation(
@@ -200,11 +200,11 @@ class World:
         )
 
     def body(self, name: str) -> Body:
-        """The scene's body called `name`; KeyError when there is none."""
+        """Return the scene's body called `name`; KeyError if it does not exist."""
         return self._specs[name]
 
     def visuals(self) -> tuple[VisualBody, ...]:
-        """What can be seen, in the order of loading; the same object as long as no colour or shape is changed.
+        """Return the visible bodies in loading order; the same object until a colour or shape changes.
 
         Raises:
             RenderError: A shape that no renderer draws.
@@ -223,7 +223,7 @@ class World:
         return self._visuals
 
     def mounts(self) -> dict[str, Mount]:
-        """Links of the robot, by name, for cameras."""
+        """Return the robot's links by name, as mounts of cameras."""
         to_base = base_from_inertial(self.client, self.arm.body).inverse()
         return {
             name: Mount(body=self.arm.body, link=link, link_from_mount=to_base if link == -1 else None)
@@ -231,11 +231,11 @@ class World:
         }
 
     def poses(self) -> Array:
-        """(n, 7) poses of all bodies and links now, as `demorec.render.Renderer.render` takes them."""
+        """Read (n, 7) poses of all bodies and links, as `demorec.render.Renderer.render` takes them."""
         return body_poses(self.client)
 
     def pose(self, name: str) -> Pose:
-        """`world_from_body` of a body of the scene."""
+        """Read `world_from_body` of a body of the scene."""
         position, quat = self.client.getBasePositionAndOrientation(self._bodies[name])
         centre = Pose(position=np.array(position), quat_xyzw=np.array(quat))
         inertial = self.inertial_poses[name]
@@ -244,12 +244,12 @@ class World:
         return centre @ inertial.inverse()
 
     def velocity(self, name: str) -> tuple[Array, Array]:
-        """Linear (m/s) and angular (rad/s) velocity of a body of the scene, each (3,)."""
+        """Read linear (m/s) and angular (rad/s) velocity of a body of the scene, each (3,)."""
         linear, angular = self.client.getBaseVelocity(self._bodies[name])
         return np.array(linear), np.array(angular)
 
     def finger_forces(self, name: str) -> tuple[float, ...]:
-        """Normal force (N) of each finger on a body of the scene."""
+        """Read the normal force (N) of each finger on a body of the scene."""
         return tuple(
             float(
                 sum(contact[9] for contact in self.client.getContactPoints(self.arm.body, self._bodies[name], link, -1))
@@ -258,16 +258,16 @@ class World:
         )
 
     def grip_force(self, name: str) -> float:
-        """With what force (N) the hand grips a body of the scene; 0 when a finger does not touch it."""
+        """Compute the force (N) with which the hand grips a body of the scene; 0 unless every finger touches it."""
         return min(self.finger_forces(name))
 
     def pressed_from_above(self, name: str, *, force: float = 3.0) -> bool:
-        """Whether the hand pushes down on a body with more than `force` N (at a contact steeper than 45 degrees)."""
+        """Check whether the hand pushes down on a body with more than `force` N (contacts steeper than 45 degrees)."""
         contacts = self.client.getContactPoints(self.arm.body, self._bodies[name])
         return any(abs(contact[7][2]) > 0.7 and contact[9] > force for contact in contacts)
 
     def crushed(self) -> str:
-        """The movable body that a link of the robot presses on harder than a real hand could; "" for none."""
+        """Find a movable body on which a robot link presses harder than a real hand could; "" if none."""
         for body in self.scene.movable:
             index, forces = self._bodies[body.name], dict[int, float]()
             touching = self.client.getContactPoints(self.arm.body, index)
@@ -275,28 +275,28 @@ class World:
                 forces[contact[3]] = forces.get(contact[3], 0.0) + contact[9]
                 if contact[8] < -MAX_PRESS_DEPTH or forces[contact[3]] > MAX_PRESS_FORCE:
                     return body.name
-            # Contact points lie where the bodies were before the last step; a blow may have turned one since.
+            # Contact points are where the bodies were before the last step; a blow may have turned one since.
             for point in self.client.getClosestPoints(self.arm.body, index, -MAX_PRESS_DEPTH) if touching else ():
                 if -point[8] > MAX_PRESS_DEPTH + self._margin(self.arm.body, point[3]) + self._margin(index, point[4]):
                     return body.name
         return ""
 
     def _margin(self, body: int, link: int) -> float:
-        """How far Bullet's shape of a link, -1: the base, is beyond its true one, metres."""
+        """Compute how far Bullet's shape of a link (-1: the base) extends beyond the true one, metres."""
         shapes = self.client.getCollisionShapeData(body, link)
         return HULL_MARGIN if any(shape[2] == self.client.GEOM_MESH for shape in shapes) else 0.0
 
     def touches_robot(self, name: str) -> bool:
-        """Whether any part of the robot touches a body of the scene."""
+        """Check whether any part of the robot touches a body of the scene."""
         return bool(self.client.getContactPoints(self.arm.body, self._bodies[name]))
 
     def touches(self, name: str, other: str, *, gap: float = 5e-4) -> bool:
-        """Whether two bodies of the scene are closer than `gap` metres."""
+        """Check whether two bodies of the scene are closer than `gap` metres."""
         contacts = self.client.getContactPoints(self._bodies[name], self._bodies[other])
         return any(contact[8] < gap for contact in contacts)
 
     def state_digest(self) -> str:
-        """SHA-256 (hex) over positions and velocities of all joints and movable bodies, every bit."""
+        """Compute SHA-256 (hex) over positions and velocities of all joints and movable bodies, bit by bit."""
         sha = hashlib.sha256()
         position, velocity, _ = self.arm.joint_states()
         sha.update(position.tobytes())
@@ -312,7 +312,7 @@ class World:
         """Place joints and bodies without physics, at rest, to draw a recorded state.
 
         Args:
-            joint_position: (n_joints,), fingers included; None leaves the robot as it is.
+            joint_position: (n_joints,), fingers included; None keeps the robot's.
             object_poses: name -> world_from_body; bodies left out stay.
         """
         if joint_position is not None:
@@ -326,7 +326,7 @@ class World:
 
 
 def set_engine(client: Any, physics: Physics) -> None:
-    """Set every engine parameter, those at their default value too: some survive resetSimulation."""
+    """Set every engine parameter, including those at their default: some survive resetSimulation."""
     client.setGravity(*physics.gravity)
     client.setPhysicsEngineParameter(
         fixedTimeStep=1.0 / physics.hz,
@@ -348,6 +348,6 @@ def set_engine(client: Any, physics: Physics) -> None:
         globalCFM=0.0,
         minimumSolverIslandSize=1,
         warmStartingFactor=0.85,
-        # About the joint that has the sensor, along the axes of the link that it carries.
+        # Measure at the joint that has the sensor, along the axes of the link that it carries.
         jointFeedbackMode=client.JOINT_FEEDBACK_IN_JOINT_FRAME,
     )

@@ -328,7 +328,7 @@ def test_random_shapes_are_closed_and_lie_flat() -> None:
 def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"no \.obj, \.stl or \.glb"):
         load_shelf(f"{tmp_path}/")
-    with pytest.raises(ConfigError, match="was not found"):
+    with pytest.raises(ConfigError, match="does not exist"):
         load_shelf(f"{tmp_path}/missing/")
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
     with pytest.raises(ConfigError, match="no triangles"):

@@ -3,9 +3,9 @@
     import demorec.extensions.policies.gym_env
     env = gymnasium.make("demorec/PickPlace-v0", cameras=("front", "wrist"), split="eval")
 
-World, cameras, renderer and feature vectors are those of the recordings: stepping a recording's commands through the
-environment gives the recorded observations, bit-exact. Every task of `demorec list tasks` is registered when this
-module is imported; `env_id` registers somebody else's.
+World, cameras, renderer and feature vectors are the same as in the recordings: stepping a recording's commands through
+the environment returns the recorded observations, bit-exact. Importing this module registers every task of
+`demorec list tasks`; `env_id` registers a custom one.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ from demorec.render.painter import Painter, WarmRenderer
 from demorec.sim.world import World
 
 SUCCESS_FRAMES = 5
-"""For how many frames in a row every check of the task must hold."""
+"""Consecutive frames for which every check of the task must hold."""
 SECONDS_PER_GOAL = 15.0
-"""Time limit for each object to be moved, about twice what the expert takes."""
+"""Time limit per object to be moved, about twice the expert's time."""
 PROBED_SCENES = 16
-"""How many scenes are looked at to tell whether the number of objects varies."""
+"""Number of scenes examined to decide whether the number of objects varies."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Situation:
-    """What the simulation is at after a reset or a step, unrounded: what a recorder or an analysis needs.
+    """State of the simulation after a reset or a step, unrounded, for recorders and analyses.
 
     Attributes:
         frame_index: Control steps since the reset.
-        observation: Now.
-        images: camera name -> images now.
-        last_frame: The frame of the step that led here, with what was commanded; None after a reset.
-        checks: The task's conditions with the values found now.
-        is_success: Whether all of them have held for `SUCCESS_FRAMES` frames.
+        observation: Current observation.
+        images: Camera name -> current images.
+        last_frame: Frame of the preceding step, with its command; None after a reset.
+        checks: The task's success conditions with their current values.
+        is_success: Whether all conditions have held for `SUCCESS_FRAMES` frames.
     """
 
     frame_index: int
@@ -66,42 +66,44 @@ class Situation:
 
 
 class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
-    """One task: the robot acts until the task's strict conditions have held for 5 frames, or time is up.
+    """One task: the robot acts until the task's strict conditions have held for 5 frames, or time runs out.
 
-    Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`, with `privileged`
-    `environment_state`, with `sensed` the features that it names without the prefix `observation.`, with cameras
-    `pixels` (camera name -> (H, W, 3) uint8): see `demorec.episode.features`.
-    Action: float32 of one of the kinds of `demorec.episode.features.action_vectors`; float64 is taken as it is. Targets
-    are held within the joint limits in position and velocity; a pose out of reach keeps the last target.
+    Observation (a dict): `agent_pos` (observation.state), `velocity`, `ee_pose`; with `privileged`,
+    `environment_state`; with `sensed`, the named features without their prefix `observation.`; with cameras, `pixels`
+    (camera name -> (H, W, 3) uint8). See `demorec.episode.features`.
+    Action: float32 of one of the kinds of `demorec.episode.features.action_vectors`; float64 is accepted without
+    rounding. Targets are clamped to the joint limits in position and velocity; an unreachable pose keeps the last
+    target.
     Reward: 1 at the step that completes a success, else 0, as `next.reward` of the datasets.
-    `info["is_success"]` says that the conditions have held for so long (the datasets' `next.success` is how an episode
-    ended); `info["episode_index"]` names the scene; after a step, `info["command"]` is what the motors were sent in it,
-    the row of the datasets' `command` of the frame before.
+    `info["is_success"]` reports whether the conditions have held for 5 frames (the datasets' `next.success` is the
+    outcome of an episode). `info["episode_index"]` names the scene. After a step, `info["command"]` is the command sent
+    to the motors, which the datasets store as `command` of the frame before.
 
-    `reset(seed=N)` gives the scene of episode N of the split, the same whatever was done before; without a seed, a
-    random one. `reset(options={"scene": scene})` gives a scene of a recording.
+    `reset(seed=N)` returns the scene of episode N of the split, independent of earlier calls; without a seed, a random
+    one. `reset(options={"scene": scene})` restores the scene of a recording.
 
     Args:
         task: A name of `demorec list tasks`, or package.module:Name.
         split: "eval": scenes and seeds that `generate-dataset --split train` leaves out; "train", "all": those that it
-            makes.
-        seed: Root of all scenes, as of `generate-dataset`.
+            generates.
+        seed: Root of all scenes, as in `generate-dataset`.
         variation: How much the scenes differ.
-        objects, object_split, robot, fps, physics_hz, width, height, renderer: As of `generate-dataset`.
+        objects, object_split, robot, fps, physics_hz, width, height, renderer: As in `generate-dataset`.
         cameras: Names of `demorec list cameras`.
-        privileged: Whether to give `environment_state`; None: only without cameras, and only for a task whose scenes
-            all have as many numbers to tell, since a space has one length.
-        sensed: Features that datasets have only when named (`export --features`), as "observation.wrench".
-        state: What `agent_pos` holds.
-        action: What an action means.
-        episode_length: Time limit in frames; None: 15 s for each object to be moved.
+        privileged: Whether to return `environment_state`. None: only without cameras, and only if all scenes of the
+            task have an equally long vector, since a space has a fixed length.
+        sensed: Optional features that datasets contain only on request (`export --features`), such as
+            "observation.wrench".
+        state: Content of `agent_pos`.
+        action: Meaning of an action.
+        episode_length: Time limit in frames; None: 15 s per object to be moved.
         render_mode: None or "rgb_array".
-        render_camera: Whose images `render` returns.
-        render_width, render_height: Their size, pixels.
-        config: Everything that decides scenes and images at once; replaces the arguments above that it holds.
+        render_camera: Camera for `render`.
+        render_width, render_height: Size of these images, pixels.
+        config: Full configuration of scenes and images; replaces the arguments above that it contains.
 
     Raises:
-        ConfigError: An unknown name or an impossible value.
+        ConfigError: Unknown name or invalid value.
     """
 
     metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 30}  # noqa: RUF012  (each instance has its own)
@@ -177,7 +179,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     @property
     def info(self) -> EpisodeInfo:
-        """Of the present episode."""
+        """Description of the current episode."""
         return self.episode.info
 
     @property
@@ -187,12 +189,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     @property
     def situation(self) -> Situation:
-        """What the simulation is at, after a reset or a step."""
+        """State of the simulation after a reset or a step."""
         return _after_reset(self._situation)
 
     @property
     def max_episode_steps(self) -> int:
-        """The time limit, frames."""
+        """Time limit, frames."""
         return self._max_episode_steps
 
     @property
@@ -202,16 +204,17 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     @property
     def task_description(self) -> str:
-        """The present episode's instruction, LeRobot's task text."""
+        """Instruction of the current episode, LeRobot's task text."""
         return self.info.instruction
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Begin an episode; see the class for `seed` and for the option "scene".
+        """Begin an episode; the class describes `seed` and the option "scene".
 
         Raises:
-            SceneError: No layout was found, the scene cannot be built, or it has other features than the space says.
+            SceneError: No layout was found, the scene cannot be built, or its features do not match the observation
+                space.
         """
         super().reset(seed=seed)
         scene = (options or {}).get("scene")
@@ -220,8 +223,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         info = self.info
         if self._lengths(info) != self._vector_lengths:
             raise SceneError(
-                f"Episode {index} of {self.config.task!r} has other objects than episode 0, and an environment has one "
-                "observation space: leave privileged out and use cameras."
+                f"Episode {index} of {self.config.task!r} has different objects from episode 0, but an environment has "
+                "one observation space: leave privileged out and use cameras."
             )
         world, renderer = self._simulators.acquire(info)
         session = Session.of_episode(world, self.episode, renderer, only_color=True)
@@ -233,11 +236,11 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return self._observation(self._situation), {"is_success": False, "episode_index": index}
 
     def step(self, action: NDArray[np.floating]) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One control step; ValueError for an action of a wrong shape or with a value that is no number."""
+        """Advance by one control step; ValueError if the action has a wrong shape or a value that is not finite."""
         return self.act(Step(action=self.command_for(action), phase=POLICY_PHASE))
 
     def command_for(self, action: NDArray[np.floating]) -> Action:
-        """What `step` would send now; errors as there. Deltas go on from here, unless `act` sends something else."""
+        """Compute the command that `step` would send now. Deltas continue from it unless `act` sends another."""
         _after_reset(self._session)
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
@@ -245,7 +248,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return self._decoder.command(values)
 
     def act(self, step: Step) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One control step as `step` makes it, whoever decided it; its command is sent as it is."""
+        """Advance by one control step as `step` does, but send the given step's command unchanged."""
         session = _after_reset(self._session)
         frame = session.frame(step)
         self._decoder.follow(frame.command)
@@ -281,7 +284,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._viewer = self._session = self._situation = None
 
     def _prepare(self, index: int, scene: Scene | None) -> PreparedEpisode:
-        """The first attempt at this episode for which a layout is found, as the generator does it."""
+        """Prepare the first attempt at this episode that has a layout, as the generator does."""
         for attempt in range(self.config.max_attempts):
             try:
                 episode = prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))
@@ -295,7 +298,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return replace(episode, info=with_simulation(episode.info, scene=scene))
 
     def _is_privileged(self) -> bool:
-        """The default: without cameras, and with as many objects in each of the first scenes."""
+        """Default of `privileged`: True without cameras and with equally many objects in each of the first scenes."""
         if self.config.cameras:
             return False
         lengths = set()
@@ -306,7 +309,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return len(lengths) == 1
 
     def _lengths(self, info: EpisodeInfo) -> dict[str, int]:
-        """Dataset feature -> how many numbers it has."""
+        """Map each dataset feature to its number of elements."""
         names = features.observation_names(
             info.simulated.robot,
             info.simulated.scene,
@@ -345,13 +348,13 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
 
 def _key(feature: str) -> str:
-    """A dataset feature's key in the observation, as LeRobot's `preprocess_observation` maps it back."""
+    """Key of a dataset feature in the observation; LeRobot's `preprocess_observation` maps it back."""
     return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
 
 
 def _checked(render_mode: str | None) -> str | None:
     if render_mode not in (None, "rgb_array"):
-        raise ConfigError(f"render_mode is {render_mode!r}, allowed are None and 'rgb_array'.")
+        raise ConfigError(f"render_mode must be None or 'rgb_array', not {render_mode!r}.")
     return render_mode
 
 
@@ -379,10 +382,10 @@ def _after_reset[T](value: T | None, what: str = "episode") -> T:
 
 
 def env_id(task: str) -> str:
-    """Gymnasium's name of a task's environment ("demorec/PickPlace-v0"); registers it where that was not done yet.
+    """Return Gymnasium's name of a task's environment ("demorec/PickPlace-v0"), registering it first if necessary.
 
     Raises:
-        ConfigError: An unknown task.
+        ConfigError: Unknown task.
     """
     TASKS.check_name(task)
     full = environment_name(task)
@@ -390,7 +393,7 @@ def env_id(task: str) -> str:
         gymnasium.register(full, entry_point="demorec.extensions.policies.gym_env:DemorecEnv", kwargs={"task": task})
     elif gymnasium.registry[full].kwargs["task"] != task:
         raise ConfigError(
-            f"Two tasks are called {full!r}: {gymnasium.registry[full].kwargs['task']} and {task}; rename one class."
+            f"Two tasks have the name {full!r}: {gymnasium.registry[full].kwargs['task']} and {task}; rename one class."
         )
     return full
 
