@@ -1,7 +1,7 @@
-"""Images of bodies whose shapes and poses are plain data: colour, depth, segmentation, by any of several renderers.
+"""Images of bodies from shapes and poses as plain data: colour, depth and segmentation, by any of several renderers.
 
-Where shapes and poses come from does not matter to a renderer: the simulator (`demorec.sim.world.World`) provides them,
-and `demorec.render.painter` brings the two together.
+A renderer does not depend on the source of shapes and poses: the simulator (`demorec.sim.world.World`) provides them,
+and `demorec.render.painter` connects the two.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ VisualKind = Literal["box", "sphere", "cylinder", "capsule", "mesh", "plane"]
 
 @dataclass(frozen=True, kw_only=True)
 class Visual:
-    """One shape that can be seen.
+    """One visible shape.
 
     Attributes:
         link: Number of the link that carries it; the body's base is -1.
-        kind: Which geometry; decides what `size` means.
+        kind: Geometry; decides the meaning of `size`.
         size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
-            mesh: (x, y, z) factors by which the file is scaled; plane (z = 0, without end): ().
+            mesh: (x, y, z) scale factors of the file; infinite plane at z = 0: ().
         file: mesh: path of an OBJ, STL or COLLADA file; otherwise "".
-        link_from_shape: Pose in the frame whose pose `Renderer.render` is given for the link.
-        rgba: Colour, 0..1; nothing is drawn with alpha 0.
+        link_from_shape: Pose in the link frame of `Renderer.render`.
+        rgba: Colour, 0..1; alpha 0 is invisible.
     """
 
     link: int
@@ -44,11 +44,11 @@ class Visual:
 
 @dataclass(frozen=True, kw_only=True)
 class VisualBody:
-    """All that can be seen of one body.
+    """All visible shapes of one body.
 
     Attributes:
-        name: For messages.
-        num_links: Beside the base.
+        name: Name for messages.
+        num_links: Number of links, base excluded.
         is_fixed: Whether physics cannot move its base.
         visuals: Its shapes.
         texture: Procedural texture that covers them, or None.
@@ -67,7 +67,7 @@ class Mount:
 
     Attributes:
         body, link: Numbers of the body and of its link; the base is -1.
-        link_from_mount: Pose of the mount's frame in the one whose pose `Renderer.render` is given; None: the same.
+        link_from_mount: Pose of the mount's frame in the link frame of `Renderer.render`; None: identity.
     """
 
     body: int
@@ -77,15 +77,15 @@ class Mount:
 
 @dataclass(frozen=True, kw_only=True)
 class RenderSetup:
-    """What a renderer needs to know about a scene, but for where things are.
+    """Description of a scene for a renderer, without poses.
 
     Attributes:
-        bodies: What can be seen. Segmentation images number a body by its place here.
+        bodies: Visible bodies. Segmentation images number a body by its index here.
         cameras: The cameras to draw, in order.
         mounts: Mount name -> the link that carries its cameras.
         light: Light and sky.
-        depth, segmentation: Whether these are drawn beside colour.
-        antialias: Whether edges are smoothed, where the renderer can.
+        depth, segmentation: Whether these are drawn in addition to colour.
+        antialias: Whether edges are smoothed, if the renderer supports it.
     """
 
     bodies: tuple[VisualBody, ...]
@@ -98,25 +98,25 @@ class RenderSetup:
 
 
 class Renderer(Protocol):
-    """Draws bodies; a context manager, warm across scenes.
+    """Interface of renderers: context managers that are reused across scenes.
 
-    `setup` is called for each scene and whenever its looks change, `render` at each frame. Images are a function of
-    setup and poses alone, on one type of machine.
+    `setup` is called for each scene and whenever its appearance changes, `render` at each frame. Images are a function
+    of setup and poses alone, on one type of machine.
     """
 
     def setup(self, setup: RenderSetup) -> None:
-        """Take over a scene; RenderError names a shape, mesh or camera that cannot be drawn."""
+        """Load a scene; RenderError names a shape, mesh or camera that cannot be drawn."""
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
-        """Camera name -> images, in the order of the cameras.
+        """Draw camera name -> images, in the order of the cameras.
 
         Args:
-            poses: (n, 7) position (metres) and quaternion xyzw in the world: of each body in turn its base, then its
-                links; `first_rows` tells where each body begins.
+            poses: (n, 7) position (metres) and quaternion xyzw in the world: for each body its base, then its links;
+                `first_rows` returns where each body begins.
         """
 
     def close(self) -> None:
-        """Free what is held; harmless when called twice."""
+        """Free all resources; safe to call twice."""
 
     def __enter__(self) -> Renderer: ...
 
@@ -124,16 +124,17 @@ class Renderer(Protocol):
 
 
 def first_rows(bodies: Sequence[VisualBody]) -> list[int]:
-    """Row of each body's base in the poses that `Renderer.render` is given; link n is n + 1 rows below it."""
+    """Compute the row of each body's base in the poses of `Renderer.render`; link n is n + 1 rows below it."""
     return list(accumulate((1 + body.num_links for body in bodies), initial=0))[:-1]
 
 
 MAX_SAMPLES = 1 << 28
-"""Of an image; beyond, buffers would take several GB. (PyBullet ends the process on sizes that it cannot draw.)"""
+"""Maximum samples of an image; beyond it, buffers would take several GB. (PyBullet aborts the process at sizes it
+cannot draw.)"""
 
 
 def check_setup(setup: RenderSetup) -> None:
-    """Raise RenderError for a camera that cannot draw, or whose mount does not exist."""
+    """Raise RenderError if a camera cannot be drawn or its mount does not exist."""
     for camera in setup.cameras:
         name, size = f"Camera {camera.name!r}", f"{camera.width}x{camera.height}"
         if camera.width < 1 or camera.height < 1:
@@ -141,22 +142,22 @@ def check_setup(setup: RenderSetup) -> None:
         samples = camera.width * camera.height * (4 if setup.antialias else 1)
         if samples > MAX_SAMPLES:
             raise RenderError(
-                f"{name} is {size}, {samples} samples an image; allowed are {MAX_SAMPLES}: make it smaller"
+                f"{name} is {size}, {samples} samples per image; the maximum is {MAX_SAMPLES}: make it smaller"
                 f"{' or draw without antialiasing' if setup.antialias else ''}."
             )
         if not 0 < camera.near < camera.far < math.inf:
-            raise RenderError(f"{name} clips at near {camera.near} m and far {camera.far} m: 0 < near < far is needed.")
+            raise RenderError(f"{name} clips at near {camera.near} m and far {camera.far} m: choose 0 < near < far.")
         if not 0 < camera.fov_y < math.pi:
-            raise RenderError(f"{name} has a field of view of {camera.fov_y} rad: allowed is 0 to pi.")
+            raise RenderError(f"{name} has a field of view of {camera.fov_y} rad: choose one between 0 and pi.")
         if camera.mount != "world" and camera.mount not in setup.mounts:
             raise RenderError(
-                f"{name} is mounted on the link {camera.mount!r}, which the robot does not have; allowed are world, "
+                f"{name} is mounted on the link {camera.mount!r}, which the robot does not have; use world, "
                 f"{', '.join(setup.mounts)}."
             )
 
 
 def world_from_camera(setup: RenderSetup, camera: SceneCamera, poses: Array) -> Pose:
-    """Pose of a camera, OpenCV axes, with `poses` as `Renderer.render` is given them."""
+    """Compute the pose of a camera, OpenCV axes, from the `poses` of `Renderer.render`."""
     if camera.mount == "world":
         return camera.mount_from_camera
     mount = setup.mounts[camera.mount]

@@ -13,19 +13,18 @@ from demorec.robots.robot import RobotSpec
 
 @dataclass(frozen=True, kw_only=True)
 class CameraPreset:
-    """A camera before it knows its image size and robot.
+    """A camera preset, independent of image size and robot.
 
     Attributes:
         summary: One line for `demorec list cameras`.
-        mount: "world", or "tcp" for a camera that the hand carries.
-        eye, target: Where it is and what it looks at, in the mount's frame, metres; in the world for an arm of
-            task_scale 1, nearer to a small one.
-        up: Direction that is up in the image, in the mount's frame.
-        usual_mount: Whether the usual place of an arm's camera on the hand (`RobotSpec.wrist_camera`) takes the place
-            of eye, target and up, where the arm has one.
+        mount: "world", or "tcp" for a camera on the hand.
+        eye, target: Position, and point that it looks at, in the mount's frame, metres. In the world frame for an arm
+            of task_scale 1; scaled down for a small one.
+        up: Up direction of the image, in the mount's frame.
+        usual_mount: Whether the arm's usual camera pose on the hand (`RobotSpec.wrist_camera`), if it has one, replaces
+            eye, target and up.
         fov_y: Vertical field of view, rad.
-        fov_x: Horizontal field that it has at least, rad: of an image that is too narrow for it the vertical field
-            becomes wider than `fov_y`.
+        fov_x: Minimum horizontal field of view, rad: in narrow images the vertical one exceeds `fov_y` to reach it.
     """
 
     summary: str
@@ -38,7 +37,7 @@ class CameraPreset:
     usual_mount: bool = False
 
     def camera(self, name: str, robot: RobotSpec, *, width: int, height: int) -> SceneCamera:
-        """The camera for an image size and a robot."""
+        """Build the camera for an image size and a robot."""
         eye, target, up = self.eye, self.target, self.up
         if self.usual_mount and robot.wrist_camera:
             eye, target, up = robot.wrist_camera
@@ -67,15 +66,15 @@ FRONT = CameraPreset(
 )
 
 TOP = CameraPreset(
-    summary="above the table, looking down, the arm comes from below: sees where things stand",
+    summary="above the table, looking down, the arm comes from below: shows where objects are",
     eye=(0.5, 0.0, 1.25),
     target=(0.5, 0.0, 0.0),
     up=(1.0, 0.0, 0.0),
     fov_y=math.radians(38.0),
 )
 
-# The hand stands behind what it reaches for and hides little of it. The region where objects are placed
-# (demorec.tasks.sampling.WORKSPACE) fills images of 7 to 5: 11 mm a pixel at 56 x 40.
+# The hand is behind the objects that it reaches for and hides little of them. The placement region
+# (demorec.tasks.sampling.WORKSPACE) fills 7:5 images: 11 mm a pixel at 56 x 40.
 WORKSPACE = CameraPreset(
     summary="from in front and above, close: sees the objects, the fingers and little else, for small images",
     eye=(1.05, 0.0, 1.0),
@@ -84,7 +83,7 @@ WORKSPACE = CameraPreset(
     fov_x=math.radians(31.0),
 )
 
-# In TCP axes: z out of the hand, y along the fingers' motion; the camera sits on the hand's side, tilted to the tips.
+# In TCP axes: z out of the hand, y along the fingers' motion; the camera is on the hand's side, tilted to the tips.
 WRIST = CameraPreset(
     summary="on the hand, looking at the finger tips",
     mount="tcp",

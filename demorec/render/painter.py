@@ -1,6 +1,6 @@
-"""The one place where a world and a renderer meet: what is drawn, by which cameras, and where these are believed to be.
+"""The only connection between a world and a renderer: bodies, cameras, and the recorded camera poses.
 
-Generation, environments, replay and re-rendering draw through it, with a renderer that is kept warm.
+Generation, environments, replay and re-rendering draw through it, with a reused renderer.
 """
 
 from __future__ import annotations
@@ -18,31 +18,31 @@ from demorec.render import Mount, Renderer, RenderSetup, VisualBody
 
 
 class Drawable(Protocol):
-    """What can be drawn: a simulated world, or one at recorded states."""
+    """A simulated world, or one at recorded states, that can be drawn."""
 
     @property
     def scene(self) -> Scene:
-        """Its light is drawn; its cameras are where they are believed to be."""
+        """Scene with the light to draw and the recorded camera poses."""
 
     def visuals(self) -> tuple[VisualBody, ...]:
-        """What can be seen at present."""
+        """Return the visible bodies."""
 
     def mounts(self) -> Mapping[str, Mount]:
-        """The links that can carry cameras."""
+        """Return the links that can carry cameras."""
 
     def poses(self) -> Array:
-        """(n, 7) where everything is at present, as `Renderer.render` takes it."""
+        """Return the current (n, 7) poses, as `Renderer.render` takes them."""
 
 
 class Painter:
-    """Draws worlds, one after the other, through a renderer, which it leaves open.
+    """Draws a sequence of worlds through a renderer, which it leaves open.
 
     Args:
-        renderer: Entered; kept warm from one world to the next.
-        cameras: Where the cameras really are.
-        true_from_recorded: Camera name -> calibration error, of the cameras that have one.
-        depth, segmentation: Whether these are drawn beside colour.
-        antialias: Whether edges are smoothed, where the renderer can.
+        renderer: Entered renderer, reused from one world to the next.
+        cameras: True camera poses.
+        true_from_recorded: Camera name -> calibration error; only cameras that have one.
+        depth, segmentation: Whether these are drawn in addition to colour.
+        antialias: Whether edges are smoothed, if the renderer supports it.
     """
 
     def __init__(
@@ -67,7 +67,7 @@ class Painter:
         )
 
     def setup(self, world: Drawable) -> None:
-        """Take over a world in a new scene; it is drawn from now on.
+        """Load a world with a new scene, to be drawn until the next call.
 
         Raises:
             RenderError: The renderer cannot draw a shape or camera.
@@ -77,16 +77,16 @@ class Painter:
         self._renderer.setup(self._setup)
 
     def images(self) -> dict[str, CameraImages]:
-        """Camera name -> images of the world's present state, with the poses at which the cameras are believed to be.
+        """Draw the world's current state: camera name -> images, with the recorded poses of the cameras.
 
         Raises:
             RuntimeError: `setup` was not called.
-            RenderError: A shape that was changed since cannot be drawn.
+            RenderError: A shape that has changed cannot be drawn.
         """
         if self._world is None:
             raise RuntimeError("the painter has no world: call setup first")
         bodies = self._world.visuals()
-        if bodies != self._setup.bodies:  # a colour or shape was changed
+        if bodies != self._setup.bodies:  # a colour or shape has changed
             self._setup = replace(self._setup, bodies=bodies)
             self._renderer.setup(self._setup)
         images = self._renderer.render(self._world.poses())
@@ -96,9 +96,9 @@ class Painter:
 
 
 class WarmRenderer(Closing):
-    """Hands out one renderer again and again, and another only when another name is asked for; a context manager.
+    """Context manager that returns the same renderer until another name is requested.
 
-    What it has read of meshes and textures is not read again.
+    Meshes and textures already read are not read again.
     """
 
     def __init__(self) -> None:
@@ -106,11 +106,11 @@ class WarmRenderer(Closing):
         self._renderer: Renderer | None = None
 
     def of(self, name: str) -> Renderer:
-        """The entered renderer of a row of the renderers' table; it stays open, one of another name is closed.
+        """Return the entered renderer of a row in the renderers' table; closes one of another name.
 
         Raises:
-            ConfigError: There is none of that name.
-            MissingDependencyError, RenderError: It cannot work on this machine.
+            ConfigError: Unknown name.
+            MissingDependencyError, RenderError: It does not work on this machine.
         """
         if self._renderer is None or name != self._name:
             self.close()
@@ -118,7 +118,7 @@ class WarmRenderer(Closing):
         return self._renderer
 
     def close(self) -> None:
-        """Free the renderer; harmless when called twice."""
+        """Free the renderer; safe to call twice."""
         renderer, self._renderer = self._renderer, None
         if renderer is not None:
             renderer.close()

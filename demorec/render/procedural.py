@@ -1,6 +1,6 @@
-"""Procedural textures: pixels as a pure function of a `Texture`, the same bits on every machine.
+"""Procedural textures: pixels as a pure function of a `Texture`, bit-exact on every machine.
 
-Integer noise and triangle waves only: the vectorised sines of NumPy may differ in the last bit between CPUs.
+Only integer noise and triangle waves: NumPy's vectorised sines may differ in the last bit between CPUs.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from demorec.episode.scene import Texture
 
 
 def texture_pixels(texture: Texture, size: int = 256) -> NDArray[np.uint8]:
-    """(size, size, 3) RGB pixels."""
+    """Compute (size, size, 3) RGB pixels."""
     axis = (np.arange(size) + 0.5) / size
     v, u = np.meshgrid(axis, axis, indexing="ij")
     mix = _mix(texture, u, v)[..., None]
@@ -22,7 +22,7 @@ def texture_pixels(texture: Texture, size: int = 256) -> NDArray[np.uint8]:
 
 
 def _mix(texture: Texture, u: Array, v: Array) -> Array:
-    """0..1: where each pixel lies between the two colours."""
+    """Compute each pixel's blend between the two colours, 0..1."""
     scale = texture.scale
     match texture.pattern:
         case "plain":
@@ -42,7 +42,7 @@ def _mix(texture: Texture, u: Array, v: Array) -> Array:
 
 
 def _triangle(x: Array) -> Array:
-    """A triangle wave of period 1 between 0 and 1."""
+    """Triangle wave of period 1 between 0 and 1."""
     return np.asarray(np.abs(2.0 * (x - np.floor(x)) - 1.0), dtype=np.float64)
 
 
@@ -71,7 +71,7 @@ def _value_noise(x: Array, y: Array, seed: int) -> Array:
 
 
 def _hash(i: NDArray[np.int64], j: NDArray[np.int64], seed: int) -> Array:
-    """A number in 0..1 for each grid point (the finaliser of MurmurHash3, 64 bits)."""
+    """Hash each grid point to a number in 0..1 (the finaliser of MurmurHash3, 64 bits)."""
     offset = (0x165667B19E3779F9 * (seed + 1)) & (2**64 - 1)
     h = i.astype(np.uint64) * np.uint64(0x9E3779B97F4A7C15) + j.astype(np.uint64) * np.uint64(0xC2B2AE3D27D4EB4F)
     h = h + np.uint64(offset)

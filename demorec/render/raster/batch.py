@@ -18,11 +18,12 @@ from demorec.render.raster.textures import Pixels
 
 Floats32 = NDArray[np.float32]
 SPECULAR_FACES = 100
-"""Shapes with more faces than this shine; boxes and boards stay matt, or whole faces would flash."""
+"""Maximum number of faces of a matt shape; shapes with more have highlights, which on a box or board would light up
+whole faces."""
 
 
 def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *, spare: int = 0) -> Geometry:
-    """Merge meshes given by vertex attributes (v, up to 8: position, normal, u, v) and vertex numbers (f, 3)."""
+    """Merge meshes given as vertex attributes (v, up to 8: position, normal, u, v) and vertex numbers (f, 3)."""
     counts = np.array([len(a) for a in attributes], dtype=np.int64)
     face_counts = np.array([len(f) for f in faces], dtype=np.int64)
     starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
@@ -49,7 +50,7 @@ def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *,
 
 
 def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None], casts: Sequence[bool]) -> Geometry:
-    """Positions only, for the shadow map; those that cast none have no faces."""
+    """Merge positions only, for the shadow map; shapes that cast no shadow get no faces."""
     points, faces = [], []
     for instance, level, does in zip(instances, levels, casts, strict=True):
         piece = instance.model.caster(level) if does else None
@@ -59,7 +60,7 @@ def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None],
 
 
 class Batch(NamedTuple):
-    """All that is drawn for one camera; the rest as of `layout.Looks`."""
+    """Everything drawn for one camera; remaining fields as in `layout.Looks`."""
 
     geometry: Geometry
     face_table: NDArray[np.int32]
@@ -69,11 +70,11 @@ class Batch(NamedTuple):
 
 
 SPARE_VERTICES = 4096
-"""First room for the vertices that clipping makes; grown when it does not suffice."""
+"""Initial capacity for vertices created by clipping; grown on demand."""
 
 
 def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, specular: float) -> Batch:
-    """Merge the instances at the given numbers of faces (None: all of them).
+    """Merge the instances, each at its number of faces (None: all of them).
 
     Args:
         specular: Strength of highlights, 0..1.
@@ -89,7 +90,7 @@ def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, s
         n = len(piece.faces)
         attributes.append(piece.scaled_vertices(instance.scale))
         is_mirrored = float(np.prod(instance.scale)) < 0
-        faces.append(piece.faces[:, ::-1] if is_mirrored else piece.faces)  # they still look outward
+        faces.append(piece.faces[:, ::-1] if is_mirrored else piece.faces)  # they still face outward
         table = np.zeros((n, 4), dtype=np.int32)
         table[:, layout.FACE_FLAGS] = piece.flags
         table[:, layout.FACE_SEGMENT] = instance.segment

@@ -19,10 +19,10 @@ from demorec.render.raster.mesh import Floats
 from demorec.render.raster.stage import Stage
 
 SHADOW_OFFSET = 0.006
-"""How far a point is at least lifted off its surface before it is looked up in the shadow map, metres: the map holds
-coarser meshes than the image, and half of it leaves blotches."""
+"""Minimum offset of a point from its surface in a shadow map lookup, metres: the map has coarser meshes than the image,
+and half of it leaves blotches."""
 SHADOW_OFFSET_TEXELS = 2.2
-"""And in texels: less leaves stripes where the light grazes a surface, since 3x3 texels are looked at."""
+"""Minimum of the same offset in texels: less leaves stripes at grazing light, since a lookup reads 3x3 texels."""
 Int32s = NDArray[np.int32]
 
 
@@ -32,18 +32,17 @@ class Canvas:
     Args:
         camera: Size, lens and clipping distances.
         batch: The scene's meshes at this camera's level of detail.
-        stage: What all cameras share.
-        setup: Its light colours the sky; its flags say whether depth and segmentation are drawn, and whether a pixel
-            has 2x2 samples.
+        stage: State shared by all cameras.
+        setup: Its light colours the sky; its flags select depth, segmentation and 2x2 samples per pixel.
 
     Attributes:
-        samples: Along a pixel's side, 1 or 2.
-        values, ids: (H * samples, W * samples) inverse depths, and the records that they came from.
-        pixel_ids: (H, W) records of pixels, or what stands for them (layout); not antialiased: `ids` itself.
+        samples: Samples along a pixel's side, 1 or 2.
+        values, ids: (H * samples, W * samples) inverse depths, and their records.
+        pixel_ids: (H, W) records of pixels, or the special values of `layout`; not antialiased: `ids` itself.
         edges: y * W + x of pixels that are shaded sample by sample.
-        geometry: The batch's, with vertices of its own.
-        records: The triangles that were drawn.
-        looks, still_looks: What decides the colour of pixels, and of what stands still with its own shadows alone.
+        geometry: The batch's, with separate vertices.
+        records: The triangles drawn.
+        looks, still_looks: Colour inputs of all pixels, and of the static layer with its own shadows alone.
     """
 
     def __init__(self, camera: SceneCamera, batch: Batch, stage: Stage, setup: RenderSetup) -> None:
@@ -83,7 +82,7 @@ class Canvas:
         self.still_looks = self.looks._replace(heights=stage.still_heights.reshape(-1))
 
     def aim(self, pose: Floats) -> None:
-        """Matrices of the camera and of every instance, and the sky's rays."""
+        """Compute the matrices of the camera and of every instance, and the sky's rays."""
         stage, camera = self._stage, self.camera
         aim_camera(pose, self._lens, self._focal, camera.width, camera.height, self._clip_from_world, self.looks.sky)
         project_instances(
@@ -100,7 +99,7 @@ class Canvas:
         )
 
     def new_images(self) -> Images:
-        """Images to be filled."""
+        """Allocate the images."""
         h, w = self.camera.height, self.camera.width
         return Images(
             np.empty((h, w, 3), dtype=np.uint8),
@@ -109,14 +108,14 @@ class Canvas:
         )
 
     def clear(self) -> None:
-        """Nothing but background."""
+        """Clear to the background."""
         self.values.fill(self._far_value)
         self.ids.fill(layout.BACKGROUND)
 
     def draw_instances(
         self, first: int, last: int, record: int, vertex: int, left: Int32s, right: Int32s
     ) -> tuple[int, int]:
-        """Draw instances; returns the next free record and vertex, or -1 after the buffers have been enlarged."""
+        """Draw instances; returns the next free record and vertex, or -1 after enlarging the buffers."""
         stage = self._stage
         sh, sw = self.ids.shape
         transform_vertices(
@@ -148,7 +147,7 @@ class Canvas:
             right,
         )
         if record < 0:
-            # More triangles were clipped than there was room for.
+            # Clipping created more vertices than the buffer can hold.
             vertices = self.geometry.vertices
             more = np.zeros(max(4 * layout.BLOCK, len(vertices)), dtype=np.float32)
             self.geometry = self.geometry._replace(vertices=np.concatenate([vertices, more]))
@@ -166,7 +165,7 @@ class Canvas:
         everything: bool,
         still: Floats32 | None,
     ) -> tuple[int, int]:
-        """Shade the pixels of records from `first` (all with `everything`); returns the numbers of edges and mixed."""
+        """Shade the pixels of records from `first` (all with `everything`); returns edge and mixed counts."""
         lowest = layout.BACKGROUND if everything else first
         records, face_table, looks = self.records, self.looks.face_table, self.looks
         if still is None:
@@ -186,7 +185,7 @@ class Canvas:
         return counts
 
     def finish_edges(self, images: Images, edge_count: int, mixed_count: int, looks: Looks) -> None:
-        """Shade the listed edges, and see what lies at the centres of mixed pixels; nothing when not antialiased."""
+        """Shade the listed edges, and resolve mixed pixels at their centres; no effect without antialiasing."""
         if self.samples == 1:
             return
         shade_edges(edge_count, self.edges, self.ids, self.records, looks, images.color)
@@ -215,7 +214,7 @@ def _empty_records(count: int) -> Records:
 
 
 def _sky_table(light: Light) -> Floats32:
-    """See kernels.layout; the rays are those of no camera yet."""
+    """Build the table of kernels.layout; the rays are set by the first camera."""
     table = np.zeros(layout.SKY_SIZE, dtype=np.float32)
     sky = 255 * np.asarray(light.sky_color, dtype=np.float64)
     table[layout.SKY_HORIZON : layout.SKY_ZENITH] = sky + 0.35 * (250 - sky) * (sky < 250)

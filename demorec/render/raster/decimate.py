@@ -1,4 +1,4 @@
-"""Meshes with fewer triangles for small images: geometry by quadric collapse, looks taken over from the original."""
+"""Meshes with fewer triangles for small images: quadric collapse, with the original's appearance."""
 
 from __future__ import annotations
 
@@ -10,25 +10,25 @@ from numpy.typing import NDArray
 from demorec.render.raster.mesh import Faces, Floats, RasterMesh, cached_mesh, face_normals, make_mesh, unit, weld
 
 SMALLEST = 64
-"""Triangles below which nothing is decimated."""
+"""Number of triangles below which nothing is decimated."""
 SAMPLES = 60_000
-"""Points on the original surface from which colours are taken over."""
+"""Number of points on the original surface at which colours are sampled."""
 _STUCK = 6.0
-"""Times as many triangles as were asked for, from which on the mesh is coarsened before: a Panda's have up to 5.2 times
-as many in small images, SO-101's as published 10 to 100 times."""
+"""Ratio of triangles to the target above which the mesh is coarsened first; a Panda's meshes reach 5.2 in small images,
+the published SO-101's 10 to 100."""
 _CELL = 2.0
-"""Extents of the mesh, over the triangles asked for: cells in which its points become one. A quarter of a pixel where
-a mesh keeps 9 triangles for each pixel."""
+"""Size of the cells in which points are merged: this times the mesh's extent, divided by the target. A quarter of a
+pixel at 9 triangles a pixel."""
 
 
 def decimated(read: Callable[[], RasterMesh], num_faces: int, target: int, *, key: str) -> RasterMesh:
-    """The mesh with about `target` faces, from the cache when it was made before.
+    """Decimate a mesh to about `target` faces, or read the result from the cache.
 
     Args:
         read: Reads the whole mesh.
-        num_faces: Of the whole mesh.
-        target: Wanted number of faces.
-        key: Digest of the mesh's source, under which it is cached.
+        num_faces: Faces of the whole mesh.
+        target: Target number of faces.
+        key: Digest of the mesh's source; its key in the cache.
     """
     if num_faces <= max(target, SMALLEST):
         return read()
@@ -36,17 +36,17 @@ def decimated(read: Callable[[], RasterMesh], num_faces: int, target: int, *, ke
 
 
 def decimate(mesh: RasterMesh, target: int) -> RasterMesh:
-    """Collapse edges until about `target` faces are left; normals, colours and texture coordinates are transferred."""
+    """Collapse edges until about `target` faces remain; normals, colours and texture coordinates are transferred."""
     points, kept = _collapsed(mesh, target, tolerance=1e-7)
     if len(kept) > _STUCK * target:
-        # Edges that no collapse may touch: CAD programs export holes, threads and letters as they like.
+        # Some edges cannot be collapsed: CAD programs export holes, threads and letters with disconnected vertices.
         points, kept = _collapsed(mesh, target, tolerance=_CELL / target)
     kept = kept[(face_normals(points, kept) ** 2).sum(1) > 0]
     return _take_over_looks(mesh, points, kept)
 
 
 def _collapsed(mesh: RasterMesh, target: int, *, tolerance: float) -> tuple[Floats, Faces]:
-    """Points (v, 3) and faces (f, 3) after points within a tolerance (of the extent) became one and edges collapsed."""
+    """Merge points within a tolerance (times the extent) and collapse edges; returns points (v, 3), faces (f, 3)."""
     import fast_simplification
 
     rows, inverse = weld(mesh.points, tolerance)
@@ -59,14 +59,14 @@ def _collapsed(mesh: RasterMesh, target: int, *, tolerance: float) -> tuple[Floa
 
 
 def _take_over_looks(mesh: RasterMesh, points: Floats, faces: NDArray[np.int32]) -> RasterMesh:
-    """Give the faces the looks of the original's nearest surface that looks the same way."""
-    from scipy.spatial import cKDTree  # takes a third of a second to load, and is needed once for each mesh
+    """Transfer the appearance of the nearest original surface with a similar direction to the faces."""
+    from scipy.spatial import cKDTree  # slow import (0.3 s), needed once for each mesh
 
     extent = float(np.ptp(mesh.points, axis=0).max())
-    turn = 0.05 * extent  # how far away a surface may be, to be preferred to one that looks another way
+    turn = 0.05 * extent  # distance at which a surface is still preferred to one that faces another direction
     source_normals = face_normals(mesh.points, mesh.faces)
     area = np.sqrt((source_normals * source_normals).sum(1))
-    random = np.random.default_rng(0)  # only chooses where the surface is sampled
+    random = np.random.default_rng(0)  # only for the sample points on the surface
     chosen = random.choice(len(area), SAMPLES, p=area / area.sum())
     share = random.random((SAMPLES, 2))
     fold = share.sum(1) > 1
@@ -76,7 +76,7 @@ def _take_over_looks(mesh: RasterMesh, points: Floats, faces: NDArray[np.int32])
     normals = unit(face_normals(points, faces))
     surface = cKDTree(np.concatenate([spots, unit(source_normals)[chosen] * turn], 1))
 
-    # Colours and palette places: the median of four spots of the face, so that a stray one does not decide.
+    # Colours and palette positions: the median of four points of the face, so that one outlier does not decide.
     weights = np.array([[1, 1, 1], [4, 1, 1], [1, 4, 1], [1, 1, 4]], dtype=np.float64)
     weights /= weights.sum(1, keepdims=True)
     inside = np.einsum("kc,fcx->fkx", weights, points[faces]).reshape(-1, 3)
@@ -92,7 +92,7 @@ def _take_over_looks(mesh: RasterMesh, points: Floats, faces: NDArray[np.int32])
     corners = cKDTree(np.concatenate([mesh.points[mesh.faces].reshape(-1, 3), corner_normals * turn], 1))
     queries = np.concatenate([points[faces].reshape(-1, 3), np.repeat(normals, 3, axis=0) * turn], 1)
     taken = corner_normals[corners.query(queries)[1]].reshape(-1, 3, 3)
-    # One that looks away from its face would blacken a corner.
+    # A normal that faces away from its face would blacken a corner.
     away = (taken * normals[:, None, :]).sum(2) < 0.3
     taken[away] = np.broadcast_to(normals[:, None, :], taken.shape)[away]
     return make_mesh(

@@ -1,4 +1,4 @@
-"""Triangle meshes as the renderer wants them, the geometry that is done on them once, and their cache between runs."""
+"""Triangle meshes in the renderer's form, their one-time geometry processing, and their cache between runs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger(__name__)
 Floats = NDArray[np.float64]
 Faces = NDArray[np.int32]
 CREASE_ANGLE = math.radians(35)
-"""Faces that meet at a sharper angle are shaded as an edge."""
+"""Angle between faces, rad, above which they are shaded as an edge."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,8 +31,8 @@ class RasterMesh:
         points: (v, 3) metres, in the shape's frame.
         faces: (f, 3) rows of `points`, counter-clockwise from outside.
         normals: (f, 3, 3) unit normal at each corner.
-        uv: (f, 3, 2) texture coordinates at each corner, v upward; None without.
-        colors: (f, 3) each face's own colour, 0..1, by which the shape's colour is multiplied.
+        uv: (f, 3, 2) texture coordinates at each corner, v upward; None if missing.
+        colors: (f, 3) colour of each face, 0..1, multiplied by the shape's colour.
         texture: Image that covers the faces, or None.
     """
 
@@ -45,7 +45,7 @@ class RasterMesh:
 
     @property
     def num_faces(self) -> int:
-        """f."""
+        """Number of faces, f."""
         return len(self.faces)
 
 
@@ -58,7 +58,7 @@ def make_mesh(
     colors: Floats | None = None,
     texture: Path | None = None,
 ) -> RasterMesh:
-    """A mesh with what is missing made: normals smooth up to the crease angle, white faces; empty faces left out."""
+    """Build a mesh without empty faces; default normals are smooth up to the crease angle, default faces white."""
     faces = np.asarray(faces, dtype=np.int32).reshape(-1, 3)
     keep = np.flatnonzero((face_normals(points, faces) ** 2).sum(1) > 0)
     if len(keep) < len(faces):
@@ -67,7 +67,7 @@ def make_mesh(
     if normals is None:
         normals = crease_normals(points, faces)
     else:
-        # Zero normals, which some exporters write, become the face's.
+        # Zero normals, which some exporters write, are replaced by the face's.
         length = np.sqrt((normals * normals).sum(2, keepdims=True))
         flat = unit(face_normals(points, faces))[:, None, :]
         normals = np.where(length > 1e-6, normals / np.maximum(length, 1e-12), flat)
@@ -82,19 +82,19 @@ def make_mesh(
 
 
 def unit(vectors: Floats) -> Floats:
-    """Vectors (..., 3) to length 1; zero ones stay."""
+    """Normalise vectors (..., 3) to length 1; zero vectors are unchanged."""
     length = np.sqrt((vectors * vectors).sum(-1, keepdims=True))
     return np.asarray(vectors / np.maximum(length, 1e-30))
 
 
 def face_normals(points: Floats, faces: NDArray[np.integer]) -> Floats:
-    """(f, 3) normals, as long as twice the face's area."""
+    """Compute (f, 3) normals with twice the face's area as length."""
     a, b, c = points[faces[:, 0]], points[faces[:, 1]], points[faces[:, 2]]
     return np.asarray(np.cross(b - a, c - a))
 
 
 def weld(points: Floats, tolerance: float = 1e-7) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Rows of the distinct points, and for each point the number of its distinct one."""
+    """Find distinct points; returns their rows, and the number of the distinct point for each point."""
     extent = float(np.ptp(points, axis=0).max()) if len(points) else 1.0
     grid = np.round((points - points.min(0)) / max(extent * tolerance, 1e-12)).astype(np.int64)
     _, rows, inverse = np.unique(grid, axis=0, return_index=True, return_inverse=True)
@@ -102,10 +102,10 @@ def weld(points: Floats, tolerance: float = 1e-7) -> tuple[NDArray[np.int64], ND
 
 
 def crease_normals(points: Floats, faces: Faces, angle: float = CREASE_ANGLE) -> Floats:
-    """(f, 3, 3) corner normals: the area-weighted mean of the faces around a point that lie within `angle`."""
+    """Compute (f, 3, 3) corner normals: the area-weighted mean of the faces around a point within `angle`."""
     if len(faces) == 0:
         return np.zeros((0, 3, 3))
-    from scipy.sparse import coo_matrix  # takes a third of a second to load, and is needed once for each mesh
+    from scipy.sparse import coo_matrix  # slow import (0.3 s), needed once for each mesh
 
     _, inverse = weld(points)
     normals = face_normals(points, faces)
@@ -131,7 +131,7 @@ _SOURCES = ("mesh.py", "mesh_files.py", "decimate.py", "textures.py")
 
 @functools.cache
 def _version() -> str:
-    """Digest of the code that makes meshes: another version reads nothing of this one's."""
+    """Digest of the code that makes meshes, so that another version does not read this one's cache."""
     digest = hashlib.sha256()
     for name in _SOURCES:
         digest.update((Path(__file__).parent / name).read_bytes())
@@ -139,10 +139,10 @@ def _version() -> str:
 
 
 def cached_mesh(key: str, make: Callable[[], RasterMesh]) -> RasterMesh:
-    """The mesh that `make` makes, from the cache when it was made before under this key.
+    """Return a mesh from the cache, or call `make` and store its result under the key.
 
-    A file that cannot be read, whatever the reason, is made anew; a folder that cannot be written to costs time only.
-    Of several processes that ask at once, one makes it and the others wait.
+    An unreadable cache file is replaced; an unwritable folder only costs time. If several processes ask at once, one
+    makes the mesh and the others wait.
     """
     name = hashlib.sha256(key.encode()).hexdigest()[:32]
     path = cache_folder("meshes", _version()) / f"{name}.npz"

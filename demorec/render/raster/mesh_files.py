@@ -24,8 +24,7 @@ def load_mesh(path: Path) -> RasterMesh:
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         raise RenderError(
-            f"The mesh file {path.name!r} cannot be drawn: {', '.join(FORMATS)} are read, convert it to one of them: "
-            f"{path}"
+            f"The mesh file {path.name!r} has an unsupported format: convert it to one of {', '.join(FORMATS)}: {path}"
         )
     try:
         mesh = {".obj": load_obj, ".stl": load_stl, ".dae": load_collada}[suffix](path)
@@ -34,17 +33,17 @@ def load_mesh(path: Path) -> RasterMesh:
     except (ValueError, IndexError, KeyError, ElementTree.ParseError, UnicodeDecodeError) as error:
         raise RenderError(f"The mesh file is broken ({describe_error(error)}): {path}") from error
     if mesh.num_faces == 0:
-        raise RenderError(f"The mesh file holds no triangles: {path}")
+        raise RenderError(f"The mesh file contains no triangles: {path}")
     if not np.isfinite(mesh.points).all():
-        raise RenderError(f"The mesh file holds points that are no numbers: {path}")
+        raise RenderError(f"The mesh file contains points that are not finite: {path}")
     return mesh
 
 
 def load_obj(path: Path) -> RasterMesh:
-    """An OBJ file with its materials.
+    """Read an OBJ file with its materials.
 
-    As in PyBullet the first texture of the file covers all of it. The materials' colours count where there are
-    several and no texture; PyBullet ignores them unless told otherwise.
+    The first texture of the file covers all of it, as in PyBullet. The materials' colours apply if there are several
+    and no texture; PyBullet ignores them by default.
     """
     found = read_obj(path)
     index, faces, materials = found.corners, found.faces, found.materials
@@ -68,7 +67,7 @@ def load_obj(path: Path) -> RasterMesh:
 
 
 def load_stl(path: Path) -> RasterMesh:
-    """A binary or text STL file; normals are made anew, since the file knows only flat ones."""
+    """Read a binary or text STL file; normals are recomputed, since the file has only flat ones."""
     data = path.read_bytes()
     count = int.from_bytes(data[80:84], "little") if len(data) >= 84 else -1
     if len(data) == 84 + 50 * count:
@@ -78,12 +77,12 @@ def load_stl(path: Path) -> RasterMesh:
         words = [line.split() for line in data.decode().splitlines()]
         corners = np.array([[float(v) for v in w[1:4]] for w in words if w and w[0] == "vertex"])
     else:
-        raise ValueError(f"{len(data)} bytes do not hold the {count} triangles that its head tells")
+        raise ValueError(f"{len(data)} bytes cannot contain the {count} triangles stated in its header")
     return make_mesh(corners.reshape(-1, 3), np.arange(len(corners)).reshape(-1, 3))
 
 
 def load_collada(path: Path) -> RasterMesh:
-    """The triangles and polygons of a COLLADA file, placed by the nodes of its scene, in metres."""
+    """Read the triangles and polygons of a COLLADA file, placed by the nodes of its scene, in metres."""
     points, normals = read_collada(path)
     corner_normals = None if normals is None else normals.reshape(-1, 3, 3)
     return make_mesh(points, np.arange(len(points)).reshape(-1, 3), normals=corner_normals)

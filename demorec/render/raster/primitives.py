@@ -10,15 +10,15 @@ from numpy.typing import NDArray
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
 
 SEGMENTS = 64
-"""Around a circle: the outline of a cylinder of 10 cm radius is then within 0.1 mm of round."""
+"""Segments around a circle: the outline of a cylinder of 10 cm radius deviates by less than 0.1 mm."""
 COARSE_SEGMENTS = 24
-"""Around a circle in the shadow map."""
+"""Segments around a circle in the shadow map."""
 PLANE_EXTENT = 100.0
-"""Half the side of the square that stands for an infinite plane, metres."""
+"""Half the side of the square that represents an infinite plane, metres."""
 
 
 def box(*size: float) -> RasterMesh:
-    """A box of three full extents around the origin, the texture once on each side."""
+    """Make a box of three full extents around the origin, with the texture once on each side."""
     corners = np.array([[-1.0, -1.0], [1.0, -1.0], [1.0, 1.0], [-1.0, 1.0]])
     points: list[Floats] = []
     normals: list[Floats] = []
@@ -42,12 +42,12 @@ def box(*size: float) -> RasterMesh:
 
 
 def roundness(segments: int) -> float:
-    """Factor by which a polygon's corners stand outside of a circle, so that it lies as much outside as inside."""
+    """Factor from a circle's radius to a polygon's, so that the polygon is as much outside the circle as inside."""
     return 1 + 2 / 3 * (1 - math.cos(math.pi / segments))
 
 
 def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: int) -> RasterMesh:
-    """A surface of revolution about z.
+    """Make a surface of revolution about z.
 
     Args:
         profile: (n, 2) radius and height, from the lowest point to the highest.
@@ -66,12 +66,12 @@ def revolve(profile: Floats, profile_normals: Floats, along: Floats, segments: i
     u = np.broadcast_to((angles / (2 * math.pi))[:, None], (m, n))
     uv = np.stack([u, np.broadcast_to(along[None, :], (m, n))], 2).reshape(-1, 2)
     faces = _grid_faces(m, n)
-    # At a pole the side that has shrunk to a point makes an empty triangle, which make_mesh leaves out.
+    # At a pole one triangle of each pair is empty, which make_mesh drops.
     return make_mesh(points, faces, normals=normals[faces], uv=uv[faces])
 
 
 def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
-    """(f, 3) two triangles for each cell of a grid of points that are numbered row by row."""
+    """Make (f, 3) faces, two triangles for each cell of a grid of points numbered row by row."""
     i, j = (a.reshape(-1) for a in np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij"))
     a = i * columns + j
     b, c, d = a + columns, a + columns + 1, a + 1
@@ -79,17 +79,17 @@ def _grid_faces(rows: int, columns: int) -> NDArray[np.int64]:
 
 
 def sphere(radius: float, segments: int = SEGMENTS) -> RasterMesh:
-    """A sphere around the origin."""
+    """Make a sphere around the origin."""
     angle = np.linspace(-math.pi / 2, math.pi / 2, segments // 2 + 1)
     normals = np.stack([np.cos(angle), np.sin(angle)], 1)
     normals[[0, -1], 0] = 0.0
-    # revolve rounds the circles of latitude; the meridians are polygons too.
+    # revolve corrects the circles of latitude; the meridians are polygons too.
     profile = normals * [radius, radius * roundness(segments)]
     return revolve(profile, normals, np.asarray(angle / math.pi + 0.5, dtype=np.float64), segments)
 
 
 def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> RasterMesh:
-    """A cylinder along z around the origin, closed."""
+    """Make a closed cylinder along z around the origin."""
     h = length / 2
     profile = np.array([[0, -h], [radius, -h], [radius, -h], [radius, h], [radius, h], [0, h]], dtype=np.float64)
     normals = np.array([[0, -1], [0, -1], [1, 0], [1, 0], [0, 1], [0, 1]], dtype=np.float64)
@@ -97,7 +97,7 @@ def cylinder(radius: float, length: float, segments: int = SEGMENTS) -> RasterMe
 
 
 def capsule(radius: float, length: float, segments: int = SEGMENTS) -> RasterMesh:
-    """A cylinder along z of `length` between the centres of two half spheres."""
+    """Make a cylinder along z of `length` between the centres of two half spheres."""
     angle = np.linspace(0, math.pi / 2, segments // 4 + 1)
     top = np.stack([np.cos(angle), np.sin(angle)], 1)
     top[-1, 0] = 0.0
@@ -111,7 +111,7 @@ def capsule(radius: float, length: float, segments: int = SEGMENTS) -> RasterMes
 
 
 def plane() -> RasterMesh:
-    """A large square in the xy plane that looks up, in cells of 2 m, the texture once on each metre."""
+    """Make a large square in the xy plane that faces up, in cells of 2 m, with the texture once per metre."""
     edge = np.arange(-PLANE_EXTENT, PLANE_EXTENT + 1, 20.0)
     n = len(edge)
     x, y = (a.reshape(-1) for a in np.meshgrid(edge, edge, indexing="ij"))

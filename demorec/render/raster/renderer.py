@@ -1,4 +1,4 @@
-"""The renderer: takes over a scene, then draws all cameras of a step; and the rehearsal that compiles its kernels."""
+"""The renderer: loads a scene, then draws all cameras of a step; and the warm-up that compiles its kernels."""
 
 from __future__ import annotations
 
@@ -24,20 +24,20 @@ from demorec.render.raster.view import CameraView
 log = logging.getLogger(__name__)
 
 FACES_PER_PIXEL = 9.0
-"""Triangles that a mesh keeps for each pixel of its diameter; below about 5, outlines look chipped."""
+"""Triangles of a mesh per pixel of its diameter; below about 5, outlines look chipped."""
 WORKING_DISTANCE = {"world": 0.8, "link": 0.3}
-"""How far from a camera in the world, or on a link, moving things are expected, metres. Levels of detail depend on
-this and not on where things are, so that nothing pops and images depend on the present state alone."""
+"""Expected distance of moving objects from a camera in the world, or on a link, metres. Levels of detail depend on it
+instead of actual distances, so that nothing pops and images depend on the present state alone."""
 CASTER_FACES_PER_METRE = 900.0
-"""Triangles that a mesh keeps in the shadow map for each metre of its diameter."""
+"""Triangles of a mesh in the shadow map per metre of its diameter."""
 
 
 class RasterRenderer(Closing):
     """The default renderer, on the CPU, compiled with numba: no system package, no GPU. See docs/rendering.md.
 
     Args:
-        exact: Draw every triangle of every mesh, for depth that must be exact to the file.
-        keep_still: Whether fixed cameras keep what stands still; the images are the same to the bit without.
+        exact: Draw every triangle of every mesh, for depth that matches the file exactly.
+        keep_still: Whether fixed cameras reuse static pixels; the images are bit-exact either way.
     """
 
     def __init__(self, *, exact: bool = False, keep_still: bool = True) -> None:
@@ -50,15 +50,15 @@ class RasterRenderer(Closing):
         warm_up()
 
     def close(self) -> None:
-        """Free buffers, meshes and textures; harmless when called twice."""
+        """Free buffers, meshes and textures; safe to call twice."""
         self._setup, self._stage, self._views = None, None, []
         self._store = ModelStore()
 
     def setup(self, setup: RenderSetup) -> None:
-        """Take over a scene.
+        """Load a scene.
 
         Raises:
-            RenderError: A shape, mesh, texture or camera that cannot be drawn, by name.
+            RenderError: A shape, mesh, texture or camera, named in the message, cannot be drawn.
         """
         check_setup(setup)
         self._setup = setup
@@ -80,13 +80,13 @@ class RasterRenderer(Closing):
             self._views.append(CameraView(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
 
     def _level(self, instance: Instance, camera: SceneCamera) -> int | None:
-        """Return how many faces an instance keeps for a camera."""
+        """Compute the number of faces of an instance for a camera."""
         distance = WORKING_DISTANCE["world" if camera.mount == "world" else "link"]
         pixels = 2 * instance.radius * float(camera.intrinsics[1, 1]) / distance
         return power_of_two(FACES_PER_PIXEL * pixels)
 
     def render(self, poses: Array) -> dict[str, CameraImages]:
-        """Camera name -> images, with poses (n, 7) as of `Renderer.render`; RuntimeError without a scene."""
+        """Draw camera name -> images, with poses (n, 7) as in `Renderer.render`; RuntimeError without a scene."""
         setup, stage = self._setup, self._stage
         if setup is None or stage is None:
             raise RuntimeError("the renderer has no scene: call setup first")
@@ -98,25 +98,25 @@ class RasterRenderer(Closing):
 
 
 def shadow_size(height: int) -> int:
-    """Texels along the shadow map's side, for images of a height."""
+    """Choose the side of the shadow map, texels, for images of a height."""
     return 512 if height <= 128 else 768 if height <= 320 else 1024
 
 
 def power_of_two(count: float) -> int:
-    """The nearest power of two, so that few levels are made and cached; at least 64."""
+    """Round to the nearest power of two, at least 64, so that few levels are made and cached."""
     return 1 << max(6, round(math.log2(max(count, 1.0))))
 
 
 def caster_faces(instance: Instance) -> int:
-    """How many faces an instance keeps in the shadow map."""
+    """Compute the number of faces of an instance in the shadow map."""
     return power_of_two(CASTER_FACES_PER_METRE * 2 * instance.radius)
 
 
 @functools.cache
 def warm_up() -> None:
-    """Compile the kernels unless that was done before, by this process or another; once for each kind of CPU.
+    """Compile the kernels unless this or another process has done so; once for each kind of CPU.
 
-    Call it before several processes start: they then find compiled code instead of each making it.
+    Call it before starting several processes: they then find compiled code instead of each compiling it.
     """
     folder = compiled_folder()
     done = folder / "complete"

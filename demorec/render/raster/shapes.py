@@ -1,4 +1,4 @@
-"""What is in the scene: visual shapes as instances of meshes."""
+"""Visual shapes of the scene as instances of meshes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Piece:
         vertices: (v, 8) position, normal, texture coordinates (u, v).
         faces: (f, 3) rows of `vertices`.
         flags: (f,) layout.SMOOTH or 0, and layout.TEXTURED.
-        groups: (f,) faces of one colour and, where flat, direction have one number, from 0.
+        groups: (f,) number, from 0, shared by faces of one colour and, if flat, one direction.
         colors: (f, 3) 0..1; white when textured.
         points, point_faces: (p, 3), (f, 3) positions alone, welded, for the shadow map.
     """
@@ -46,7 +46,7 @@ class Piece:
     point_faces: NDArray[np.int64]
 
     def scaled_vertices(self, scale: Floats) -> Floats:
-        """(v, 8) with each axis scaled, normals upright again."""
+        """Scale each axis of the (v, 8) vertices and recompute their unit normals."""
         result = self.vertices.copy()
         result[:, :3] *= scale
         result[:, 3:6] = unit(result[:, 3:6] / scale)
@@ -54,7 +54,7 @@ class Piece:
 
 
 def make_piece(mesh: RasterMesh, *, textured: bool) -> Piece:
-    """Lay a mesh out."""
+    """Convert a mesh to vertices and faces for drawing."""
     n = mesh.num_faces
     uv = mesh.uv if textured and mesh.uv is not None else np.zeros((n, 3, 2))
     corners = np.concatenate([mesh.points[mesh.faces], mesh.normals, uv], 2).reshape(-1, 8)
@@ -77,16 +77,16 @@ def make_piece(mesh: RasterMesh, *, textured: bool) -> Piece:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Model:
-    """A mesh of a file or a primitive, before scaling.
+    """A mesh from a file or a primitive, before scaling.
 
     Attributes:
-        key: Digest of what it was made from: equal keys, equal meshes.
+        key: Digest of its source: equal keys mean equal meshes.
         read: Reads all its triangles, which are not kept: those of a Panda take 17 MB.
         points: (v, 3) corners of all its triangles.
         num_faces: Number of all its triangles.
         has_uv: Whether it has texture coordinates.
         texture: Image that covers it, or None.
-        coarse: For the shadow map, of a primitive; primitives are always drawn whole.
+        coarse: Mesh of a primitive for the shadow map; primitives are always drawn whole.
     """
 
     key: str
@@ -100,7 +100,7 @@ class Model:
     _spheres: dict[bytes, tuple[Floats, float]] = field(default_factory=dict)
 
     def piece(self, target: int | None, *, textured: bool) -> Piece:
-        """The mesh with about `target` faces (None: all), laid out for drawing; made once."""
+        """Return the mesh with about `target` faces (None: all), prepared for drawing; computed once."""
         if self.coarse is not None:
             target = None
         place = (target, textured)
@@ -110,7 +110,7 @@ class Model:
         return self._pieces[place]
 
     def caster(self, target: int | None) -> Piece:
-        """The same for the shadow map, where textures do not matter."""
+        """Return the same for the shadow map, without textures."""
         if self.coarse is None:
             return self.piece(target, textured=False)
         if "caster" not in self._pieces:
@@ -118,7 +118,7 @@ class Model:
         return self._pieces["caster"]
 
     def bounding_sphere(self, scale: Floats) -> tuple[Floats, float]:
-        """Centre (3,) and radius of a sphere around the scaled mesh."""
+        """Compute centre (3,) and radius of a sphere around the scaled mesh."""
         place = scale.tobytes()
         if place not in self._spheres:
             points = self.points * scale
@@ -145,14 +145,14 @@ class Instance:
 
     Attributes:
         segment: Its number in segmentation images.
-        row: Of its link in the poses that are drawn.
+        row: Row of its link in the poses.
         model: Its mesh.
-        scale: (3,) of the mesh.
+        scale: (3,) scale of the mesh.
         link_from_shape: (3, 4).
         color: (3,) 0..1.
         texture: Pixels, or None.
         stands: Whether physics cannot move it.
-        has_links: Whether its body has links that reach around its base.
+        has_links: Whether its body has links that extend around its base.
         centre, radius: Bounding sphere in the shape's frame.
     """
 
@@ -169,22 +169,22 @@ class Instance:
     radius: float
 
     def piece(self, target: int | None) -> Piece:
-        """Its mesh with about `target` faces, None for all of them; not scaled yet.
+        """Return its mesh with about `target` faces (None: all), before scaling.
 
-        Textured meshes keep all: their texture coordinates would not survive.
+        Textured meshes keep all faces: decimation would destroy their texture coordinates.
         """
         return self.model.piece(None if self.texture is not None else target, textured=self.texture is not None)
 
 
 @dataclass
 class ModelStore:
-    """Meshes and textures that were loaded, kept across scenes; files are looked at again when they change."""
+    """Loaded meshes and textures, kept across scenes; changed files are read again."""
 
     _models: dict[tuple[Any, ...], Model] = field(default_factory=dict)
     _images: dict[tuple[Any, ...], Pixels] = field(default_factory=dict)
 
     def file(self, path: Path) -> Model:
-        """The model of a mesh file; RenderError when it cannot be read."""
+        """Load the model of a mesh file; RenderError if it cannot be read."""
         try:
             stat = path.stat()
         except OSError as error:
@@ -197,7 +197,7 @@ class ModelStore:
         return self._models[place]
 
     def _read_file(self, path: Path, digest: str) -> tuple[RasterMesh, str]:
-        """Return the mesh of a file, a palette's colours on its faces, and the digest of the file and its texture."""
+        """Read a mesh file, palette colours on its faces; returns the mesh, and the digest of file and texture."""
         mesh = cached_mesh(digest, lambda: load_mesh(path))
         if mesh.texture is None or mesh.uv is None:
             return mesh, digest
@@ -207,25 +207,25 @@ class ModelStore:
         return mesh if colors is None else replace(mesh, colors=colors, texture=None), key
 
     def primitive(self, name: str, *size: float) -> Model:
-        """A box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
+        """Make a box (x, y, z), sphere (radius), cylinder or capsule (radius, length), or plane ()."""
         place = (name, *size)
         if place not in self._models:
             make: Any = getattr(primitives, name)
             mesh = coarse = make(*size)
-            if name not in ("box", "plane"):  # which have no curves
+            if name not in ("box", "plane"):  # no curved surface
                 coarse = make(*size, segments=primitives.COARSE_SEGMENTS)
             self._models[place] = _model_of(mesh, key=repr(place), read=lambda: mesh, coarse=coarse)
         return self._models[place]
 
     def procedural(self, texture: Texture) -> Pixels:
-        """A procedural texture's image."""
+        """Draw a procedural texture's image."""
         place = (texture,)
         if place not in self._images:
             self._images[place] = texture_pixels(texture)
         return self._images[place]
 
     def image(self, path: Path) -> Pixels:
-        """A texture file's image."""
+        """Read a texture file's image."""
         try:
             place = (str(path), path.stat().st_mtime_ns)
         except OSError as error:
@@ -236,7 +236,7 @@ class ModelStore:
 
 
 def _source_digest(path: Path) -> str:
-    """Digest of a mesh file, its place (a mesh holds the path of its texture) and its materials."""
+    """Digest of a mesh file, its path (a mesh stores the path of its texture) and its materials."""
     data = path.read_bytes()
     digest = hashlib.sha256(f"{path} ".encode() + data)
     for line in re.findall(rb"^mtllib\s+(.+?)\s*$", data, re.MULTILINE):
@@ -247,10 +247,10 @@ def _source_digest(path: Path) -> str:
 
 
 def make_instances(bodies: Sequence[VisualBody], store: ModelStore) -> list[Instance]:
-    """The instances of the scene, those that stand still first.
+    """Create the instances of the scene, static ones first.
 
     Raises:
-        RenderError: A shape or texture that cannot be drawn, with the body and link that it belongs to.
+        RenderError: A shape or texture cannot be drawn; the message names its body and link.
     """
     instances = []
     for number, (body, row) in enumerate(zip(bodies, first_rows(bodies), strict=True)):
@@ -282,7 +282,7 @@ def make_instances(bodies: Sequence[VisualBody], store: ModelStore) -> list[Inst
 
 
 def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
-    """The model and its scale."""
+    """Return the model and its scale."""
     one, size = np.ones(3), visual.size
     match visual.kind:
         case "mesh":
@@ -300,7 +300,7 @@ def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
 
 
 def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Pixels | None:
-    """The image that covers a shape: one that was set on it, else the mesh file's own."""
+    """Choose the image that covers a shape: one set on it, else the mesh file's."""
     if texture is not None and model.has_uv:
         return store.procedural(texture)
     if model.texture is not None and model.has_uv:

@@ -1,4 +1,4 @@
-"""What all cameras of a step share: poses, light and the shadow map."""
+"""State shared by all cameras of a step: poses, light and the shadow map."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from demorec.render.raster.mesh import Floats
 from demorec.render.raster.shapes import Instance
 
 REACH = 0.9
-"""How far a robot's shadow is expected around its base, metres."""
+"""Expected extent of a robot's shadow around its base, metres."""
 LARGEST_RADIUS = 1.2
-"""Of the shadowed region, metres: beyond, texels would grow coarse. What lies outside is lit."""
+"""Maximum radius of the shadowed region, metres: a larger one would make texels coarse. The outside is lit."""
 LARGE = 2.0
-"""Shapes of a larger radius (floors) receive shadows but cast none."""
+"""Radius above which shapes (floors) receive shadows but cast none, metres."""
 BELOW = -1e9
 """Height of the empty shadow map."""
 
@@ -31,7 +31,7 @@ class Stage:
     """The scene's instances, their poses at this step and the shadow that they cast.
 
     Args:
-        instances: Those that stand still first.
+        instances: Instances, static ones first.
         light: Direction, colour and strengths.
         shadow_size: Texels along the side of the shadow map; a multiple of the tile.
         caster_faces: Faces of each instance in the shadow map, None for all.
@@ -58,13 +58,13 @@ class Stage:
         self.light_in_shape = np.zeros((n, 3))
         self.light_table = _light_table(light)
         self.still_version = 0
-        """Grows when something of what stands still was moved after all."""
+        """Increases when a static instance has been moved."""
         self._still_pose: bytes | None = None
 
         direction = np.asarray(light.direction, dtype=np.float64)
         length = math.sqrt(float((direction * direction).sum()))
         if length == 0 or not math.isfinite(length):
-            raise RenderError(f"The light's direction is {light.direction}: it needs a finite length above 0.")
+            raise RenderError(f"The light's direction is {light.direction}: give a finite vector of length above 0.")
         self.light = direction / length
         self.shadow_size = shadow_size
         self.shadow_from_world: Floats = np.zeros((3, 4))
@@ -78,9 +78,9 @@ class Stage:
         self._bounds = np.array([shadow_size, 0, shadow_size, 0], dtype=np.int64)
 
     def _fit_shadow(self) -> tuple[Floats, float]:
-        """(3, 4) world to shadow map (texels, texels, metres), and metres a texel.
+        """Compute (3, 4) world to shadow map (texels, texels, metres), and metres per texel.
 
-        The region depends on what stands still alone: a shadow must not change because something moved elsewhere.
+        The region depends on static instances alone: a shadow must not change because of motion elsewhere.
         """
         low, high = np.full(3, np.inf), np.full(3, -np.inf)
         for number, instance in enumerate(self.instances):
@@ -109,9 +109,9 @@ class Stage:
         return matrix, 1 / scale
 
     def update(self, poses: Floats) -> None:
-        """Take over poses, as `Renderer.render` is given them, and draw the shadow map.
+        """Set the poses of `Renderer.render` and draw the shadow map.
 
-        What stands still is drawn once, what moves each time.
+        Static instances are drawn once, moving ones each time.
         """
         self.pose = poses[self._rows]
         still_pose = self.pose[: self.num_still].tobytes()
@@ -157,7 +157,7 @@ class Stage:
 
 
 def _light_table(light: Light) -> NDArray[np.float32]:
-    """See kernels.layout; surfaces that look up get a little more of the ambient light than those that look down."""
+    """Build the table of kernels.layout; surfaces that face up get slightly more ambient light than those below."""
     table = np.zeros(layout.LIGHT_SIZE, dtype=np.float32)
     table[layout.AMBIENT] = light.ambient * 0.88
     table[layout.AMBIENT_UP] = light.ambient * 0.12

@@ -1,4 +1,4 @@
-"""Textures as pyramids of ever smaller images, and palettes turned into face colours."""
+"""Textures as mip pyramids, and palettes turned into face colours."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ Pixels = NDArray[np.uint8]
 
 
 def load_image(path: Path) -> Pixels:
-    """(H, W, 3) uint8 RGB of an image file; RenderError names one that cannot be read."""
+    """Read (H, W, 3) uint8 RGB of an image file; RenderError names the file if that fails."""
     try:
         with Image.open(path) as image:
             return np.asarray(image.convert("RGB"))
     except UnidentifiedImageError as error:
-        raise RenderError(f"The texture is no image that can be read: {path}") from error
+        raise RenderError(f"The texture is not a readable image: {path}") from error
     except OSError as error:
         raise RenderError(f"The texture cannot be read ({describe_error(error)}): {path}") from error
 
@@ -34,10 +34,10 @@ KEPT_PYRAMIDS = 32
 
 
 def pyramid(image: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
-    """As `make_pyramid`; those of the last images are kept, since most scenes share them."""
+    """Return `make_pyramid` of an image; recent ones are cached, since most scenes share them."""
     found = _pyramids.pop(id(image), None)
     if found is None:
-        found = (image, *make_pyramid(image))  # the image itself too, so that its id stays its own
+        found = (image, *make_pyramid(image))  # keeps the image alive, so that its id stays unique
     _pyramids[id(image)] = found
     if len(_pyramids) > KEPT_PYRAMIDS:
         _pyramids.popitem(last=False)
@@ -45,9 +45,9 @@ def pyramid(image: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
 
 
 def make_pyramid(pixels: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
-    """Packed texels of each level, from the largest, and log2 of the largest's side.
+    """Compute packed texels of each level, from the largest, and log2 of the largest level's side.
 
-    Each level is square, a power of two wide, and carries its first row and column again at the end, so that a
+    Each level is square with a power of two as side, and repeats its first row and column at the end, so that a
     bilinear lookup needs no second wrap.
     """
     side = min(LARGEST_SIDE, 1 << max(0, math.ceil(math.log2(max(pixels.shape[:2])))))
@@ -63,7 +63,7 @@ def make_pyramid(pixels: Pixels) -> tuple[list[NDArray[np.uint32]], int]:
 
 
 def pack(images: list[Pixels]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """All pyramids in one array, and (textures, MIP_LEVELS + 1) where each level starts; the last column is log2."""
+    """Concatenate all pyramids; also returns (textures, MIP_LEVELS + 1) level starts, then log2."""
     texels: list[NDArray[np.uint32]] = [np.zeros(2, dtype=np.uint32)]
     table = np.zeros((max(1, len(images)), MIP_LEVELS + 1), dtype=np.int64)
     start = 2
@@ -78,13 +78,13 @@ def pack(images: list[Pixels]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
 
 
 PALETTE_ERROR = 4.0
-"""Mean difference (of 255) within the faces up to which a texture counts as a palette."""
+"""Maximum mean difference (of 255) within the faces of a palette texture."""
 PALETTE_COLORS = 24
-"""And so few colours cover nearly all of the surface."""
+"""Maximum number of colours of a palette, which cover nearly all of the surface."""
 
 
 def palette_colors(mesh: RasterMesh, image: Pixels) -> Floats | None:
-    """(f, 3) face colours 0..1 of a mesh whose faces each lie on one colour of the texture; None when they do not.
+    """Compute (f, 3) face colours 0..1 if each face is on one colour of the texture; else None.
 
     Such a texture is a palette: colours by face are faster, do not bleed into each other in small images, and
     survive decimation.

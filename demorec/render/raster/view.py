@@ -1,4 +1,4 @@
-"""One camera's images: everything redrawn, or what stands still kept and only the rest redrawn."""
+"""One camera's images: everything redrawn, or static pixels kept and only the rest redrawn."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from demorec.render.raster.stage import Stage
 
 @dataclass(eq=False)
 class _Still:
-    """What stands still before a fixed camera, as drawn with its own shadows alone.
+    """Static instances before a fixed camera, drawn with their own shadows alone.
 
     Attributes:
-        key: What it depends on: camera pose and the poses of what stands still.
+        key: Its inputs: camera pose and the poses of static instances.
         images: Finished images.
         values, ids: Samples.
         pixel_ids: Records of pixels.
-        num_records, num_vertices: Used up by it.
-        tile_start, tile_pixels, gathered: Which pixels look into which shadow tile, and their terms.
+        num_records, num_vertices: Number that it uses.
+        tile_start, tile_pixels, gathered: Pixels that read each shadow tile, and their terms.
     """
 
     key: tuple[bytes, int]
@@ -49,8 +49,8 @@ class CameraView:
 
     Args:
         canvas: The camera's buffers.
-        stage: What all cameras share.
-        keep_still: Whether what stands still is kept between images (fixed cameras).
+        stage: State shared by all cameras.
+        keep_still: Whether static pixels are kept between images (fixed cameras).
     """
 
     def __init__(self, canvas: Canvas, stage: Stage, *, keep_still: bool) -> None:
@@ -60,14 +60,14 @@ class CameraView:
         self._still: _Still | None = None
         h, w = canvas.camera.height, canvas.camera.width
         sh, sw = canvas.ids.shape
-        # Extents of what moves: in samples, and in pixels.
+        # Extents of moving instances: in samples, and in pixels.
         self._left, self._right = np.full(sh, sw, dtype=np.int32), np.zeros(sh, dtype=np.int32)
         self._pixel_left, self._pixel_right = np.zeros(h, dtype=np.int32), np.zeros(h, dtype=np.int32)
         self._whole_left, self._whole_right = np.zeros(h, dtype=np.int32), np.full(h, w, dtype=np.int32)
         self._scratch_left, self._scratch_right = np.zeros(sh, dtype=np.int32), np.zeros(sh, dtype=np.int32)
 
     def draw(self, world_from_camera: Pose) -> CameraImages:
-        """The image of the stage's present state."""
+        """Draw the image of the stage's current state."""
         pose = world_from_camera.vector()
         self._canvas.aim(pose)
         images = self._draw_changes(pose) if self._keep_still else self._draw(len(self._stage.instances), None)[0]
@@ -79,18 +79,18 @@ class CameraView:
         )
 
     def _draw(self, count: int, still: Floats32 | None) -> tuple[Images, int, int]:
-        """Draw so many instances onto the background.
+        """Draw the first instances onto the background.
 
         Args:
-            count: The first ones.
-            still: As of `Canvas.shade`.
+            count: Number of instances.
+            still: As in `Canvas.shade`.
 
         Returns:
-            The images, and how many records and vertices they have used up.
+            The images, and the number of records and vertices used.
         """
         canvas = self._canvas
         records = -1
-        while records < 0:  # the buffers grow until there is room for all
+        while records < 0:  # the buffers grow until they are large enough
             canvas.clear()
             records, vertices = canvas.draw_instances(
                 0, count, 0, canvas.geometry.num_vertices, self._scratch_left, self._scratch_right
@@ -141,7 +141,7 @@ class CameraView:
         return images
 
     def _draw_still(self, key: tuple[bytes, int]) -> _Still:
-        """Draw what stands still, with its own shadows."""
+        """Draw static instances, with their own shadows."""
         canvas, stage = self._canvas, self._stage
         h, w = canvas.camera.height, canvas.camera.width
         terms = np.zeros((h, w, layout.STILL_SIZE), dtype=np.float32)

@@ -1,1 +1,1 @@
-"""The inner loops, compiled with numba; everything around them is NumPy and plain Python."""
+"""The inner loops, compiled with numba; all other code is NumPy and plain Python."""

@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Pixels of 2x2 samples: which are shaded once, which sample by sample, and whose depth is seen at the centre."""
+"""Pixels of 2x2 samples: shaded once or sample by sample, with the depth at the centre."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from demorec.render.raster.kernels.shade import sky_pixel
 
 EDGE, QUEUED, BACKGROUND = at.EDGE, at.QUEUED, at.BACKGROUND
 STILL = -2
-"""In the image of pixel records: what stood still and was shaded before."""
+"""Value in the image of pixel records for static pixels, already shaded."""
 FLAT_ENOUGH = 0.012
-"""Samples of one surface whose depths differ by less than this share are shaded as one."""
+"""Maximum relative depth difference of samples of one surface that are shaded as one."""
 
 
 @kernel
 def halve_extents(sample_left, sample_right, left, right, pixel_ids):
-    """Clear what the last image left in `pixel_ids` and turn extents in samples into extents in pixels."""
+    """Clear the previous image from `pixel_ids` and convert extents in samples to extents in pixels."""
     for y in range(pixel_ids.shape[0]):
         for x in range(left[y], right[y]):
             pixel_ids[y, x] = STILL
@@ -30,18 +30,18 @@ def halve_extents(sample_left, sample_right, left, right, pixel_ids):
 
 @kernel
 def resolve(left, right, first_record, ids, values, records, face_table, pixel_ids, edges, mixed):
-    """Sort the pixels inside the extents: one surface, background, standing still, or an edge.
+    """Classify the pixels inside the extents: one surface, background, static, or an edge.
 
     Args:
-        first_record: Records below it stand still and were shaded before.
+        first_record: Records below it are static and already shaded.
         ids, values: (2H, 2W) records and inverse depths of the samples.
         pixel_ids: (H, W) result: record, BACKGROUND, STILL or EDGE.
         records: Those from `first_record` on that own a sample are flagged.
         edges: Result: y * W + x of pixels to be shaded sample by sample.
-        mixed: Likewise, of all pixels whose samples differ; of size 0 when they are not wanted.
+        mixed: Result: y * W + x of all pixels with different samples; of size 0 if not requested.
 
     Returns:
-        Numbers of entries in `edges` and in `mixed`.
+        Number of entries in `edges` and in `mixed`.
     """
     width = pixel_ids.shape[1]
     want_mixed = mixed.size > 0
@@ -96,7 +96,7 @@ def resolve(left, right, first_record, ids, values, records, face_table, pixel_i
 
 @kernel
 def shade_edges(count, edges, ids, triangles, looks, color):
-    """Shade the listed pixels sample by sample and mix; equal samples are shaded once."""
+    """Shade the listed pixels sample by sample and average; equal samples are shaded once."""
     width = color.shape[1]
     records = triangles.planes
     origins = triangles.origins
@@ -188,7 +188,7 @@ def shade_edges(count, edges, ids, triangles, looks, color):
 
 @inlined
 def covers(record, point, corners, vertices):
-    """Whether a triangle contains a point of the screen, as of `screen`."""
+    """Check whether a triangle contains a point of the screen, in units of `screen`."""
     a = screen(vertices, index(corners[record, 0]))
     b = screen(vertices, index(corners[record, 1]))
     c = screen(vertices, index(corners[record, 2]))
@@ -197,7 +197,7 @@ def covers(record, point, corners, vertices):
 
 @inlined
 def value_at_centre(x, y, record, triangles):
-    """Inverse depth of a triangle's plane at the centre of a pixel."""
+    """Compute the inverse depth of a triangle's plane at the centre of a pixel."""
     fx = f4(2 * x - triangles.origins[record, 0]) + f4(0.5)
     fy = f4(2 * y - triangles.origins[record, 1]) + f4(0.5)
     planes = triangles.planes
@@ -206,11 +206,11 @@ def value_at_centre(x, y, record, triangles):
 
 @kernel
 def centre_of_mixed(mixed, mixed_count, ids, values, triangles, face_table, vertices, far_value, images):
-    """Depth and segmentation, at the pixel's centre, of pixels whose samples differ.
+    """Resolve depth and segmentation at the centre of pixels with different samples.
 
-    Of the triangles that own a sample of the pixel, or else of its neighbours, the nearest that covers the centre is
-    seen there. Where none does (it lies on a triangle that fell between the samples), the owner of most samples
-    stands for it, its plane kept within the depths of its samples.
+    Candidates are the triangles that own a sample of the pixel, then those of its neighbours; the nearest one that
+    covers the centre is visible there. If none does (the centre is on a triangle that fell between the samples), the
+    owner of most samples is used, its plane clamped to the depths of its samples.
     """
     depth = images.depth
     segments = images.segments
@@ -255,7 +255,7 @@ def centre_of_mixed(mixed, mixed_count, ids, values, triangles, face_table, vert
                     best = record
                     best_value = value
         if best < 0:
-            # Then one that owns a sample of a neighbouring pixel.
+            # Then triangles that own a sample of a neighbouring pixel.
             for s in range(16):
                 sample_x = 2 * x - 1 + (s & 3)
                 sample_y = 2 * y - 1 + (s >> 2)

@@ -1,8 +1,8 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Exact triangle rasterisation: every sample of a mesh is covered once, whatever the order of its triangles.
+"""Exact triangle rasterisation: every sample of a mesh is covered once, in any order of its triangles.
 
-Corners are snapped to 1/256 sample, so that the edge functions are whole numbers, exact in float64; samples on an
-edge belong to the triangle for which it is a top or left edge.
+Corners are snapped to 1/256 sample, so that the edge functions are integers, exact in float64; samples on an edge
+belong to the triangle for which it is a top or left edge.
 """
 
 from __future__ import annotations
@@ -13,35 +13,34 @@ from demorec.render.raster.kernels.jit import f4, f8, i4, index, inlined
 from demorec.render.raster.kernels.layout import SCREEN_X, SCREEN_Y
 
 STRIP = 16
-"""Samples of a row that are tested at once. Fewer, and the compiler would unroll the loop instead of making vector code
-of it."""
+"""Samples of a row tested at once; with fewer, the compiler unrolls the loop instead of vectorising it."""
 NARROW = 3 * STRIP
-"""Triangles narrower than this are tested sample by sample: less work than finding where each of their rows ends."""
+"""Width below which triangles are tested sample by sample: cheaper than computing the end of each row."""
 
 
 @inlined
 def screen(vertices, address):
-    """Where a vertex is: (x, y) in 1/256 sample, whole numbers in float64."""
+    """Read the screen position of a vertex: (x, y) in 1/256 sample, integers in float64."""
     return f8(vertices[address + index(SCREEN_X)]), f8(vertices[address + index(SCREEN_Y)])
 
 
 @inlined
 def doubled_area(a, b, c):
-    """Of a triangle (x, y); positive where its corners go round clockwise, y pointing down."""
+    """Compute twice the area of a triangle (x, y); positive if its corners are clockwise, y pointing down."""
     return (b[0] - a[0]) * (c[1] - a[1]) - (c[0] - a[0]) * (b[1] - a[1])
 
 
 @inlined
 def covered(low, high, count):
-    """The first and the last of `count` samples in a row between two places (1/256 sample)."""
+    """Return the first and last of `count` samples in a row between two positions (1/256 sample)."""
     return max(0, math.ceil((low - 128.0) / 256.0)), min(count - 1, math.floor((high - 128.0) / 256.0))
 
 
 @inlined
 def edge_function(a, b, x, y):
-    """What an edge function gains from one sample to the next, along a row and down, and what it is at (x, y).
+    """Compute an edge function's step from sample to sample, along a row and down, and its value at (x, y).
 
-    It is below zero outside, and on an edge that belongs to the neighbour.
+    It is negative outside, and on an edge that belongs to the neighbour.
     """
     step_x = a[1] - b[1]
     step_y = b[0] - a[0]
@@ -53,9 +52,9 @@ def edge_function(a, b, x, y):
 
 @inlined
 def within_edge(step_x, value, low, high):
-    """The part of a span of samples for which an edge function is not below zero.
+    """Clip a span of samples to those where an edge function is not negative.
 
-    Quotients of exact whole numbers round to the right side.
+    Quotients of exact integers round to the correct side.
     """
     if step_x > 0.0:
         low = max(low, -value / step_x)
@@ -68,14 +67,14 @@ def within_edge(step_x, value, low, high):
 
 @inlined
 def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record, with_ids, left, right):
-    """Draw one triangle of positive area where its value is greater than what is there.
+    """Draw one triangle of positive area where its value exceeds the stored one.
 
     Args:
-        a, b, c: Corners, as of `screen`.
+        a, b, c: Corners, in units of `screen`.
         v0, v1, v2: Value at the corners (inverse depth, height), linear over the image.
-        values, ids: (height * width,) greatest value so far, and the record it came from.
-        with_ids: Whether ids, left and right are kept.
-        left, right: (height,) extents of what was drawn in each row, widened (to the corners, where narrow).
+        values, ids: (height * width,) greatest stored value, and its record.
+        with_ids: Whether ids, left and right are updated.
+        left, right: (height,) extents drawn in each row, widened (to the corners, for narrow triangles).
 
     Returns:
         Whether it may own a sample.
@@ -104,7 +103,7 @@ def fill_triangle(a, b, c, v0, v1, v2, area, width, height, values, ids, record,
     step_y *= 256.0
     span = x_last - x_first
     strips = span // STRIP + 1
-    # What lies beyond the row's end is read and written back: within the image, that is.
+    # Values beyond the row's end are read and written back, which requires them to be inside the image.
     if span < NARROW and y_last * width + x_first + strips * STRIP <= width * height:
         limit = i4(span)
         number = i4(record)

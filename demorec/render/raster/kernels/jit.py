@@ -1,4 +1,4 @@
-"""How the kernels are compiled: flags that keep every bit, and a cache that is right when sources change."""
+"""Compilation of the kernels: flags that keep every bit, and a cache that is invalidated when sources change."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ import numpy as np
 from demorec.core.compiled import njit
 from demorec.core.files import cache_folder
 
-# Only flags that change no finite result: images are equal whatever vector width a CPU has. `contract`, `arcp` and
-# `reassoc` are left out on purpose.
+# Only flags that change no finite result: images are equal for any vector width of the CPU. `contract`, `arcp` and
+# `reassoc` are excluded on purpose.
 _FLAGS = {"nnan", "ninf", "nsz"}
 
 f4 = np.float32
 f8 = np.float64
 i4 = np.int32
 u4 = np.uint32
-index = np.uintp  # an unsigned index spares the test for negative ones
+index = np.uintp  # an unsigned index avoids the test for negative ones
 
 
 @functools.cache
 def compiled_folder() -> Path:
-    """Cache of the compiled code, one folder for each state and place of the sources, numba and kind of CPU.
+    """Create the cache of compiled code, one folder per state and location of the sources, numba and kind of CPU.
 
-    numba compiles again when a kernel's own file has moved or has another modification time, but not when the files of
-    the functions inlined into it have changed: the folder stands for all of that, so that it is complete or empty.
+    numba recompiles when a kernel's own file has moved or its modification time has changed, but not when the files of
+    functions inlined into it have changed. The folder name covers all of that, so that it is complete or empty.
     """
     digest = hashlib.sha256(f"{numba.__version__} {llvmlite.binding.get_host_cpu_name()}".encode())
     for path in sorted(Path(__file__).parent.glob("*.py")):
@@ -41,7 +41,7 @@ def compiled_folder() -> Path:
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
     """Compile a function on first use, cached on disk."""
-    # numba reads the folder while decorating; its own setting is put back for other users of numba.
+    # numba reads the folder while decorating; its own setting is restored for other users of numba.
     before = numba.config.CACHE_DIR
     numba.config.CACHE_DIR = str(compiled_folder())
     try:

@@ -1,9 +1,9 @@
-"""How vertices, faces and records lie in memory: constants shared by all kernels and by the code that fills them.
+"""Memory layout of vertices, faces and records: constants shared by all kernels and by the code that fills them.
 
-Vertices are stored in blocks of `LANES`, attribute after attribute (ROWS of them), in one float32 array. The
-distance between two attributes is thus known to the compiler, which then turns the loops over a block's vertices
-into vector code (numba cannot promise that two arrays do not overlap). A vertex is addressed by the place of its
-first attribute. LANES is no power of two, or all attributes would fall on the same cache lines.
+Vertices are stored in blocks of `LANES`, attribute after attribute (ROWS of them), in one float32 array. The compiler
+thus knows the distance between two attributes and vectorises the loops over a block's vertices (numba cannot guarantee
+that two arrays do not overlap). The address of a vertex is the index of its first attribute. LANES is not a power of
+two, or all attributes would share the same cache lines.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ LANES = 1008
 ROWS = 20
 BLOCK = LANES * ROWS
 
-# Attributes, as distances from a vertex' address.
+# Attributes, as offsets from a vertex' address.
 POS_X = 0
 POS_Y = LANES
 POS_Z = 2 * LANES
@@ -41,9 +41,8 @@ FACE_GREEN = 1
 FACE_BLUE = 2
 FACE_SPECULAR = 3
 
-# Columns of a record: what a triangle needs while it is shaded. Each quantity q is a plane over the image, as
-# value at the origin, step in x, step in y; all but the first, the inverse depth, are divided by depth, so that they
-# are planes at all.
+# Columns of a record: data of a triangle for shading. Each quantity q is a plane over the image, as value at the
+# origin, step in x, step in y. All but the first, the inverse depth, are divided by depth, which makes them planes.
 SHADOW_X_PLANE = 3
 SHADOW_Y_PLANE = 6
 SHADOW_Z_PLANE = 9
@@ -58,7 +57,7 @@ RECORD = 28
 # Values in the image of record numbers.
 BACKGROUND = -1
 EDGE = -3  # shaded sample by sample
-QUEUED = -4  # an edge that is in the list already
+QUEUED = -4  # an edge already in the list
 
 # Columns of the light's table.
 AMBIENT, AMBIENT_UP, DIFFUSE, IN_SHADOW, LIGHT_RED, LIGHT_GREEN, LIGHT_BLUE = range(7)
@@ -72,23 +71,23 @@ SKY_HORIZON = 9
 SKY_ZENITH = 12
 SKY_SIZE = 15
 
-# A pixel that stands still, with what its shading needs: ambient and direct colour, place in the shadow map.
+# A static pixel, with its shading inputs: ambient and direct colour, position in the shadow map.
 STILL_SIZE = 9
 
 TILE_SHIFT = 3
 """Shadow tiles are 8x8 texels."""
 MIP_LEVELS = 11
-"""Columns of the mip table: the first texel of each level; then the log2 of the texture's side."""
+"""Number of columns of the mip table: the first texel of each level; then the log2 of the texture's side."""
 
 
 class Geometry(NamedTuple):
-    """Vertices and faces of all instances, the vertices numbered in their order.
+    """Vertices and faces of all instances; vertices are numbered in the order of the instances.
 
     Attributes:
-        vertex_start, vertex_count: (n,) of each instance.
-        face_start, face_end: (n,) of each instance.
-        vertices: Blocks of vertices, room for spare ones at the end.
-        num_vertices: Without the spare ones.
+        vertex_start, vertex_count: (n,) vertex range of each instance.
+        face_start, face_end: (n,) face range of each instance.
+        vertices: Blocks of vertices, with spare room at the end.
+        num_vertices: Number of vertices, spare ones excluded.
         faces: (f, 3) vertex addresses, counter-clockwise from outside.
     """
 
@@ -102,14 +101,14 @@ class Geometry(NamedTuple):
 
 
 class Records(NamedTuple):
-    """Triangles that cover a sample at least, in the order in which they were drawn.
+    """Triangles that cover at least one sample, in drawing order.
 
     Attributes:
         corners: (r, 3) vertex addresses.
-        faces: (r,) of which face they are, or a part.
-        flags: (r,) 1 where one owns a sample, so that its planes are needed.
+        faces: (r,) face that the triangle is, or is a part of.
+        flags: (r,) 1 if it owns a sample, so that its planes are needed.
         planes: (r, RECORD).
-        origins: (r, 2) the samples where the planes start.
+        origins: (r, 2) samples at the planes' origins.
     """
 
     corners: NDArray[np.int32]
@@ -120,12 +119,12 @@ class Records(NamedTuple):
 
 
 class Looks(NamedTuple):
-    """What decides the colour of a surface, and of the background.
+    """Inputs to the colour of surfaces and background.
 
     Attributes:
-        face_table: (f, 4) flags, texture, segment, group (faces of equal look, which need no edge between).
+        face_table: (f, 4) flags, texture, segment, group (faces of equal appearance, without edges between them).
         face_color: (f, 4) red, green, blue, specular, 0..255 (0..1 with a texture).
-        texels, mips: Packed texels, and (textures, MIP_LEVELS + 1) where their levels start.
+        texels, mips: Packed texels, and (textures, MIP_LEVELS + 1) start of their levels.
         light: (LIGHT_SIZE,) parameters.
         sky: (SKY_SIZE,) rays and colours.
         heights, size: (size * size,) shadow map, and its side.
@@ -142,7 +141,7 @@ class Looks(NamedTuple):
 
 
 class Images(NamedTuple):
-    """(H, W, 3) colour, (H, W) depth and segmentation; the latter two of size (0, 0) when not wanted."""
+    """(H, W, 3) colour, (H, W) depth and segmentation; the latter two of size (0, 0) if not requested."""
 
     color: NDArray[np.uint8]
     depth: NDArray[np.float32]
@@ -150,6 +149,6 @@ class Images(NamedTuple):
 
 
 def addresses(count: int) -> NDArray[np.int64]:
-    """(count,) addresses of the first vertices."""
+    """Compute the (count,) addresses of the first vertices."""
     number = np.arange(count, dtype=np.int64)
     return number // LANES * BLOCK + number % LANES

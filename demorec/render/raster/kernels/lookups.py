@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""What every shaded point looks up: shadow, texture, light, tone. One arithmetic for all paths, so that they agree."""
+"""Lookups of every shaded point: shadow, texture, light, tone. All paths share this arithmetic, so that they agree."""
 
 from __future__ import annotations
 
@@ -8,22 +8,22 @@ import numpy as np
 from demorec.render.raster.kernels.jit import f4, i4, index, inlined, u4
 
 KNEE = 0.8 * 255
-"""Brightness up to which colours are kept as they are."""
+"""Brightness up to which colours are unchanged."""
 ROOM = 255 - KNEE
 
 
 @inlined
 def tone(value):
-    """Light to 0..255: linear up to a knee, then flattening out, so that bright surfaces keep their relief."""
+    """Map light to 0..255: linear up to a knee, then flattening out, so that bright surfaces keep their relief."""
     over = (value - f4(KNEE)) * f4(1 / ROOM)
     return value if value <= f4(KNEE) else f4(KNEE) + f4(ROOM) * (over / (f4(1) + over))
 
 
 @inlined
 def filtered_shadow(heights, q, size, z, fx, fy):
-    """Share of light that reaches height `z`: 3x3 box over bilinear comparisons (16 texels), q the upper-left of 2x2.
+    """Compute the ratio of light at height `z`: 3x3 box over bilinear comparisons (16 texels), q the upper-left of 2x2.
 
-    When the corners of the footprint agree, so does the rest, near enough.
+    If the corners of the footprint agree, the rest is assumed to agree.
     """
     o = q - size - 1
     a = heights[index(o)]
@@ -52,7 +52,7 @@ def filtered_shadow(heights, q, size, z, fx, fy):
 
 @inlined
 def shadow_at(heights, size, x, y, z):
-    """Share of light at a place of the shadow map (texels, metres); 1 outside."""
+    """Compute the ratio of light at a position of the shadow map (texels, metres); 1 outside."""
     limit = f4(size - 2)
     if x >= f4(1) and y >= f4(1) and x < limit and y < limit:
         column = i4(x)
@@ -63,7 +63,7 @@ def shadow_at(heights, size, x, y, z):
 
 @inlined
 def mip_level(density, log2_side):
-    """Level at which a pixel holds about one to two texels; `density` in (texture widths / pixel)^2."""
+    """Choose the level at which a pixel covers one to two texels; `density` in (texture widths / pixel)^2."""
     texels = density * f4(1 << (2 * log2_side))
     level = 0
     while texels > f4(2.0) and level < log2_side:
@@ -74,7 +74,7 @@ def mip_level(density, log2_side):
 
 @inlined
 def texel_at(texels, start, log2_side, u, v):
-    """Bilinear (red, green, blue), 0..255, of one mip level; levels carry a border that repeats their start."""
+    """Interpolate (red, green, blue), 0..255, bilinearly in one mip level; its border repeats its start."""
     scale = f4(256 << log2_side)
     mask = i4((1 << log2_side) - 1)
     pitch = i4((1 << log2_side) + 1)
@@ -88,7 +88,7 @@ def texel_at(texels, start, log2_side, u, v):
 
 @inlined
 def blend_texels(a, b, c, d, iu, iv):
-    """Mix four packed texels by the low 8 bits of `iu`, `iv`; red and blue share one multiplication."""
+    """Interpolate four packed texels by the low 8 bits of `iu`, `iv`; red and blue share one multiplication."""
     pair = u4(0xFF00FF)
     low = u4(255)
     fu = u4(iu & i4(255))

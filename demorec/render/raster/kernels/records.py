@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Which triangles own samples, and the planes over the image that shading needs of them."""
+"""Triangles that own samples, and the image planes of their attributes for shading."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def flag_owners(left, right, first_record, ids, flags):
 
 @inlined
 def set_planes(planes, record, column, vertices, attribute, count, corners, value, step_x, step_y):
-    """Planes of attributes that follow each other, over the image; the weights hold each corner's share over depth."""
+    """Compute the image planes of consecutive attributes; the weights hold each corner's share over depth."""
     a, b, c = corners
     for k in range(count):
         p = vertices[a + index(attribute + k * LANES)]
@@ -62,7 +62,7 @@ def set_up_records(first, last, records, face_table, vertices):
         py = f8((origin_y << 8) + 128)
         records.origins[t, 0] = origin_x
         records.origins[t, 1] = origin_y
-        # Barycentric weights: steps a sample, and values at the origin.
+        # Barycentric weights: steps per sample, and values at the origin.
         a1 = (y2 - y0) * scale
         b1 = (x0 - x2) * scale
         a2 = (y0 - y1) * scale
@@ -85,7 +85,7 @@ def set_up_records(first, last, records, face_table, vertices):
             e1 = (x2 - x1) ** 2 + (y2 - y1) ** 2
             e2 = (x0 - x2) ** 2 + (y0 - y2) ** 2
             if area * area < 65536.0 * max(e0, e1, e2):
-                # Thinner than a sample: the mean normal, where the gradient would run wild.
+                # Thinner than a sample: the mean normal, because the gradient would be unbounded.
                 third = f4(1.0 / 3.0)
                 for k in range(3):
                     place = at.TO_LIGHT + k * LANES
@@ -97,7 +97,7 @@ def set_up_records(first, last, records, face_table, vertices):
             else:
                 set_planes(planes, t, at.TO_LIGHT_PLANE, vertices, at.TO_LIGHT, 3, corners, value, step_x, step_y)
         else:
-            # Flat: the value itself, no plane.
+            # Flat: the value itself, not a plane.
             planes[t, at.TO_LIGHT_PLANE] = vertices[a + index(at.TO_LIGHT)]
             planes[t, at.UPWARD_PLANE] = vertices[a + index(at.UPWARD)]
         if kind & at.TEXTURED:

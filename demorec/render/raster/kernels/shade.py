@@ -1,9 +1,9 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
 """Colour, depth and segmentation of the pixels that one triangle covers, row by row.
 
-A row's runs of equal record are first turned into columns of numbers (light terms, place in the shadow map), then
-the shadow is looked up for the whole row, then colours are made: simple loops over one array with distances known to
-the compiler become vector code; the gathers stand in loops of their own.
+Runs of equal record in a row are first turned into columns of numbers (light terms, position in the shadow map). Then
+the shadow is looked up for the whole row, then colours are computed. Simple loops over one array, with offsets known to
+the compiler, become vector code; the gathers have separate loops.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from demorec.render.raster.kernels.jit import f4, i4, index, inlined, kernel
 from demorec.render.raster.kernels.lookups import blend_texels, filtered_shadow, mip_level, tone
 
 CHUNK = 1024
-"""Pixels that are worked on at once."""
+"""Pixels processed at once."""
 PITCH = CHUNK + 16
 # Columns of the scratch array.
 SHADOW_X = 0
@@ -29,12 +29,12 @@ SPECULAR = 12 * PITCH
 RED, GREEN, BLUE = 13 * PITCH, 14 * PITCH, 15 * PITCH
 COLUMNS = 16
 MIP_BLOCK_SHIFT = 4
-"""The mip level is chosen once for every 16 pixels of a row, at fixed places."""
+"""log2 of the pixels of a row that share one mip level, aligned to fixed positions."""
 
 
 @inlined
 def sky_pixel(sky, x, y):
-    """(red, green, blue) of the background at a pixel: paler towards the horizon."""
+    """Compute (red, green, blue) of the background at a pixel: paler towards the horizon."""
     dx = sky[0] + sky[3] * x + sky[6] * y
     dy = sky[1] + sky[4] * x + sky[7] * y
     dz = sky[2] + sky[5] * x + sky[8] * y
@@ -113,7 +113,7 @@ def texture_run(
 
 @inlined
 def finish_chunk(y, count, columns, scratch, places, looks, color, keep, still):
-    """Shadow, tone and colour of the pixels gathered in scratch."""
+    """Compute shadow, tone and colour of the pixels gathered in scratch."""
     look_up_row(scratch, places, count, looks.heights, looks.size)
     in_shadow = looks.light[at.IN_SHADOW]
     for j in range(count):
@@ -137,14 +137,14 @@ def finish_chunk(y, count, columns, scratch, places, looks, color, keep, still):
 
 @kernel
 def shade_rows(left, right, first_record, ids, samples, triangles, looks, images, still):
-    """Shade the pixels inside the extents whose record is at least `first_record` (-1: background too).
+    """Shade the pixels inside the extents with a record of at least `first_record` (-1: background too).
 
     Args:
         left, right: (H,) extents of each row.
         ids: (H, W) int32 record of each pixel.
         samples: Samples along a pixel's side; records are planes over samples.
         triangles, looks, images: See layout.
-        still: (H, W, STILL_SIZE) what re-shading needs, x being -9 where nothing is; of size 0 when it is not wanted.
+        still: (H, W, STILL_SIZE) result for later shading, x = -9 if empty; of size 0 if not requested.
     """
     records = triangles.planes
     origins = triangles.origins
@@ -172,7 +172,7 @@ def shade_rows(left, right, first_record, ids, samples, triangles, looks, images
     for y in range(ids.shape[0]):
         x = left[y]
         x_end = right[y]
-        filled = np.int64(0)  # no literal, for which all that is inlined would be compiled once more
+        filled = np.int64(0)  # not a literal, which would compile all inlined code once more
         while x < x_end:
             record = ids[y, x]
             xa = x
@@ -198,7 +198,7 @@ def shade_rows(left, right, first_record, ids, samples, triangles, looks, images
                         segments[y, i] = -1
                 continue
             if x - xa > CHUNK:
-                x = xa + CHUNK  # the rest comes round again
+                x = xa + CHUNK  # the next iteration handles the rest
             n = x - xa
             if filled + n > CHUNK:
                 finish_chunk(y, filled, columns, scratch, places, looks, color, keep, still)

@@ -1,6 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""What stands still before a fixed camera: kept from image to image, its shadows looked up anew where they may
-have changed."""
+"""Static surfaces before a fixed camera: kept between images, with shadows updated only where they may change."""
 
 from __future__ import annotations
 
@@ -16,7 +15,7 @@ SHIFT = at.TILE_SHIFT
 
 @kernel
 def restore_samples(values, still_values, ids, still_ids, left, right):
-    """Undo the moving layer of the last image, row by row, and empty the extents."""
+    """Undo the moving layer of the previous image, row by row, and empty the extents."""
     width = ids.shape[1]
     values = values.reshape(-1)
     still_values = still_values.reshape(-1)
@@ -35,12 +34,12 @@ def restore_samples(values, still_values, ids, still_ids, left, right):
 
 @kernel
 def list_tiles(still, pixel_ids, ids, triangles, tiles, size, tile_start, tile_pixels):
-    """For each tile of the shadow map, the pixels that look into it: a pixel y * W + x for each lookup.
+    """List for each shadow map tile the pixels that read it: a pixel y * W + x per lookup.
 
     Args:
         still: (H, W, STILL_SIZE) from shading; pixel_ids, ids: records of pixels and of samples.
-        tile_start: (tiles * tiles + 1,) result, where each tile's pixels start.
-        tile_pixels: Result, large enough for four lookups a pixel.
+        tile_start: (tiles * tiles + 1,) result, start of each tile's pixels.
+        tile_pixels: Result, with room for four lookups per pixel.
     """
     height, width = pixel_ids.shape
     records = triangles.planes
@@ -99,10 +98,10 @@ def gather_still(still, tile_pixels, count, gathered):
 def shade_still(
     touched, tile_start, tile_pixels, gathered, first_record, pixel_ids, still_pixel_ids, looks, color, edges, count
 ):
-    """Shade anew what stands still and looks into a touched tile; edge pixels are appended to `edges` instead.
+    """Shade static pixels that read a touched tile again; edge pixels are appended to `edges` instead.
 
     Returns:
-        The number of entries in `edges`, of which there were `count`; the pixels appended here are marked QUEUED.
+        Number of entries in `edges`, initially `count`; pixels appended here are marked QUEUED.
     """
     width = pixel_ids.shape[1]
     in_shadow = looks.light[at.IN_SHADOW]
@@ -132,7 +131,7 @@ def shade_still(
 
 @kernel
 def clear_queued(edges, first, last, pixel_ids, value):
-    """Take the mark QUEUED off the listed pixels."""
+    """Remove the mark QUEUED from the listed pixels."""
     width = pixel_ids.shape[1]
     for e in range(first, last):
         y = edges[e] // width

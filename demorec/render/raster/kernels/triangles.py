@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""Meshes into the image, clipped and without the faces that look away, and into the shadow map."""
+"""Drawing of meshes into the image, clipped and without back faces, and into the shadow map."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from demorec.render.raster.kernels.jit import f4, f8, index, inlined, kernel
 LANES, BLOCK = at.LANES, at.BLOCK
 CX, CY, CW, SX, SY, IW = at.CLIP_X, at.CLIP_Y, at.CLIP_W, at.SCREEN_X, at.SCREEN_Y, at.INVERSE_W
 GUARD = 16.0
-"""Triangles that reach farther than this many half images from the middle are clipped: beyond, the edge functions
-would leave the whole numbers that float64 holds."""
+"""Distance from the middle, in half images, beyond which triangles are clipped: the edge functions would exceed the
+integers that float64 represents."""
 SHIFT = at.TILE_SHIFT
 
 
 @inlined
 def interpolate_vertex(vertices, new, a, b, t, half_width, half_height):
-    """Put the vertex a + t (b - a) at address `new`, projected."""
+    """Write the projected vertex a + t (b - a) at address `new`."""
     for row in range(6, at.ROWS):
         if row < 8 or row in (8, 9, 10) or row >= 14:
             k = row * LANES
@@ -32,7 +32,7 @@ def interpolate_vertex(vertices, new, a, b, t, half_width, half_height):
 
 @inlined
 def clip_distance(vertices, a, plane, near):
-    """How far inside the near plane (0) or a guard plane (1..4) a vertex is; negative outside."""
+    """Compute a vertex's distance inside the near plane (0) or a guard plane (1..4); negative outside."""
     w = vertices[a + CW]
     if plane == 0:
         return w - near
@@ -47,7 +47,7 @@ def clip_distance(vertices, a, plane, near):
 
 @inlined
 def note_record(records, record, a, b, c, face):
-    """Write down the corners of a triangle, and whose it is."""
+    """Store the corners and the face of a triangle."""
     records.corners[record, 0] = a
     records.corners[record, 1] = b
     records.corners[record, 2] = c
@@ -56,19 +56,19 @@ def note_record(records, record, a, b, c, face):
 
 @kernel
 def draw_instances(first, last, record, next_vertex, geometry, visible, values, ids, near, records, left, right):
-    """Draw the faces of the visible instances `first` .. `last` - 1 that look towards the camera.
+    """Draw the front faces of the visible instances `first` .. `last` - 1.
 
     Args:
         record: Number of the first record to write; a record is one triangle that covers at least one sample.
         next_vertex: Number of the first vertex free for clipping.
         values, ids: (height, width) inverse depth and record numbers of the samples.
-        records: Of which the corners and faces are written.
-        left, right: (height,) extents of what was drawn.
+        records: Records to store corners and faces in.
+        left, right: (height,) extents drawn.
 
     Returns:
-        The next free record and vertex; a record of -1 when the room for clipped vertices or records ran out.
+        The next free record and vertex; a record of -1 if the room for clipped vertices or records is used up.
     """
-    with_ids = np.bool_(True)  # no literal, for which all that is inlined would be compiled once more
+    with_ids = np.bool_(True)  # not a literal, which would compile all inlined code once more
     height, width = ids.shape
     values = values.reshape(-1)
     ids = ids.reshape(-1)
@@ -152,7 +152,7 @@ def draw_instances(first, last, record, next_vertex, geometry, visible, values, 
                     if (du >= f4(0)) != (dv >= f4(0)):
                         new = next_vertex // LANES * BLOCK + next_vertex % LANES
                         next_vertex += 1
-                        # Always from inside to outside: an edge shared by two faces is cut at the same point.
+                        # Always from inside to outside, so that an edge shared by two faces is cut at the same point.
                         if du >= f4(0):
                             interpolate_vertex(vertices, new, u, v, du / (du - dv), half_width, half_height)
                         else:
@@ -194,11 +194,11 @@ def draw_casters(first, last, geometry, size, heights, touched, mark, bounds, no
     Args:
         size: Texels along a side.
         heights: (size * size,) greatest height towards the light.
-        touched: (tiles, tiles) uint8, set where a lookup may see what was drawn (when `mark`).
-        bounds: (4,) x from, x to, y from, y to of what was drawn, widened (when `mark`).
-        nothing: An empty int32 array, in the place of record numbers and extents.
+        touched: (tiles, tiles) uint8, set where a lookup may read the drawn texels (with `mark`).
+        bounds: (4,) first and last x, first and last y drawn, widened (with `mark`).
+        nothing: An empty int32 array that replaces record numbers and extents.
     """
-    record = np.int64(0)  # no literals, see draw_instances
+    record = np.int64(0)  # not literals, see draw_instances
     with_ids = np.bool_(False)
     vertices = geometry.vertices
     for k in range(first, last):

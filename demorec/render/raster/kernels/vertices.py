@@ -1,5 +1,5 @@
 # mypy: allow-untyped-defs, allow-incomplete-defs
-"""From link poses to vertices on the screen, in the light and in the shadow map."""
+"""Transformation of vertices from link poses to the screen, the light and the shadow map."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LX, LY, LZ = at.SHADOW_X, at.SHADOW_Y, at.SHADOW_Z
 def place_instances(
     pose, link_from_shape, shadow_from_world, light, world_from_shape, shadow_from_shape, light_in_shape
 ):
-    """Matrices of every instance that do not depend on a camera.
+    """Compute the camera-independent matrices of every instance.
 
     Args:
         pose: (n, 7) world_from_link, position and quaternion xyzw.
@@ -62,15 +62,15 @@ def place_instances(
 
 @kernel
 def aim_camera(pose, lens, focal, width, height, clip_from_world, sky):
-    """Matrix of a camera, and the rays of its image.
+    """Compute the matrix of a camera, and the rays of its image.
 
     Args:
         pose: (7,) world_from_camera, position and quaternion xyzw, OpenCV axes.
         lens: (2,) focal lengths in half images.
-        focal: In pixels.
+        focal: Focal lengths in pixels.
         width, height: Pixels.
         clip_from_world: (3, 4) result, rows x, y (image between -w and w, y down), w = depth.
-        sky: Result: origin and steps of the rays (see layout); the colours stay.
+        sky: Result: origin and steps of the rays (see layout); the colours are unchanged.
     """
     x = pose[3]
     y = pose[4]
@@ -95,13 +95,13 @@ def aim_camera(pose, lens, focal, width, height, clip_from_world, sky):
 def project_instances(
     world_from_shape, centre, radius, clip_from_world, pose, near, far, clip_from_shape, eye_in_shape, visible
 ):
-    """Matrices of every instance for one camera, and whether its bounding sphere can be seen.
+    """Compute the matrices of every instance for one camera, and whether its bounding sphere is in view.
 
     Args:
         world_from_shape: (n, 3, 4).
         centre, radius: (n, 3), (n,) bounding spheres in the shapes' frames.
         clip_from_world: (3, 4), see `aim_camera`.
-        pose: (7,) world_from_camera, of which the position counts.
+        pose: (7,) world_from_camera, of which only the position is used.
         near, far: Metres.
         clip_from_shape: (n, 3, 4) result.
         eye_in_shape: (n, 3) result.
@@ -129,13 +129,13 @@ def project_instances(
 
 @inlined
 def matrix_row(matrix, row):
-    """A row of a (3, 4) matrix in single precision."""
+    """Convert a row of a (3, 4) matrix to single precision."""
     return f4(matrix[row, 0]), f4(matrix[row, 1]), f4(matrix[row, 2]), f4(matrix[row, 3])
 
 
 @inlined
 def moved(row, x, y, z):
-    """A coordinate of a point that a matrix moves, by its row."""
+    """Compute one coordinate of a transformed point from a row of the matrix."""
     return row[0] * x + row[1] * y + row[2] * z + row[3]
 
 
@@ -157,7 +157,7 @@ def transform_vertices(
     """Fill the per-camera attributes of the vertices of the visible instances `first` .. `last` - 1.
 
     Args:
-        offset: How far along the normal a vertex is moved before it is looked up in the shadow map, metres.
+        offset: Displacement of a vertex along its normal for the shadow map lookup, metres.
         width, height: Samples.
     """
     vertices = geometry.vertices
@@ -243,7 +243,7 @@ def transform_casters(first, last, geometry, shadow_from_shape):
                 x = vertices[i]
                 y = vertices[i + index(PY)]
                 z = vertices[i + index(PZ)]
-                # Texel centres lie at whole numbers of the lookup, at half ones of the rasteriser.
+                # Texel centres are integers in the lookup, half-integers in the rasteriser.
                 vertices[i + index(SX)] = np.floor((moved(s0, x, y, z) + f4(0.5)) * f4(256) + f4(0.5))
                 vertices[i + index(SY)] = np.floor((moved(s1, x, y, z) + f4(0.5)) * f4(256) + f4(0.5))
                 vertices[i + index(IW)] = moved(s2, x, y, z)
