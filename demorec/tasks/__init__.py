@@ -1,1 +1,1 @@
-"""What the robot does: families of tasks, one file each, rows in `demorec.core.tables.TASKS`."""
+"""Robot tasks: families of tasks, one file each, rows in `demorec.core.tables.TASKS`."""

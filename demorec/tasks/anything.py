@@ -1,4 +1,4 @@
-"""A named thing out of several from a shelf goes onto a mark or a plate, or into a tray or a bowl."""
+"""Placing of a named object from an object set onto a mark or a plate, or into a tray or a bowl."""
 
 from __future__ import annotations
 
@@ -26,40 +26,40 @@ from demorec.tasks.trays import IN_TRAY, TRAY_FLOOR, TRAYS, tray
 BESIDE_TRAY = Region(x=(0.33, 0.68), y=(-0.30, 0.15))
 EVERYWHERE = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
 HAND = 0.105
-"""Room, metres, about the middle of what is grasped or put down, for the palm and the fingers."""
+"""Radius, metres, kept free around a grasp or a placement for the palm and the fingers."""
 GAP = 0.02
-"""Between things that stay where they are, metres."""
+"""Minimum gap between objects that are not moved, metres."""
 MOST_THINGS = 6
 MASSES = (0.01, 0.2)
-"""Limits, kg: lighter things take too many iterations (see below), heavier ones slip."""
+"""Range of masses, kg: lighter objects need too many solver iterations (see `_PUSH`), heavier ones slip."""
 _PUSH = 200.0
-"""Acceleration, m/s^2, with which one finger's force would push a thing away, up to which 50 iterations of the solver
-find the forces between two fingers; faster ones take so many times more. With 50, vases of 40 g were sunk into by up to
-2.7 mm, so by 0.7; the fingers' stiffness alone gives 0.2."""
+"""Maximum acceleration, m/s^2, from one finger's force at which 50 solver iterations suffice to balance two fingers;
+higher ones need proportionally more. With 50, fingers penetrated vases of 40 g by up to 2.7 mm; with enough, by 0.7
+(0.2 is due to the fingers' stiffness)."""
 TINTS = (0.6, 0.85)
-"""Of the darker colour of a thing's texture."""
+"""Range of factors from an object's colour to the darker colour of its texture."""
 DRAWS = 50
-"""Of a thing until one rests on a table and can be grasped."""
+"""Maximum attempts to draw an object that rests on a table and can be grasped."""
 NEUTRAL_COLORS: Mapping[str, Rgba] = {"grey": (0.5, 0.5, 0.51, 1.0), "black": (0.15, 0.15, 0.16, 1.0)}
-"""Of what lies about: no colour that an instruction names."""
+"""Colours of distractors; instructions do not name them."""
 DISHES = {"bowl": (0.085, 0.115, 0.03), "plate": (0.08, 0.105, 0.012)}
-"""Round white vessels that stand still: radii of the flat floor and of the rim, and height of the rim, metres."""
+"""Round white fixed vessels: radii of the flat floor and of the rim, and height of the rim, metres."""
 DISH_FLOOR = 0.004
 """Height of a dish's floor above its lower face, metres."""
 BESIDE_THING = 0.015
-"""Of a dish's floor, left free about what is put on its middle, metres."""
+"""Width of a dish's floor left free around an object at its middle, metres."""
 
 
 class PickAnything(TableTask):
-    """Pick up the named thing and put it onto the mark or the plate, or into the tray or the bowl.
+    """Pick up the named object and place it on the mark or the plate, or in the tray or the bowl.
 
-    Task: one to six things from shelves (`--objects`), each of another name or colour; a square mark, or a tray, a bowl
-        or a plate at the robot's left. With `--distractors` as many more things of the same shelves, grey or black.
-    Randomised: which things and their shapes (`--object-split`), places, yaws, colours, densities and frictions by
-        material; what they go to, its place and yaw; the arm's initial joints.
-    Success: the thing's centre within 2 cm of the mark's, or in the tray, bowl or plate, on its floor,
-        standing as it stood within 5 degrees, at rest, not touched; everything else within 2 cm of where it was; the
-        gripper open.
+    Task: one to six objects from object sets (`--objects`), each with a different name or colour; a square mark, or a
+        tray, bowl or plate on the robot's left. `--distractors` adds grey or black objects from the same sets.
+    Randomised: objects and their shapes (`--object-split`), positions, yaws, colours, densities and frictions by
+        material; type, position and yaw of the target; the arm's initial joints.
+    Success: the object's centre within 2 cm of the mark's, or in the tray, bowl or plate, on its floor, tilted by less
+        than 5 degrees from its initial orientation, at rest, not touched; everything else within 2 cm of its initial
+        position; the gripper open.
     """
 
     summary = "the named thing out of one to six, to a mark, a tray, a bowl or a plate"
@@ -87,7 +87,7 @@ class PickAnything(TableTask):
         return replace(scene, bodies=(*scene.bodies, *walls()), physics=physics)
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw objects and goal."""
         things = _things(sampler, 1 + int(sampler.rng.integers(MOST_THINGS)))
         low, high = sampler.ranges.range("distractors")
         things += _things(sampler, int(sampler.rng.integers(int(low), int(high) + 1)), neutral=True)
@@ -118,7 +118,7 @@ class PickAnything(TableTask):
         return [target, wanted, *others], [goal]
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """One of the wordings, filled in."""
+        """Fill in one of the wordings."""
         (goal,) = scene.goals
         name = goal.onto or "green_target"
         place = f"{'in' if name.endswith(VESSELS) else 'on'} the {name.replace('_', ' ')}"
@@ -126,25 +126,25 @@ class PickAnything(TableTask):
 
 
 def radius_of(body: Body) -> float:
-    """Of the circle about a body's origin, seen from above, that holds it, metres."""
+    """Compute the radius, metres, of the circle about a body's origin, seen from above, that contains it."""
     points = decode_mesh(body.shape.mesh).points
     return body.shape.scale * math.sqrt(float((points[:, :2] ** 2).sum(axis=1).max()))
 
 
 def _targets(wanted: Body) -> list[str]:
-    """What a thing can be put to: it has to stand on the flat floor of a dish."""
+    """List the possible targets of an object: it must fit on the flat floor of a dish."""
     room = radius_of(wanted) + BESIDE_THING
     return ["mark", "mark", "tray", *(name for name, (floor, *_) in DISHES.items() if room < floor)]
 
 
 def _things(sampler: Sampler, count: int, *, neutral: bool = False) -> list[Body]:
-    """Up to so many things at the origin, each of another name or colour; fewer where the shelves have no more.
+    """Draw up to `count` objects at the origin, each with a different name or colour; fewer if the sets have no more.
 
-    The first one can be grasped; SceneError when none can. Neutral ones are grey or black and need not.
+    The first one can be grasped; SceneError if none can. Neutral ones are grey or black and need not be graspable.
     """
     kinds = [kind for shelf in sampler.shelves for kind in shelf.kinds if kind.numbers(sampler.object_split)]
     if not kinds:
-        raise SceneError(f"The shelves have nothing for --object-split {sampler.object_split}.")
+        raise SceneError(f"The object sets have no shape for --object-split {sampler.object_split}: choose another.")
     left = [(kind, color) for kind in kinds for color in (NEUTRAL_COLORS if neutral else kind.colors or OTHER_COLORS)]
     things: dict[str, Body] = {}
     for _ in range(DRAWS * count):
@@ -160,7 +160,7 @@ def _things(sampler: Sampler, count: int, *, neutral: bool = False) -> list[Body
             left = [entry for entry in left if (entry[0].noun, entry[1]) != (kind.noun, color)]
             things[thing.name] = thing
     if not things and not neutral:
-        raise SceneError("The gripper finds no grasp of any thing on the shelves: give others with --objects.")
+        raise SceneError("The gripper cannot grasp any object of these sets: choose others with --objects.")
     return list(things.values())
 
 
@@ -168,7 +168,7 @@ _ALL_COLORS = {**COLORS, **NEUTRAL_COLORS}
 
 
 def make_object(sampler: Sampler, kind: Kind, number: int, color_name: str) -> Body:
-    """A thing from a shelf as it rests at the world's origin, with drawn density and friction of its material."""
+    """Make an object in its resting pose at the world's origin, with density and friction of its material."""
     material = MATERIALS[kind.material]
     mesh, height = at_rest(encode_mesh(with_parts(kind.shape(number))))
     solid = decode_mesh(mesh)
@@ -190,7 +190,7 @@ def make_object(sampler: Sampler, kind: Kind, number: int, color_name: str) -> B
 
 
 def _texture(sampler: Sampler, material: Material) -> Texture | None:
-    """Tints of the thing's own colour, so that its word stays true; None where it is plain."""
+    """Draw a texture in tints of the object's colour, so that its colour word stays true; None for a plain surface."""
     pattern, tint = sampler.choice(material.patterns), sampler.uniform(*TINTS)
     if pattern == "plain":
         return None
@@ -203,13 +203,13 @@ def _texture(sampler: Sampler, material: Material) -> Texture | None:
 
 
 def _standing(thing: Body, point: tuple[float, float], yaw: float, role: Role = "object") -> Body:
-    """The thing where it shall stand; from half a millimetre above the table."""
+    """Place an object half a millimetre above the table at a point and yaw."""
     height = float(thing.world_from_body.position[2]) + 5e-4
     return replace(thing, role=role, world_from_body=Pose.from_yaw((*point, height), yaw))
 
 
 def _resting(thing: Body, point: Sequence[float], floor: float = 0.0) -> Pose:
-    """Where the origin of a standing thing is on a floor."""
+    """Compute the pose of an upright object that rests on a floor."""
     return Pose.from_yaw((point[0], point[1], floor + float(thing.world_from_body.position[2]) - 5e-4), 0.0)
 
 
@@ -224,14 +224,14 @@ def _container_and_goal(sampler: Sampler, wanted: Body, onto: str) -> tuple[Body
     if onto == "tray":
         target, floor, area = tray("blue_tray", point, yaw, color_name="blue"), TRAY_FLOOR, IN_TRAY
     else:
-        half = DISHES[onto][0] / math.sqrt(2)  # of the square within the round floor
+        half = DISHES[onto][0] / math.sqrt(2)  # side of the largest square within the round floor
         target, floor, area = _dish_body(onto, point, yaw), DISH_FLOOR, (-half, -half, half, half)
     pose = _resting(wanted, (0.0, 0.0), floor)
     return target, Goal(object=wanted.name, onto=target.name, onto_from_goal=pose, yaw_symmetry=0, area=area)
 
 
 def _dish_body(noun: str, point: tuple[float, float], yaw: float) -> Body:
-    """A white bowl or plate, its origin in its lower face."""
+    """Make a white bowl or plate, its origin in its lower face."""
     mesh = dish(*DISHES[noun], thickness=DISH_FLOOR)
     x, y, z = mesh.extents.tolist()
     return Body(

@@ -1,4 +1,4 @@
-"""What a task is."""
+"""Interface of tasks."""
 
 from __future__ import annotations
 
@@ -20,57 +20,57 @@ from demorec.tasks.skills import Expert
 
 
 class Task(ABC):
-    """Something to be demonstrated: a random layout, words, a script and strict conditions of success.
+    """A task to demonstrate: a random layout, an instruction, a script and strict success conditions.
 
-    A task holds no state of an episode: `sample_scene` puts everything into the scene, and the other methods read
-    it from there, so that one instance serves many episodes.
+    A task is stateless: `sample_scene` puts everything into the scene, and the other methods read it from there, so
+    that one instance serves many episodes.
     """
 
     summary: ClassVar[str]
     """One line for `demorec list tasks`."""
     has_fixed_layout: ClassVar[bool] = False
-    """Whether `--fixed` gives one exact layout instead of a random one."""
+    """Whether `--fixed` selects one exact layout instead of a random one."""
     shelves: ClassVar[tuple[str, ...]] = ()
-    """Rows of `OBJECTS` that it draws from unless --objects names others; empty: it has its own things."""
+    """Rows of `OBJECTS` that it draws from unless --objects names others; empty if it has its own objects."""
     draws_distractors: ClassVar[bool] = False
-    """Whether `sample_scene` itself puts as many distractors among its things as the ranges say."""
+    """Whether `sample_scene` itself adds the number of distractors given by the ranges."""
     camera_presets: ClassVar[Mapping[str, CameraPreset]] = {}
-    """Camera name -> preset in place of the table's, for a scene that the usual view misses."""
+    """Camera name -> preset that replaces the table's, for scenes outside the usual view."""
 
     @classmethod
     def refusal(cls, robot: RobotSpec) -> str:
-        """Why no arm like this one can do it, in words; "": it may."""
+        """Return why a robot cannot do the task, in words; "" if it may."""
         del robot
         return ""
 
     @abstractmethod
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout; no cameras. SceneError when none is found."""
+        """Draw a layout without cameras. SceneError if none is found."""
 
     def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
-        """Whether the arm can do it in this layout; another one is drawn where it cannot.
+        """Check whether the arm can do the task in this layout; if not, another one is drawn.
 
         Args:
-            scene: As it is at the start.
-            robot: At the scene's scale.
-            behaviour: How the expert does it.
+            scene: Scene at the start.
+            robot: Robot at the scene's scale.
+            behaviour: Variation in how the expert does it.
         """
         del scene, robot, behaviour
         return True
 
     @abstractmethod
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
+        """Return the instruction, in words."""
 
     @abstractmethod
     def script(self, expert: Expert) -> Iterator[Step]:
-        """Do it, one control step at a time: the world has advanced when the generator resumes."""
+        """Yield the control steps of the task; the world has advanced when the generator resumes."""
 
     def resume(self, expert: Expert) -> Iterator[Step]:
-        """Do what is left of it from whatever state the world is in; `expert` is made for that state.
+        """Yield the remaining control steps from any state of the world; `expert` is made for that state.
 
-        This one lets go of everything and follows the script from its beginning, unless the scene's goals are served
-        already. Tasks whose goals are the whole aim go on where they are (`demorec.tasks.recovery.finish`).
+        The default releases everything and runs the script from its beginning, unless the scene's goals are met
+        already. Tasks that consist of their goals continue from the current state (`demorec.tasks.recovery.finish`).
         """
         yield from begin_again(expert)
         goals = expert.world.scene.goals
@@ -79,4 +79,4 @@ class Task(ABC):
 
     @abstractmethod
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
-        """The conditions of success, with the values found now."""
+        """Evaluate the success conditions now."""

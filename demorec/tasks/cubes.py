@@ -1,4 +1,4 @@
-"""Cubes onto cubes, two or three high, and off again; three of them in a row."""
+"""Tasks with cubes: stacking two or three, unstacking, and lining up three."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.success import at_most
 
 INNER = Region(x=(0.38, 0.60), y=(-0.22, 0.22))
-"""Where a tower stands: the hand must get above it."""
+"""Region of towers: the hand must reach above them."""
 ROW = Region(x=(0.40, 0.60), y=(-0.10, 0.10))
 ROW_CUBES = Region(x=(0.33, 0.68), y=(-0.33, 0.33))
 REACHABLE = Region(x=WORKSPACE.x, y=(-0.30, 0.30), min_radius=0.33, max_radius=0.70)
@@ -24,10 +24,10 @@ class Stack(TableTask):
     """Pick up one cube and stack it on the other.
 
     Task: two cubes on the table.
-    Randomised: places, yaws, sizes (3-6 cm, the lower one 4-6 cm), masses (20-200 g), frictions (0.4-1.2), which
+    Randomised: positions, yaws, sizes (3-6 cm, the lower one 4-6 cm), masses (20-200 g), frictions (0.4-1.2), which
         colour is stacked on which; the arm's initial joints.
     Success: the upper cube's centre within 2 cm of the lower one's, on it, upright within 5 degrees, at rest, not
-        touched; the lower one within 2 cm of where it was; the gripper open.
+        touched; the lower one within 2 cm of its initial position; the gripper open.
     """
 
     summary = "a cube onto another cube"
@@ -38,7 +38,7 @@ class Stack(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw both cubes and the goal."""
         upper_color, lower_color = sampler.choice([("red", "blue"), ("blue", "red"), ("red", "green")])
         start = sampler.point(WORKSPACE, what="the upper cube")
         yaw = sampler.yaw()
@@ -52,11 +52,11 @@ class Stack(TableTask):
 class StackThree(TableTask):
     """Build a tower of three cubes.
 
-    Task: three cubes on the table; the second goes onto the first, the third onto the second.
-    Randomised: places, yaws, sizes (4-5.5 cm), masses (20-200 g), frictions (0.4-1.2), the order of the colours;
-        the arm's initial joints.
+    Task: three cubes on the table; the second is placed on the first, the third on the second.
+    Randomised: positions, yaws, sizes (4-5.5 cm), masses (20-200 g), frictions (0.4-1.2), the order of the colours; the
+        arm's initial joints.
     Success: each upper cube's centre within 2 cm of the one below, on it, upright within 5 degrees, at rest, not
-        touched; the lowest within 2 cm of where it was; the gripper open.
+        touched; the lowest within 2 cm of its initial position; the gripper open.
     """
 
     summary = "a tower of three cubes"
@@ -66,7 +66,7 @@ class StackThree(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the cubes and the goals."""
         colors = sampler.choice([("red", "green", "blue"), ("blue", "red", "green"), ("green", "blue", "red")])
         base = sampler.point(INNER, what="the lowest cube")
         base_yaw = sampler.yaw()
@@ -84,11 +84,12 @@ class StackThree(TableTask):
 class Unstack(TableTask):
     """Take the upper cube off the lower one and place it on the mark.
 
-    Task: a cube that stands on another, a square mark on the table.
-    Randomised: the tower's place and yaw, how the upper cube lies on the lower (5 mm, any yaw), sizes (3-6 cm, the
-        lower one 4-6 cm), masses (20-200 g), frictions (0.4-1.2), the mark's place and yaw; the arm's initial joints.
-    Success: the cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest, not
-        touched; the lower cube within 2 cm of where it was; the gripper open.
+    Task: a cube on top of another, a square mark on the table.
+    Randomised: the tower's position and yaw, the upper cube's pose on the lower (5 mm, any yaw), sizes (3-6 cm, the
+        lower one 4-6 cm), masses (20-200 g), frictions (0.4-1.2), the mark's position and yaw; the arm's initial
+        joints.
+    Success: the cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest, not touched;
+        the lower cube within 2 cm of its initial position; the gripper open.
     """
 
     summary = "a cube off another cube and onto a mark"
@@ -99,7 +100,7 @@ class Unstack(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the tower, the mark and the goal."""
         tower, tower_yaw, place, place_yaw = start_and_target(sampler, "the tower", region=INNER)
         lower = random_cube(sampler, "blue", tower, tower_yaw, sides=(0.04, 0.06))
         upper = cube(
@@ -119,10 +120,10 @@ class LineUp(TableTask):
     """Put three cubes on three marks in a row.
 
     Task: three cubes on the table, three marks in a straight row at even distance.
-    Randomised: the cubes' places, yaws, sizes (3-4.5 cm), masses (20-200 g), frictions (0.4-1.2) and order; the
+    Randomised: the cubes' positions, yaws, sizes (3-4.5 cm), masses (20-200 g), frictions (0.4-1.2) and order; the
         row's middle, direction and spacing (12-15 cm); the arm's initial joints.
-    Success: each cube's centre within 2 cm of its mark's, on the table, upright within 5 degrees, at rest, not
-        touched; the two gaps equal within 1.5 cm and the middle cube within 1.5 cm of the line; the gripper open.
+    Success: each cube's centre within 2 cm of its mark's, on the table, upright within 5 degrees, at rest, not touched;
+        the two gaps equal within 1.5 cm and the middle cube within 1.5 cm of the line; the gripper open.
     """
 
     summary = "three cubes in a row at even distance"
@@ -132,7 +133,7 @@ class LineUp(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the row, the cubes and the goals."""
         spacing = sampler.uniform(0.12, 0.15)
         direction = sampler.uniform(-math.pi / 2, math.pi / 2)
         along = (math.cos(direction), math.sin(direction))
@@ -159,7 +160,7 @@ class LineUp(TableTask):
         return [*marks, *cubes], goals
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
-        """Each cube on its mark, the row straight and even."""
+        """Check that each cube is on its mark, and the row straight and even."""
         first, second, third = (world.pose(goal.object).position[:2] for goal in world.scene.goals)
         gaps = math.dist(first, second), math.dist(second, third)
         length = math.dist(first, third)

@@ -1,4 +1,4 @@
-"""What is in a scene: table, floor and target marks, cubes and things of other shapes; the colours that have a name."""
+"""Elements of scenes: table, floor and target marks, cubes and objects of other shapes; the named colours."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from demorec.tasks.sampling import Sampler
 
 TABLE_HEIGHT = 0.62
 WALL_HEIGHT = 1.6
-"""Of what stands around the table, metres: the sun of `--variation full` comes over it."""
+"""Height of the walls around the table, metres; the sun of `--variation full` is above them."""
 MARK_THICKNESS = 0.001
 
 COLORS: Mapping[str, Rgba] = {
@@ -28,11 +28,11 @@ COLORS: Mapping[str, Rgba] = {
 }
 """Colours that have a name in instructions."""
 OTHER_COLORS = tuple(name for name in COLORS if name != "green")
-"""Of things that go to a green target."""
+"""Colours of objects that are moved to a green target."""
 
 
 def floor(height: float) -> Body:
-    """A floor whose upper face is at z = `height`, metres."""
+    """Make a floor with its upper face at z = `height`, metres."""
     return Body(
         name="floor",
         role="fixture",
@@ -44,7 +44,7 @@ def floor(height: float) -> Body:
 
 
 def table_and_floor() -> tuple[Body, Body]:
-    """The floor and a table whose top is at z = 0."""
+    """Make the floor and a table with its top at z = 0."""
     table = Body(
         name="table",
         role="support",
@@ -57,7 +57,7 @@ def table_and_floor() -> tuple[Body, Body]:
 
 
 def walls() -> tuple[Body, ...]:
-    """Behind the table and at both sides, out of the arm's reach, only seen; named "wall..."."""
+    """Make visual-only walls behind the table and on both sides, out of the arm's reach; named "wall..."."""
     places = {
         "wall_back": (-1.3, 0.0, 0.0),
         "wall_left": (0.7, 1.5, -math.pi / 2),
@@ -77,7 +77,7 @@ def walls() -> tuple[Body, ...]:
 
 
 def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, color_name: str) -> Body:
-    """A thin square on the table that is only seen, its top a millimetre above it."""
+    """Make a thin visual-only square on the table, its top a millimetre above it."""
     return Body(
         name=name,
         role="target",
@@ -91,7 +91,7 @@ def mark(name: str, point: tuple[float, float], yaw: float, *, side: float, colo
 
 
 def green_target(point: tuple[float, float], yaw: float, *, side: float = 0.08) -> Body:
-    """The mark to which instructions send things."""
+    """Make the target mark of instructions."""
     return mark("green_target", point, yaw, side=side, color_name="green")
 
 
@@ -106,7 +106,7 @@ def cube(
     color_name: str,
     z: float = 0.0,
 ) -> Body:
-    """A cube standing with its lower face at height `z`, metres."""
+    """Make a cube with its lower face at height `z`, metres."""
     position: Vector3 = (point[0], point[1], z + side / 2 + 5e-4)
     return Body(
         name=name,
@@ -122,9 +122,9 @@ def cube(
 
 
 def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
-    """The robot at the world's origin, its arm near the home configuration (range joint_spread), gripper open.
+    """Place the robot at the world's origin, near its home configuration (range joint_spread), gripper open.
 
-    A joint whose home lies close to a limit starts within it.
+    A joint with its home near a limit starts within the limit.
     """
     spread = sampler.ranges.number("joint_spread")
     drawn = [q + sampler.uniform(-spread, spread) for q in robot.home_q]
@@ -137,7 +137,7 @@ def robot_at_origin(robot: RobotSpec, sampler: Sampler) -> RobotPlacement:
 
 
 WHITE = (1.0, 1.0, 1.0, 1.0)
-"""Leaves a mesh its own colours."""
+"""Colour that leaves a mesh's own unchanged."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -147,8 +147,8 @@ class Thing:
     Attributes:
         noun: Its word in instructions.
         shape: Draws its geometry.
-        yaw_symmetry: As `Body.yaw_symmetry`.
-        painted: Whether it gets a colour and the colour's word; a mesh keeps its own.
+        yaw_symmetry: As in `Body.yaw_symmetry`.
+        painted: Whether it gets a colour and the colour's word; a mesh keeps its colours.
     """
 
     noun: str
@@ -195,7 +195,7 @@ def _duck(sampler: Sampler) -> Shape:
 
 def _mug(sampler: Sampler) -> Shape:
     scale = sampler.uniform(0.52, 0.60)
-    # The origin lies on the mug's axis, so that the fingers close over its middle; the handle points along y.
+    # The origin is on the mug's axis, so that the fingers close over its middle; the handle points along y.
     size = (0.082 * scale, 0.1613 * scale, 0.1 * scale)
     return Shape(kind="mesh", file="objects/mug.obj", scale=scale, size=size, origin=(0.0, 0.0, 0.05))
 
@@ -209,13 +209,13 @@ THINGS: Mapping[str, Thing] = {
     "duck": Thing(noun="duck", shape=_duck, yaw_symmetry=1, painted=False),
     "mug": Thing(noun="mug", shape=_mug, yaw_symmetry=1),
 }
-"""Every kind that the tasks draw from."""
+"""All kinds that the tasks draw from."""
 
 
 def make_thing(
     sampler: Sampler, kind: str, name: str, point: tuple[float, float], yaw: float, *, color_name: str, role: Role
 ) -> Body:
-    """A thing on the table with drawn geometry, mass (20-150 g) and friction (0.5-1.2)."""
+    """Make an object on the table with drawn geometry, mass (20-150 g) and friction (0.5-1.2)."""
     thing = THINGS[kind]
     shape = thing.shape(sampler)
     return Body(
@@ -225,7 +225,7 @@ def make_thing(
         world_from_body=Pose.from_yaw((point[0], point[1], shape.extents[2] / 2 + 5e-4), yaw),
         mass=sampler.uniform(0.02, 0.15),
         lateral_friction=sampler.uniform(0.5, 1.2),
-        # What could roll away is slowed down as felt on a table would.
+        # Rolling objects are slowed down as felt on a table would.
         rolling_friction=0.001 if shape.kind == "cylinder" else 0.0,
         rgba=COLORS[color_name] if thing.painted else WHITE,
         color_name=color_name if thing.painted else "",
@@ -234,6 +234,6 @@ def make_thing(
 
 
 def words_for(body: Body) -> str:
-    """What a thing is called: "red cube", "duck"; what is of no known kind by its own name."""
+    """Describe an object in words ("red cube", "duck"); one of an unknown kind by its body's name."""
     kinds = [THINGS[part].noun for part in body.name.split("_") if part in THINGS]
     return f"{body.color_name} {kinds[0]}".strip() if kinds else body.name.replace("_", " ")

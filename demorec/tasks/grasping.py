@@ -1,4 +1,4 @@
-"""Where a hand that points down takes hold of a body, beside it, and puts it down."""
+"""Poses of a hand that points down: to grasp a body, to miss it, and to put it down."""
 
 from __future__ import annotations
 
@@ -14,23 +14,23 @@ from demorec.robots.robot import RobotSpec
 from demorec.tasks.script import Behaviour
 from demorec.tasks.success import resting_half_height
 
-# Half of the open hand, metres (of an arm of task_scale 1), along its x and y axes: the larger of the Panda's and the
-# iiwa's; with the gap, that of the SO-101 at its scale.
+# Half of the open hand, metres (of an arm of task_scale 1), along its x and y axes: the maximum of the Panda's and the
+# iiwa's; with the gap, it also covers the SO-101's at its scale.
 _FINGERS = np.array([0.012, 0.07])
 _PALM = np.array([0.035, 0.11])
 _UP = np.array([0.0, 0.0, 1.0])
 _GAP = 0.005
-"""Air between the hand and what it shall not touch, metres."""
+"""Clearance between the hand and bodies that it must not touch, metres."""
 _COST_OF_TURNING = 0.1
-"""Of a radian that the hand turns, in the unit of `demorec.objects.antipodal.Grasp.cost`."""
+"""Cost per radian of turning the hand, in the unit of `demorec.objects.antipodal.Grasp.cost`."""
 ABOVE_M = 0.01
-"""Maximum distance of the hand from above its grasp at which it need not rise and come again."""
+"""Maximum horizontal distance of the hand from its grasp at which it can descend directly, metres."""
 ABOVE_RAD = 0.35
-"""Maximum angle between the two."""
+"""Maximum angle between the two, rad."""
 
 
 def hand_down(position: Sequence[float] | Array, yaw: float) -> Pose:
-    """`world_from_tcp` with the hand pointing down; at yaw 0 its x axis is the world's."""
+    """Build `world_from_tcp` of a hand that points down; at yaw 0 its x axis is the world's."""
     return Pose(
         position=np.asarray(position, dtype=np.float64),
         quat_xyzw=np.array([math.cos(yaw / 2), math.sin(yaw / 2), 0.0, 0.0]),
@@ -38,37 +38,37 @@ def hand_down(position: Sequence[float] | Array, yaw: float) -> Pose:
 
 
 def hand_yaw(world_from_tcp: Pose) -> float:
-    """Yaw, rad, of a hand that points down (roughly): the angle of its x axis."""
+    """Compute the yaw, rad, of a hand that points (roughly) down: the angle of its x axis."""
     rotation = world_from_tcp.rotation
     return math.atan2(rotation[1, 0], rotation[0, 0])
 
 
 def _across(yaw: float) -> Array:
-    """The direction (3,) in which the fingers of a hand move that points down at a yaw, rad."""
+    """Compute the direction (3,) of finger motion of a hand that points down at a yaw, rad."""
     return hand_down((0.0, 0.0, 0.0), yaw).rotation[:, 1]
 
 
 def raised(pose: Pose, height: float) -> Pose:
-    """The same pose `height` metres higher."""
+    """Raise a pose by `height` metres."""
     return Pose(position=pose.position + np.array([0.0, 0.0, height]), quat_xyzw=pose.quat_xyzw)
 
 
 def symmetric_yaws(yaw: float, symmetry: int) -> list[float]:
-    """All yaws, rad, that look the same."""
+    """List all equivalent yaws, rad."""
     return [wrap_angle(yaw + 2 * math.pi * k / symmetry) for k in range(symmetry)]
 
 
 def nearest_first(yaws: Iterable[float], now: float) -> list[float]:
-    """Yaws, rad, in the order of how far the hand turns to them from its present one."""
+    """Sort yaws, rad, by how far the hand turns to them from its current one."""
     return sorted(yaws, key=lambda yaw: abs(wrap_angle(yaw - now)))
 
 
 def is_above(here: Pose, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
-    """Whether the hand needs but to be lowered to get from one `world_from_tcp` to another.
+    """Check whether the hand can get from one `world_from_tcp` to another just by descending.
 
     Args:
-        here, wanted: Where it is, and where to.
-        beside: So far aside it may be, metres; beyond a centimetre no farther than it is above.
+        here, wanted: Current pose and target.
+        beside: Maximum horizontal distance, metres; beyond 1 cm also limited by the height above.
     """
     above = float(here.position[2] - wanted.position[2])
     aside = math.dist(here.position[:2], wanted.position[:2])
@@ -76,19 +76,19 @@ def is_above(here: Pose, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
 
 
 def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[float]:
-    """Hand yaws, rad, at which the fingers close over two opposite faces that fit between them.
+    """List the hand yaws, rad, at which the fingers close over two opposite faces that fit between them.
 
     Args:
-        body, pose: What is grasped, and its pose in the world.
-        now: Present hand yaw, allowed for round bodies.
-        open_width: Of the gripper, metres.
+        body, pose: Body to grasp, and its pose in the world.
+        now: Current hand yaw, allowed for round bodies.
+        open_width: Opening of the gripper, metres.
     """
     vertical = int(np.argmax(np.abs(pose.rotation[2])))
     if body.yaw_symmetry == 0 and vertical == 2:
         return symmetric_yaws(now, 8)
     yaws: list[float] = []
     for axis in range(3):
-        # A centimetre of play for noise and for the perceived yaw.
+        # One centimetre of play for noise and for the perceived yaw.
         if axis == vertical or body.shape.extents[axis] > open_width - 0.01:
             continue
         angle = math.atan2(pose.rotation[1, axis], pose.rotation[0, axis])
@@ -98,15 +98,15 @@ def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[fl
 
 
 def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour: Behaviour) -> list[Pose]:
-    """`world_from_tcp` of grasps with the behaviour's offset and errors, the yaw nearest to the present one first.
+    """List `world_from_tcp` of grasps with the behaviour's offset and errors, nearest to the current yaw first.
 
     Args:
-        body, pose: What is grasped, and its pose in the world.
-        now: Present hand yaw, rad.
-        robot: Whose hand it is.
-        behaviour: How it is done.
+        body, pose: Body to grasp, and its pose in the world.
+        now: Current hand yaw, rad.
+        robot: Robot with the hand.
+        behaviour: Variation in how the expert does it.
 
-    Of a mesh from a file those across its narrower side come before the others.
+    For a mesh from a file, grasps across its narrower side come first.
     """
     if body.shape.mesh:
         return [_perturbed(grasp, behaviour) for grasp in _grasps_of_mesh(body, pose, now=now, robot=robot)]
@@ -118,7 +118,8 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
     found = []
     yaws = nearest_first(grasp_yaws(body, pose, now, gripper.open_width), now)
     if body.shape.kind == "mesh":
-        # Its faces are not known. Over the ends of a long thing fingers meet points, at which it turns and comes loose.
+        # Its faces are unknown. Over the ends of an elongated object fingers touch points, where it turns and comes
+        # loose.
         yaws.sort(key=lambda yaw: round(half_extent(body, pose, _across(yaw)), 4))
     for yaw in yaws:
         across = _across(yaw)
@@ -128,7 +129,7 @@ def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour
 
 
 def found_grasps(shape: Shape, robot: RobotSpec, up: Array) -> tuple[Grasp, ...]:
-    """The grasps of a solid that stands with the direction `up` (3,) of its own axes upward, best first."""
+    """Compute the grasps of a solid resting with its direction `up` (3,) upward, best first."""
     x, y, z = np.round(up, 2).tolist()
     length = math.hypot(x, y, z)
     upward = x / length, y / length, z / length
@@ -136,7 +137,7 @@ def found_grasps(shape: Shape, robot: RobotSpec, up: Array) -> tuple[Grasp, ...]
 
 
 def _grasps_of_mesh(body: Body, pose: Pose, *, now: float, robot: RobotSpec) -> list[Pose]:
-    """The same for a solid, by their cost and how far the hand has to turn."""
+    """Sort the grasps of a solid by cost and by how far the hand has to turn."""
     up = pose.rotation[2]
     found = found_grasps(body.shape, robot, up)
     x, y, z = up.tolist()
@@ -154,12 +155,12 @@ def _grasps_of_mesh(body: Body, pose: Pose, *, now: float, robot: RobotSpec) -> 
 
 
 def clear_first(grasps: Sequence[Pose], others: Sequence[tuple[Body, Pose]], robot: RobotSpec) -> list[Pose]:
-    """Grasps `world_from_tcp` in their order, but those at which the open hand would touch another body last."""
+    """Move grasps `world_from_tcp` at which the open hand would touch another body to the end."""
     return sorted(grasps, key=lambda grasp: not all(_is_clear(grasp, other, at, robot) for other, at in others))
 
 
 def _is_clear(hand: Pose, body: Body, pose: Pose, robot: RobotSpec) -> bool:
-    """Whether the open hand, pointing down at `world_from_tcp`, touches nothing of a body."""
+    """Check that the open hand, pointing down at `world_from_tcp`, does not touch a body."""
     gripper, scale = robot.gripper, robot.task_scale
     tips, palm = hand.position[2] - gripper.finger_depth, hand.position[2] + gripper.palm_clearance
     offset = gripper.object_offset(gripper.open_width)  # a jaw opens to one side of the TCP
@@ -174,19 +175,19 @@ def _is_clear(hand: Pose, body: Body, pose: Pose, robot: RobotSpec) -> bool:
 def _perturbed(grasp: Pose, behaviour: Behaviour) -> Pose:
     yaw = hand_yaw(grasp)
     shift = np.array([behaviour.perception_x, behaviour.perception_y, 0.0])
-    # The hand's x axis runs along the fingers' faces: a shift that way still grasps.
+    # The hand's x axis runs along the fingers' faces: a shift in that direction still grasps.
     shift = shift + behaviour.grasp_offset * np.array([math.cos(yaw), math.sin(yaw), 0.0])
     return hand_down(grasp.position + shift, yaw + behaviour.perception_yaw)
 
 
 def places_of(body: Body, pose: Pose, wanted: Pose, *, hand: Pose, yaw_symmetry: int) -> list[Pose]:
-    """`world_from_tcp` that put a held body where it is wanted, with the offset in the hand compensated.
+    """List `world_from_tcp` that put a held body at its target, compensating its offset in the hand.
 
     Args:
-        body, pose: What is held, and its pose in the world.
-        wanted: Its pose in the world, resting on the face that was meant.
-        hand: `world_from_tcp` now.
-        yaw_symmetry: How many yaws are as good; 0: the present one.
+        body, pose: Held body, and its pose in the world.
+        wanted: Target pose in the world, resting on the intended face.
+        hand: Current `world_from_tcp`.
+        yaw_symmetry: Number of equivalent yaws; 0: only the current one.
     """
     hand_from_object = (hand.inverse() @ pose).position
     now = hand_yaw(hand)
@@ -208,16 +209,16 @@ def grasps_beside(
     others: Collection[tuple[Body, Pose]],
     robot: RobotSpec,
 ) -> Iterator[Pose]:
-    """Yield poses of the open hand next to a body, where it touches nothing: grasps that miss.
+    """Yield poses of the open hand next to a body that touch nothing: grasps that miss.
 
     Args:
         grasps: `world_from_tcp` of grasps of it.
-        body, pose: What is missed, and its pose in the world.
-        x, y: From the body's centre in the hand's frame, metres. x is made longer where the fingers would touch the
-            body. For each grasp the side that it points to (for 0: forward) comes first, then the other one; a side
-            where something else is in the way is left out, so there may be none.
-        others: All the other bodies and their poses.
-        robot: Whose hand it is.
+        body, pose: Body to miss, and its pose in the world.
+        x, y: Offset from the body's centre in the hand's frame, metres. x is increased where the fingers would touch
+            the body. For each grasp the side of its sign (for 0: forward) comes first, then the other one; a blocked
+            side is omitted, so there may be none.
+        others: All other bodies and their poses.
+        robot: Robot with the hand.
     """
     for grasp in grasps:
         hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]
@@ -236,7 +237,7 @@ def _is_lower(body: Body, pose: Pose, height: float) -> bool:
 
 
 def _is_beside(hand: Pose, half_size: Array, body: Body, pose: Pose) -> bool:
-    """Whether a body is clear of a rectangle around the hand's middle, both seen from above along the hand's axes."""
+    """Check that a body is clear of a rectangle around the hand's middle, seen from above along the hand's axes."""
     offset = np.abs((pose.position - hand.position) @ hand.rotation)
     return any(
         offset[axis] > half_size[axis] + half_extent(body, pose, hand.rotation[:, axis]) + _GAP for axis in (0, 1)
@@ -244,5 +245,5 @@ def _is_beside(hand: Pose, half_size: Array, body: Body, pose: Pose) -> bool:
 
 
 def half_extent(body: Body, pose: Pose, direction: Array) -> float:
-    """Half the extent of a body's bounding box along a unit vector of the world, metres."""
+    """Compute half the extent of a body's bounding box along a unit vector of the world, metres."""
     return float(np.abs(direction @ pose.rotation) @ np.array(body.shape.extents)) / 2

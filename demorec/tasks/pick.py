@@ -1,4 +1,4 @@
-"""One thing goes to a target mark on the table: a cube, the named cube among others, a thing of any shape."""
+"""Placing of one object on a target mark on the table: a cube, the named cube among others, any shape."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from demorec.tasks.sampling import Region, Sampler
 CLUTTER = Region(x=(0.33, 0.68), y=(-0.30, 0.30))
 OTHER_KINDS = ("block", "cylinder", "cube", "cube")
 GAP = 0.115
-"""Between the centres of neighbours, metres: the open hand must fit between them."""
+"""Minimum distance between the centres of neighbours, metres: the open hand must fit between them."""
 KINDS = tuple(kind for kind in THINGS if kind != "cube")
 
 
@@ -18,10 +18,10 @@ class PickPlace(TableTask):
     """Pick up the cube and place it on the mark.
 
     Task: one cube, one square mark on the table.
-    Randomised: the cube's place (0.30 x 0.50 m), yaw, size (3-6 cm), mass (20-200 g) and friction (0.4-1.2); the
-        mark's place and yaw, 12 cm from the cube or more; the arm's initial joints (0.05 rad).
-    Success: the cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest
-        (1 cm/s, 0.1 rad/s), not touched, the gripper open; what else stands there (a variation) has stayed.
+    Randomised: the cube's position (0.30 x 0.50 m), yaw, size (3-6 cm), mass (20-200 g) and friction (0.4-1.2); the
+        mark's position and yaw, at least 12 cm from the cube; the arm's initial joints (0.05 rad).
+    Success: the cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest (1 cm/s, 0.1
+        rad/s), not touched, the gripper open; other objects (a variation) undisturbed.
     """
 
     summary = "a cube to a target mark on the table"
@@ -32,7 +32,7 @@ class PickPlace(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the cube, the mark and the goal."""
         start, yaw, place, place_yaw = start_and_target(sampler, "the cube", apart=0.12)
         body = random_cube(sampler, "red", start, yaw, sides=(0.03, 0.06))
         return [green_target(place, place_yaw), body], [on_table(body, place, place_yaw)]
@@ -41,11 +41,11 @@ class PickPlace(TableTask):
 class PickFromClutter(TableTask):
     """Pick the cube of the named colour out of a clutter and place it on the mark.
 
-    Task: three to five things of other colours and shapes around the wanted cube, a square mark.
-    Randomised: how many things, which, their places, yaws, sizes, masses and frictions; the wanted colour; the
-        mark's place and yaw; the arm's initial joints.
-    Success: the wanted cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest,
-        not touched; everything else within 2 cm of where it was; the gripper open.
+    Task: three to five objects of other colours and shapes around the named cube, a square mark.
+    Randomised: number and kinds of objects, their positions, yaws, sizes, masses and frictions; the named colour; the
+        mark's position and yaw; the arm's initial joints.
+    Success: the named cube's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest, not
+        touched; everything else within 2 cm of its initial position; the gripper open.
     """
 
     summary = "the cube of the named colour out of a clutter"
@@ -56,7 +56,7 @@ class PickFromClutter(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the clutter, the mark and the goal."""
         colors = [OTHER_COLORS[i] for i in sampler.rng.permutation(len(OTHER_COLORS))]
         start, yaw, place, place_yaw = start_and_target(sampler, "the wanted cube")
         wanted = make_thing(sampler, "cube", f"{colors[0]}_cube", start, yaw, color_name=colors[0], role="object")
@@ -72,12 +72,12 @@ class PickFromClutter(TableTask):
 
 
 class PickShapes(TableTask):
-    """Pick up a thing of any shape and place it on the mark.
+    """Pick up an object of any shape and place it on the mark.
 
     Task: one of a block, a cylinder, a wooden plank, a toy brick, a duck or a mug; a square mark on the table.
-    Randomised: which thing, its size, place, yaw, mass (20-150 g), friction (0.5-1.2) and colour where it has
-        none of its own; the mark's place and yaw; the arm's initial joints.
-    Success: the thing's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest, not
+    Randomised: the object, its size, position, yaw, mass (20-150 g), friction (0.5-1.2) and colour unless it has a
+        fixed one; the mark's position and yaw; the arm's initial joints.
+    Success: the object's centre within 2 cm of the mark's, on the table, upright within 5 degrees, at rest, not
         touched, the gripper open.
     """
 
@@ -89,7 +89,7 @@ class PickShapes(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the object, the mark and the goal."""
         kind = sampler.choice(KINDS)
         color = sampler.choice(OTHER_COLORS)
         start, yaw, place, place_yaw = start_and_target(sampler, "the thing")

@@ -1,4 +1,4 @@
-"""What tasks made of pick-and-place goals share: their script, their strict conditions, common bodies."""
+"""Shared parts of tasks made of pick-and-place goals: script, strict success conditions, common bodies."""
 
 from __future__ import annotations
 
@@ -26,32 +26,32 @@ from demorec.tasks.skills import Expert
 from demorec.tasks.success import MAX_DISTURBANCE, at_most, gripper_open_check, placement_checks
 
 TALLEST = 0.07
-"""Height, metres, above which no thing on the table reaches."""
+"""Maximum height of objects on the table, metres."""
 HAND_AND_THING = 0.07
-"""Half the width of a finger and half the diagonal of a thing, metres, with a little air between."""
+"""Half the width of a finger plus half the diagonal of an object, metres, with a small margin."""
 
 Layout = tuple[Sequence[Body], Sequence[Goal]]
-"""What is on the table, and the goals."""
+"""Objects on the table, and the goals."""
 
 
 class PlacingTask(Task):
-    """A task whose goals are served one after the other, in the order of the scene.
+    """A task that serves its goals one after the other, in the order of the scene.
 
-    Success: every goal's object lies at its goal (`placement_checks`), whatever was not to be moved is where it
-    was (2 cm), and the gripper is open.
+    Success: every goal's object is at its goal (`placement_checks`), other objects are within 2 cm of their initial
+        positions, and the gripper is open.
     """
 
     def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
-        """All that the goals ask of it, one after the other."""
+        """Check whether the arm reaches everything that the goals require, in order."""
         return serves(scene, scene.goals, robot, behaviour)
 
     def script(self, expert: Expert) -> Iterator[Step]:
-        """One pick-and-place per goal."""
+        """Yield the steps of one pick-and-place per goal."""
         for goal in expert.world.scene.goals:
             yield from expert.pick_and_place(goal)
 
     def resume(self, expert: Expert) -> Iterator[Step]:
-        """What is left of the goals, then bystanders that were moved back to where they lay."""
+        """Yield the steps of the remaining goals, then of moving displaced bystanders back."""
         world = expert.world
         yield from finish(expert, world.scene.goals)
         moved = [
@@ -61,21 +61,21 @@ class PlacingTask(Task):
             yield from finish(expert, (*moved, *world.scene.goals))
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
-        """Goals, bystanders, gripper."""
+        """Check goals, bystanders and gripper."""
         placed = [check for goal in world.scene.goals for check in placement_checks(world, goal)]
         return (*placed, *undisturbed_checks(world), gripper_open_check(world))
 
 
 class TableTask(PlacingTask):
-    """A placing task of things on the table behind which the robot stands."""
+    """A placing task with objects on the table in front of the robot."""
 
     wordings: ClassVar[tuple[str, ...]]
-    """Of the instruction: `thing` is what the first goal moves; `moved`, `bases` and `targets` are the colours of what
-    the goals move, of what they put it on or into, and of marks and trays."""
+    """Wordings of the instruction. `thing` is the first goal's object; `moved`, `bases` and `targets` are the colours
+    of the goals' objects, of their supports or containers, and of marks and trays."""
 
     @abstractmethod
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw what is on the table, and the goals; SceneError when none is found."""
+        """Draw the objects on the table, and the goals; SceneError if no layout is found."""
 
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         """Draw a layout."""
@@ -89,7 +89,7 @@ class TableTask(PlacingTask):
         return Scene(robot=robot_at_origin(robot, sampler), bodies=(*table_and_floor(), *bodies), goals=tuple(goals))
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """One of the wordings, filled in."""
+        """Fill in one of the wordings."""
         moved = [scene.body(goal.object) for goal in scene.goals]
         return wording(
             rng,
@@ -102,13 +102,13 @@ class TableTask(PlacingTask):
 
 
 def _beside_the_hand(robot: RobotSpec, *, joint_spread: float) -> Callable[[tuple[float, float]], bool]:
-    """Whether a thing at a point (x, y) of a layout, before it is scaled, is not where the open hand is at the start.
+    """Make a check that a point (x, y) of an unscaled layout is clear of the open hand at the start.
 
-    Arms of scale 1 rest with the hand above everything; a small one may rest with it among the things.
+    Arms of scale 1 rest with the hand above everything; a small one may rest with it among the objects.
 
     Args:
-        robot: Whose hand it is.
-        joint_spread: By how much each joint may be off the home configuration, rad.
+        robot: Robot with the hand.
+        joint_spread: Maximum deviation of each joint from the home configuration, rad.
     """
     home, gripper, scale = arm_kinematics(robot).forward(np.array(robot.home_q)), robot.gripper, robot.task_scale
     off = joint_spread * math.hypot(*home.position.tolist())
@@ -126,7 +126,7 @@ def _beside_the_hand(robot: RobotSpec, *, joint_spread: float) -> Callable[[tupl
 
 
 def _scaled_body(body: Body, scale: float) -> Body:
-    """A body with its lengths and its mass multiplied: a small hand takes small things."""
+    """Scale a body's lengths and its mass, since a small hand handles small objects."""
     shape = body.shape
     is_file = shape.kind in ("mesh", "urdf")
     shape = replace(
@@ -148,7 +148,7 @@ def _scaled_pose(pose: Pose, scale: float) -> Pose:
 
 
 def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
-    """That each movable body without a goal of its own still lies where it lay."""
+    """Check that each movable body without a goal is still at its initial position."""
     moved = {goal.object for goal in world.scene.goals}
     return tuple(
         at_most(
@@ -165,13 +165,13 @@ def undisturbed_checks(world: World) -> tuple[SuccessCheck, ...]:
 def start_and_target(
     sampler: Sampler, what: str, *, apart: float = 0.14, region: Region = WORKSPACE
 ) -> tuple[tuple[float, float], float, tuple[float, float], float]:
-    """Point and yaw at which a thing lies, and those of its target, at least `apart` metres away.
+    """Draw point and yaw of an object, and those of its target, at least `apart` metres away.
 
     Args:
-        sampler: Draws them.
-        what: The thing, in words for an error.
-        apart: Metres.
-        region: Where it lies; its target is anywhere in the workspace.
+        sampler: Source of the random numbers.
+        what: Name of the object in error messages.
+        apart: Minimum distance, metres.
+        region: Region of the object; its target may be anywhere in the workspace.
     """
     start, yaw = sampler.point(region, what=what), sampler.yaw()
     place = sampler.point(WORKSPACE, away_from=[start], min_distance=apart, what="the target")
@@ -181,7 +181,7 @@ def start_and_target(
 def random_cube(
     sampler: Sampler, color_name: str, point: tuple[float, float], yaw: float, *, sides: tuple[float, float]
 ) -> Body:
-    """A cube on the table with drawn side (m), mass (20-200 g) and friction (0.4-1.2)."""
+    """Make a cube on the table with drawn side (m), mass (20-200 g) and friction (0.4-1.2)."""
     return cube(
         f"{color_name}_cube",
         point,
@@ -194,12 +194,12 @@ def random_cube(
 
 
 def onto_cube(object_: Body, base: Body, *, yaw: float = 0.0) -> Goal:
-    """The goal that one cube stands centred on another."""
+    """Make the goal of a cube centred on another."""
     height = (base.shape.size[2] + object_.shape.size[2]) / 2
     return Goal(object=object_.name, onto=base.name, onto_from_goal=Pose.from_yaw((0.0, 0.0, height), yaw))
 
 
 def on_table(object_: Body, point: tuple[float, float], yaw: float, *, yaw_symmetry: int = 4) -> Goal:
-    """The goal that an object stands upright at a point of the table."""
+    """Make the goal of an object standing upright at a point of the table."""
     pose = Pose.from_yaw(np.array([point[0], point[1], object_.shape.extents[2] / 2]), yaw)
     return Goal(object=object_.name, onto="", onto_from_goal=pose, yaw_symmetry=yaw_symmetry)

@@ -1,4 +1,4 @@
-"""What an arm reaches: single poses of its hand, and all that a scene's goals ask of it."""
+"""Reach of an arm: single poses of its hand, and everything that a scene's goals require."""
 
 from __future__ import annotations
 
@@ -16,31 +16,31 @@ from demorec.tasks.grasping import grasps_of, hand_yaw, places_of, raised
 from demorec.tasks.script import Behaviour
 
 LEAST_ABOVE_GOAL = 0.10
-"""Metres of the TCP (of an arm of task_scale 1) above the goal on its way there; it stays at `lift_height` where that
-is higher."""
+"""Minimum height, metres, of the TCP (of an arm of task_scale 1) above the goal during transport; it stays at
+`lift_height` if that is higher."""
 ANY_YAW = 24
-"""Yaws that are tried where any will do."""
+"""Number of yaws tried when any yaw is acceptable."""
 JOINT_SPEED = 0.8
-"""Peak speed of a joint, rad/s, where all of them move at once instead of the TCP in a straight line."""
+"""Peak speed of a joint, rad/s, when all joints move at once instead of the TCP in a straight line."""
 DESCEND_SPEED = 0.25
-"""Peak speed of the TCP, m/s, on its way down to a grasp."""
+"""Peak speed of the TCP, m/s, while descending to a grasp."""
 _CONTROL_STEP = 1 / 30
-"""Seconds between the points at which the arm has to follow a line."""
+"""Time between the points at which the arm must follow a line, s."""
 
 
 class Reach:
-    """Where the hand of a scene's arm gets to.
+    """Reachability of poses for the arm of a scene.
 
     Args:
-        scene: As it is at the start.
-        robot: At the scene's scale.
-        arm: Its kinematics, where they are there already.
+        scene: Scene at the start.
+        robot: Robot at the scene's scale.
+        arm: Its kinematics, if already available.
 
     Attributes:
         arm: Its kinematics.
         home: (n,) home configuration, rad.
         start: (n,) configuration at the start, rad.
-        limits: What its motions keep to: less than its joints' own limits, with which noise on the way stays in them.
+        limits: Limits of its motions: below the joints' own limits, to leave room for noise.
     """
 
     def __init__(self, scene: Scene, robot: RobotSpec, arm: ArmKinematics | None = None) -> None:
@@ -53,25 +53,25 @@ class Reach:
         self._world_from_base = scene.robot.world_from_base
 
     def tcp(self, joint_position: Array) -> Pose:
-        """`world_from_tcp` at (n,) joint positions, rad."""
+        """Compute `world_from_tcp` at (n,) joint positions, rad."""
         return self._world_from_base @ self.arm.forward(joint_position)
 
     def rest_for(self, world_from_tcp: Pose) -> Array:
-        """The home configuration turned towards a pose: what the goal configuration is pulled to."""
+        """Turn the home configuration towards a pose, as the configuration that inverse kinematics prefers."""
         return self.arm.turned_towards(self.home, self._in_base(world_from_tcp).position)
 
     def at_once(self, world_from_tcp: Pose, start: Array) -> bool:
-        """Whether the inverse kinematics finds the way there from a configuration (n,), rad."""
+        """Check whether inverse kinematics finds the pose from a configuration (n,), rad."""
         rest = self.rest_for(world_from_tcp)
         return self.arm.inverse(self._in_base(world_from_tcp), start=start, rest=rest) is not None
 
     def at_all(self, world_from_tcp: Pose) -> bool:
-        """Whether the arm can get there."""
+        """Check whether the arm can reach the pose."""
         rest = self.rest_for(world_from_tcp)
         return self.arm.find(self._in_base(world_from_tcp), start=rest, rest=rest) is not None
 
     def descends(self, world_from_tcp: Pose, *, by: float, start: Array) -> bool:
-        """Whether a straight line leads there from so many metres above, where the arm comes from `start` (n,), rad."""
+        """Check for a straight descent to a pose from `by` metres above, coming from `start` (n,), rad."""
         above, goal = self._in_base(raised(world_from_tcp, by)), self._in_base(world_from_tcp)
         rest = self.rest_for(world_from_tcp)
         q = self.arm.find(above, start=start, rest=rest)
@@ -92,16 +92,16 @@ class Reach:
         dt: float,
         may_sink: float | None = None,
     ) -> Array | None:
-        """Joint targets (T, n) there in a straight line, or with all joints at once; None where neither leads there.
+        """Plan joint targets (T, n) to a pose in a straight line, or with all joints at once; None if neither works.
 
         Args:
-            world_from_tcp: Where to.
-            start: (n,) commanded configuration now, rad.
+            world_from_tcp: Target pose.
+            start: (n,) current commanded configuration, rad.
             speed: Peak speed of the TCP, m/s.
             pace: Factor on it, on the speed of turning and on that of the joints.
             dt: Control step, s.
-            may_sink: So far, metres, the TCP may come below both ends of the line where it leaves it; None: it may not
-                leave it.
+            may_sink: Maximum depth, metres, of the TCP below both ends of the line when it leaves the line; None: it
+                must not leave it.
         """
         goal, rest = self._in_base(world_from_tcp), self.rest_for(world_from_tcp)
         line = plan_straight(
@@ -117,7 +117,7 @@ class Reach:
         return arc if min(heights) > min(heights[0], heights[-1]) - may_sink else None
 
     def why_not(self, world_from_tcp: Pose, start: Array) -> str:
-        """What of a pose cannot be had from a configuration (n,), rad, in words."""
+        """Explain in words why a pose cannot be reached from a configuration (n,), rad."""
         rest = self.rest_for(world_from_tcp)
         return self.arm.why_unreachable(self._in_base(world_from_tcp), start=start, rest=rest)
 
@@ -126,18 +126,19 @@ class Reach:
 
 
 def within(reaches: Callable[[Pose], bool], poses: Iterable[Pose], *, up_to: float) -> Iterator[Pose]:
-    """Those of the poses that are reached as they are and so many metres higher."""
+    """Select the poses that are reached both unchanged and `up_to` metres higher."""
     return (pose for pose in poses if reaches(pose) and (not up_to or reaches(raised(pose, up_to))))
 
 
 def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Behaviour) -> bool:
-    """Whether the arm reaches what goals ask of it, one after the other: a grasp, above it, a place that goes with it.
+    """Check whether the arm reaches everything that the goals require, in order: a grasp, above it, and a matching
+    placement.
 
     Args:
-        scene: As it is at the start.
-        goals: Of it, in the order of their service.
-        robot: At the scene's scale.
-        behaviour: How the expert does it.
+        scene: Scene at the start.
+        goals: Its goals, in order.
+        robot: Robot at the scene's scale.
+        behaviour: Variation in how the expert does it.
     """
     reach = Reach(scene, robot)
     now = hand_yaw(reach.tcp(reach.start))

@@ -1,8 +1,8 @@
-"""Going on from whatever state somebody else has left: the expert takes over from a policy or a person, and finishes.
+"""Recovery from an arbitrary state: the expert takes over from a policy or a person, and finishes the task.
 
-A script begins at rest, hand open and high, objects where the layout put them. Nothing of that need hold here: the arm
-may be moving, tilted or low, the gripper closed beside an object or around one, objects pushed away or put down at a
-wrong place. So the arm is stopped and brought to where a script can begin, and every goal that is not served is.
+A script begins at rest, hand open and high, objects where the layout put them. None of that is guaranteed here: the arm
+may be moving, tilted or low, the gripper closed next to an object or around one, objects displaced or put down in a
+wrong place. So the arm is stopped and moved to where a script can begin, and every unmet goal is served.
 """
 
 from __future__ import annotations
@@ -22,28 +22,28 @@ from demorec.tasks.skills import Expert
 from demorec.tasks.success import placement_checks, resting_half_height
 
 TAKE_OVER = "take_over"
-"""Phase in which the arm, stopped, is brought to where a script can begin."""
+"""Phase in which the stopped arm moves to where a script can begin."""
 _STOP_SECONDS = 0.3
-"""Maximum time for which the arm is held."""
+"""Maximum time for which the arm is held, s."""
 _STOPPED = 0.05
-"""rad/s; the arm is held until no joint is faster."""
+"""Maximum joint speed, rad/s, at which the arm counts as stopped."""
 _CLEARANCE = 0.03
-"""Metres of air between the finger tips and everything that lies about, above which the hand moves where it wants."""
+"""Clearance, metres, of the finger tips over all objects at which the hand moves freely."""
 _HEIGHTS = (0.16, 0.12, 0.08, _CLEARANCE)
-"""Metres above everything to which the hand rises; the first that it reaches."""
+"""Heights, metres above all objects, to which the hand tries to rise; it uses the first one in reach."""
 _ROUNDS = 2
-"""How often all goals are gone through: serving one may spoil another."""
+"""Number of passes over all goals: serving one may disturb another."""
 
 
 def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
-    """Serve every goal, in order, from any state of the world; none is touched that is served already.
+    """Serve every goal, in order, from any state of the world, without touching those already met.
 
     Args:
-        expert: Made for the world as it is now; its behaviour should not miss on purpose.
-        goals: What shall be where in the end.
+        expert: Expert made for the current world; its behaviour should not miss on purpose.
+        goals: Final placements of objects.
 
     Raises:
-        ExpertFailure: Something is out of reach, or several tries were not enough.
+        ExpertFailure: An object or goal is out of reach, or several attempts failed.
     """
     held = _held(expert)
     yield from _stop(expert, holding=bool(held))
@@ -64,9 +64,10 @@ def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
 
 
 def _begun(expert: Expert, goals: Sequence[Goal]) -> Goal | None:
-    """The first goal to be served, if the open hand is above its object and needs but to descend.
+    """Return the first goal to serve if the open hand is above its object and can descend directly.
 
-    Whoever halts there is shown the way on: to rise and to come again would contradict every demonstration.
+    A policy that stops there is shown how to continue: rising and approaching again would contradict every
+    demonstration.
     """
     goal = next((goal for goal in goals if not is_served(expert.world, goal)), None)
     if goal is None or not _is_open(expert):
@@ -77,7 +78,7 @@ def _begun(expert: Expert, goals: Sequence[Goal]) -> Goal | None:
 
 
 def begin_again(expert: Expert) -> Iterator[Step]:
-    """Stop, let go of whatever is held, and bring the hand to where a script can begin."""
+    """Stop, release any held object, and move the hand to where a script can begin."""
     yield from _stop(expert, holding=False)
     yield from _stand_clear(expert)
 
@@ -88,7 +89,7 @@ def _stand_clear(expert: Expert) -> Iterator[Step]:
 
 
 def _serve(expert: Expert, goal: Goal, *, is_begun: bool) -> Iterator[Step]:
-    """Pick and place; once more from home where the arm stands so that no straight line leads on."""
+    """Pick and place; if the arm cannot follow a straight line from here, once more from home."""
     try:
         yield from expert.pick_and_place(goal, is_begun=is_begun)
     except ExpertFailure as error:
@@ -101,23 +102,23 @@ def _serve(expert: Expert, goal: Goal, *, is_begun: bool) -> Iterator[Step]:
 
 
 def is_served(world: World, goal: Goal) -> bool:
-    """Whether an object lies at its goal, at rest and let go."""
+    """Check whether an object is at its goal, at rest and released."""
     return all(check.passed for check in placement_checks(world, goal))
 
 
 def put_back(world: World, name: str) -> Goal:
-    """The goal that an object lies where it lay at the start."""
+    """Make the goal of an object at its initial position."""
     body = world.body(name)
     return Goal(object=name, onto="", onto_from_goal=body.world_from_body, yaw_symmetry=body.yaw_symmetry)
 
 
 def _held(expert: Expert) -> str:
-    """Which object the fingers hold; "" for none."""
+    """Return the object that the fingers hold; "" if none."""
     return next((body.name for body in expert.world.scene.movable if expert.holds(body.name)), "")
 
 
 def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
-    """Hold the arm where it is until it stands still, with the hand closed around what it holds."""
+    """Hold the arm in place until it is at rest, with the hand closed around a held object."""
     world = expert.world
     expert.phase = HALT_PHASE
     if holding:
@@ -133,7 +134,7 @@ def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
 
 
 def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[Step]:
-    """Bring what is held to its goal where its turn has come, else back to where it lay; let go where neither goes."""
+    """Bring the held object to its goal if it is next, else to its initial position; else release it."""
     goal = put_back(expert.world, name)
     for wanted in goals:
         if wanted.object == name:
@@ -148,7 +149,7 @@ def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[St
 
 
 def _is_clear(expert: Expert) -> bool:
-    """Whether the hand is so high that it may go anywhere, and open, or empty: it then opens on its way."""
+    """Check whether the hand is high enough to move anywhere, and open or empty (it then opens while moving)."""
     return (_is_open(expert) or not _held(expert)) and expert.tcp().position[2] >= _lowest_clear(expert)
 
 
@@ -157,7 +158,7 @@ def _is_open(expert: Expert) -> bool:
 
 
 def _lowest_clear(expert: Expert) -> float:
-    """Height of the TCP, metres, at which the finger tips pass over everything that can be moved and every goal."""
+    """Compute the TCP height, metres, at which the finger tips pass over every movable object and every goal."""
     world = expert.world
     placed = [(body, world.pose(body.name)) for body in world.scene.bodies]
     tops = [pose.position[2] + resting_half_height(body, pose) for body, pose in placed]
@@ -165,7 +166,7 @@ def _lowest_clear(expert: Expert) -> float:
 
 
 def _rise(expert: Expert) -> Iterator[Step]:
-    """Open the hand and rise, straightened, above everything; where no such line can be followed, go home."""
+    """Open the hand and rise, straightened, above everything; if no such line can be followed, move home."""
     yield from expert.open_gripper(max_seconds=0.5)
     here = expert.tcp()
     yaws = nearest_first(symmetric_yaws(hand_yaw(here), 8), hand_yaw(here))
@@ -184,7 +185,7 @@ def _rise(expert: Expert) -> Iterator[Step]:
 
 
 def _go_home(expert: Expert) -> Iterator[Step]:
-    """Joint by joint to the home configuration."""
+    """Move joint by joint to the home configuration."""
     home = np.array(expert.world.robot.home_q)
     dt = 1.0 / expert.world.fps
     for joint_target in plan_joints(

@@ -1,4 +1,4 @@
-"""Whether a robot of the user's own can do what tasks ask of it, as far as a second of computing tells."""
+"""Quick check, about 1 s, of whether a custom robot can do what tasks require."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from demorec.sim.client import connect
 from demorec.tasks.grasping import hand_down, symmetric_yaws
 
 _WORKSPACE = ((0.35, 0.5, 0.65), (-0.25, 0.0, 0.25), (0.02, 0.15, 0.22), (-0.8, 0.0, 0.8))
-"""x, y and z of the TCP, metres, and yaws of the hand, rad."""
+"""Sampled x, y and z of the TCP, metres, and yaws of the hand, rad."""
 NUM_POSES = math.prod(map(len, _WORKSPACE))
 MAX_UNREACHABLE_RATIO = 0.5
-"""Layouts that are out of reach are drawn again, which succeeds as long as most are within it."""
+"""Maximum ratio of unreachable poses: unreachable layouts are drawn again, which works if most are reachable."""
 MAX_DEPTH_ERROR_M = 0.01
-"""How far finger tips may be from where finger_depth says: a grasp of a 3 cm cube misses beyond it."""
+"""Maximum error of finger_depth, metres: a grasp of a 3 cm cube misses beyond it."""
 
 
 class FingerBoxes(NamedTuple):
-    """Boxes of the fingers along the axes of the TCP, the hand as far open as tasks open it.
+    """Boxes of the fingers along the axes of the TCP, with the hand as open as in tasks.
 
-    PyBullet's boxes are some millimetres too large.
+    PyBullet's boxes are a few millimetres too large.
 
     Attributes:
-        low, high: (n, 3) their corners, metres.
+        low, high: (n, 3) corners of the boxes, metres.
     """
 
     low: Array
@@ -41,42 +41,42 @@ class FingerBoxes(NamedTuple):
 
     @property
     def centres(self) -> Array:
-        """(n, 3) metres."""
+        """Centres (n, 3), metres."""
         return (self.low + self.high) / 2
 
     @property
     def depth(self) -> float:
-        """How far the tips are beyond the TCP, metres."""
+        """Distance of the finger tips beyond the TCP, metres."""
         return float(self.high[:, 2].max())
 
 
 def check_robot(spec: RobotSpec, *, uses_workspace: bool) -> None:
-    """Check a robot before anything is made with it.
+    """Check a robot before generating anything with it.
 
     Args:
         spec: The robot.
-        uses_workspace: Whether objects will be placed all over the workspace of the included tasks.
+        uses_workspace: Whether objects will be placed across the workspace of the built-in tasks.
 
     Raises:
-        ConfigError: The spec does not fit the URDF, a link does not say what it weighs, the TCP is not between the
-            finger tips, or most of the workspace is out of reach; says what to change.
+        ConfigError: The spec does not fit the URDF, a link does not specify its mass, the TCP is not between the finger
+            tips, or most of the workspace is out of reach; the message states the fix.
         SceneError: A mesh of the URDF is missing or cannot be loaded.
     """
     try:
         checked_urdf(spec)
-    except SceneError as error:  # of a recording it says that the data are damaged, here that the request is wrong
+    except SceneError as error:  # for a recording it means damaged data, here a wrong request
         raise ConfigError(str(error)) from error
     check_masses(spec.urdf)
     if problem := finger_problem(spec, finger_boxes(spec)):
-        raise ConfigError(f"The TCP of the robot {spec.name!r} is not where tasks need it: {problem}: {spec.urdf}")
+        raise ConfigError(f"The robot {spec.name!r} has its TCP in the wrong place: {problem}: {spec.urdf}")
     if uses_workspace and (problem := reach_problem(spec)):
-        raise ConfigError(f"The robot {spec.name!r} does not reach what tasks place: {problem}: {spec.urdf}")
+        raise ConfigError(f"The robot {spec.name!r} does not reach the workspace of the tasks: {problem}: {spec.urdf}")
 
 
 def unreachable_poses(spec: RobotSpec) -> tuple[str, ...]:
-    """Say which of the poses of the workspace, `NUM_POSES` of them, the hand cannot take, and why not.
+    """Find the poses of the workspace, of `NUM_POSES`, that the hand cannot reach, with the reason.
 
-    It points down at one of a grasp's two yaws, wherever tasks put objects, up to 22 cm above the table.
+    The hand points down at one of a grasp's two yaws, over the objects' region, up to 22 cm above the table.
     """
     arm, home = arm_kinematics(spec), np.array(spec.home_q)
     found = []
@@ -90,7 +90,7 @@ def unreachable_poses(spec: RobotSpec) -> tuple[str, ...]:
 
 
 def reach_problem(spec: RobotSpec) -> str:
-    """What to change where most of the workspace is out of reach; "" for nothing."""
+    """Return the fix if most of the workspace is out of reach; "" otherwise."""
     unreachable = unreachable_poses(spec)
     if len(unreachable) <= MAX_UNREACHABLE_RATIO * NUM_POSES:
         return ""
@@ -107,7 +107,7 @@ def finger_boxes(spec: RobotSpec) -> FingerBoxes:
     home = np.array(spec.home_q)
     placement = RobotPlacement(
         name=spec.name,
-        world_from_base=arm_kinematics(spec).forward(home).inverse(),  # so that the TCP is the world's frame
+        world_from_base=arm_kinematics(spec).forward(home).inverse(),  # puts the TCP at the world's frame
         joint_position=spec.home_q,
         gripper_width=spec.gripper.open_width,
     )
@@ -122,7 +122,7 @@ def finger_boxes(spec: RobotSpec) -> FingerBoxes:
 
 
 def finger_problem(spec: RobotSpec, fingers: FingerBoxes) -> str:
-    """What is grossly wrong about the TCP, and what to change; "" for nothing."""
+    """Return the fix for a grossly misplaced TCP; "" otherwise."""
     gripper = spec.gripper
     across = np.abs(fingers.centres)
     if isinstance(gripper, ParallelGripper) and (across[:, 0] > across[:, 1]).any():
@@ -136,6 +136,6 @@ def finger_problem(spec: RobotSpec, fingers: FingerBoxes) -> str:
             "tips, its z axis out of the hand"
         )
     return (
-        f"the finger tips are {fingers.depth:.3f} m beyond tcp_link {spec.tcp_link!r}, finger_depth is "
+        f"the finger tips are {fingers.depth:.3f} m beyond tcp_link {spec.tcp_link!r}, but finger_depth is "
         f"{gripper.finger_depth:g}; move tcp_link by {error:.3f} m along its z axis, or correct finger_depth"
     )

@@ -1,4 +1,4 @@
-"""Random layouts: numbers for placements, and rejection sampling with a bound."""
+"""Random layouts: numbers for placements, and bounded rejection sampling."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ from demorec.objects.shelf import Shelf, Split
 
 MAX_TRIES = 1000
 STRATIFIED_NUMBERS = 12
-"""How many placements of a layout are spread evenly: x, y and yaw of the first four objects."""
+"""Number of stratified placement coordinates of a layout: x, y and yaw of the first four objects."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
-    """A rectangle on the table, metres, world frame, cut by a ring about the robot's base.
+    """A rectangle on the table, metres, world frame, intersected with a ring about the robot's base.
 
     Attributes:
         x, y: (low, high).
-        min_radius, max_radius: Distance from the base at (0, 0) that the hand reaches while it points down.
+        min_radius, max_radius: Range of distances from the base at (0, 0) that the hand reaches while pointing down.
     """
 
     x: tuple[float, float]
@@ -37,7 +37,7 @@ class Region:
     max_radius: float = 0.72
 
     def contains(self, point: tuple[float, float]) -> bool:
-        """Whether a point (x, y) is inside."""
+        """Check whether a point (x, y) is inside."""
         radius = math.hypot(*point)
         return (
             self.x[0] <= point[0] <= self.x[1]
@@ -46,19 +46,19 @@ class Region:
         )
 
     def cut(self, other: Region, what: str) -> Region:
-        """The part of this rectangle within the other; SceneError when there is none."""
+        """Intersect the rectangle with another; SceneError if the intersection is empty."""
         x = (max(self.x[0], other.x[0]), min(self.x[1], other.x[1]))
         y = (max(self.y[0], other.y[0]), min(self.y[1], other.y[1]))
         if x[0] >= x[1] or y[0] >= y[1]:
             raise SceneError(
-                f"The held-out rectangle x {other.x}, y {other.y} lies outside of where {what} is placed "
+                f"The held-out rectangle x {other.x}, y {other.y} is outside the region of {what} "
                 f"(x {self.x}, y {self.y}): choose another with ranges held_out_x and held_out_y."
             )
         return replace(self, x=x, y=y)
 
 
 WORKSPACE = Region(x=(0.35, 0.65), y=(-0.25, 0.25))
-"""Where objects are placed unless a task says otherwise."""
+"""Default region of objects."""
 
 
 @dataclass
@@ -67,15 +67,15 @@ class Sampler:
 
     Attributes:
         rng: The stream of purpose "scene".
-        unit_point: Coordinates in 0..1 of a stratified point (Sobol, Latin hypercube): the first placements take
-            theirs from it, one per call of `placement`; empty for plain random sampling.
-        ranges: Resolved ranges of the run, for what `named` draws and for the initial joints.
+        unit_point: Coordinates in 0..1 of a stratified point (Sobol, Latin hypercube), used by the first placements,
+            one per call of `placement`; empty for plain random sampling.
+        ranges: Resolved ranges of the run, for `named` and for the initial joints.
         split: "train" keeps every point out of the held-out rectangle, "eval" puts the first one into it.
-        fixed: Whether the task's exact layout is wanted, of those that have one.
-        shelves: What things are drawn from, for tasks that draw from shelves.
-        object_split: Which of their shapes: `demorec.objects.shelf.Split`.
-        can_grasp: Whether the robot's gripper finds a grasp of a mesh.
-        is_free: Whether something may lie at a point (x, y), beside what a caller of `point` accepts.
+        fixed: Whether to use the task's exact layout, if it has one.
+        shelves: Object sets, for tasks that draw from them.
+        object_split: Subset of their shapes: `demorec.objects.shelf.Split`.
+        can_grasp: Whether the robot's gripper can grasp a mesh.
+        is_free: Whether an object may be at a point (x, y), in addition to the condition of `point`.
     """
 
     rng: np.random.Generator
@@ -91,20 +91,20 @@ class Sampler:
     _points: int = field(default=0, init=False)
 
     def uniform(self, low: float, high: float) -> float:
-        """A number in low..high."""
+        """Draw a number in low..high."""
         return float(self.rng.uniform(low, high))
 
     def named(self, name: Literal["cube_side", "cube_mass", "cube_friction"], low: float, high: float) -> float:
-        """A number in the user's range of that name, or in the task's own low..high."""
+        """Draw a number in the user's range of that name, or in the task's own low..high."""
         chosen = getattr(self.ranges, name)
         return self.uniform(*((low, high) if chosen is None else chosen))
 
     def choice[T](self, options: Sequence[T]) -> T:
-        """One of the options."""
+        """Draw one of the options."""
         return options[int(self.rng.integers(len(options)))]
 
     def placement(self, low: float, high: float) -> float:
-        """A number in low..high that is spread evenly over the episodes of a stratified run."""
+        """Draw a number in low..high, stratified over the episodes of a stratified run."""
         if self._used < len(self.unit_point):
             value = self.unit_point[self._used]
             self._used += 1
@@ -112,7 +112,7 @@ class Sampler:
         return self.uniform(low, high)
 
     def yaw(self) -> float:
-        """An angle in -pi..pi."""
+        """Draw an angle in -pi..pi."""
         return self.placement(-math.pi, math.pi)
 
     def point(
@@ -124,10 +124,10 @@ class Sampler:
         accept: Callable[[tuple[float, float]], bool] = lambda point: True,
         what: str = "an object",
     ) -> tuple[float, float]:
-        """A point (x, y) in a region, at least `min_distance` from the points of `away_from`.
+        """Draw a point (x, y) in a region, at least `min_distance` from the points of `away_from`.
 
         Raises:
-            SceneError: None was found in 1000 tries.
+            SceneError: No point was found in 1000 attempts.
         """
         held_out = Region(
             x=self.ranges.range("held_out_x"), y=self.ranges.range("held_out_y"), min_radius=0.0, max_radius=math.inf
@@ -142,20 +142,20 @@ class Sampler:
             if far and allowed and region.contains(candidate) and self.is_free(candidate) and accept(candidate):
                 return candidate
         raise SceneError(
-            f"No place was found for {what} in {MAX_TRIES} tries: x {region.x}, y {region.y}, {min_distance:g} m from "
-            f"{len(away_from)} others; widen the region or place fewer or smaller objects."
+            f"No place was found for {what} in {MAX_TRIES} attempts: x {region.x}, y {region.y}, {min_distance:g} m "
+            f"from {len(away_from)} others; widen the region or place fewer or smaller objects."
         )
 
 
 def stratified_point(
     method: Literal["random", "sobol", "lhs"], *, root_seed: int, episode_index: int, block: int
 ) -> tuple[float, ...]:
-    """Coordinates in 0..1 of one episode's layout, spread evenly over the episodes of a run; empty for "random".
+    """Compute the stratified coordinates in 0..1 of one episode's layout; empty for "random".
 
     Args:
         method: A scrambled Sobol sequence, or one Latin hypercube per `block` episodes (scipy.stats.qmc).
-        root_seed: Of the run.
-        episode_index: Which point.
+        root_seed: Root seed of the run.
+        episode_index: Index of the point.
         block: Episodes in one Latin hypercube.
     """
     if method == "random":
@@ -181,5 +181,5 @@ def _latin_hypercube(root_seed: int, cube: int, block: int) -> Array:
 
 
 def wording(rng: np.random.Generator, *templates: str, **words: object) -> str:
-    """One of several wordings of an instruction, filled in."""
+    """Choose one of several wordings of an instruction and fill it in."""
     return templates[int(rng.integers(len(templates)))].format(**words)

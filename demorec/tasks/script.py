@@ -1,4 +1,4 @@
-"""The expert's knowledge of an episode, the steps of its script, and conditions to wait for."""
+"""Episode-specific behaviour of the expert, the steps of its script, and conditions to wait for."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from demorec.sim.world import World
 
 
 class ExpertFailure(Exception):
-    """The expert cannot go on; ends the script with a failure."""
+    """The expert cannot continue; ends the script with a failure."""
 
     def __init__(self, phase: str, reason: str) -> None:
         super().__init__(phase, reason)
@@ -20,15 +20,15 @@ class ExpertFailure(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """How the expert does it in one episode; recorded as `EpisodeInfo.behaviour`.
+    """Variation in how the expert does one episode; recorded as `EpisodeInfo.behaviour`.
 
     Attributes:
-        speed: Factor on the speeds of all motions; touching down with an object is never faster than at 1.
-        approach_height, lift_height: Above the grasp, metres.
+        speed: Factor on the speeds of all motions, except that objects never touch down faster than at 1.
+        approach_height, lift_height: Heights above the grasp, metres.
         grasp_offset: Shift of the grasp along the fingers' faces, metres.
         action_noise: Standard deviation of the exploration noise on the executed joint targets, rad.
         miss_x, miss_y: Deliberate error of the first grasp in the hand's frame, metres, x along the fingers' faces; 0
-            for none. What is done may be farther, to the other side or left out, so that nothing is touched.
+            if none. The actual miss may be larger, on the other side or omitted, so that nothing is touched.
         perception_x, perception_y: Error of every perceived object position, metres.
         perception_yaw: Error of every perceived object yaw, rad.
     """
@@ -50,20 +50,20 @@ class Behaviour:
         return self.miss_x != 0.0 or self.miss_y != 0.0
 
     def as_mapping(self) -> dict[str, float]:
-        """name -> value."""
+        """Convert to name -> value."""
         return {name: float(value) for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """What an agent, the script or any other, wants in one control step; recorded in the `Frame` of that step.
+    """Decision of an agent, such as the script, for one control step; recorded in the `Frame` of that step.
 
     Attributes:
-        action: The label, which a policy learns.
+        action: The label that a policy learns.
         command: Command for the motors; None: the action.
         phase: "approach", "lift", ...
-        noise_allowed: Whether exploration noise does no harm now (free motion, away from objects).
-        events: What happened since the step before.
+        noise_allowed: Whether exploration noise is harmless now (free motion, away from objects).
+        events: Events since the previous step.
         is_deliberate_miss: Whether this belongs to a deliberate miss.
     """
 
@@ -76,7 +76,7 @@ class Step:
 
 
 def lasting(condition: Callable[[], bool], *, steps: int) -> Callable[[], bool]:
-    """A condition that holds once another one has held for so many control steps in a row."""
+    """Make a condition that holds once another one has held for `steps` consecutive control steps."""
     count = 0
 
     def done() -> bool:
@@ -88,7 +88,7 @@ def lasting(condition: Callable[[], bool], *, steps: int) -> Callable[[], bool]:
 
 
 def steady_width(world: World, *, tolerance: float = 0.006, seconds: float = 0.06) -> Callable[[], bool]:
-    """A condition that holds once the opening has changed by less than `tolerance` (m/s) for some time."""
+    """Make a condition that holds once the opening has changed by less than `tolerance` (m/s) for `seconds`."""
     last = math.inf
 
     def is_steady() -> bool:

@@ -1,8 +1,8 @@
-"""The pick-and-place skill: every task of the arm is a sequence of it.
+"""The pick-and-place skill: every arm task is a sequence of it.
 
-perceive, approach, descend, close, lift, transport, lower, release, retreat, verify; three tries in all.
-The poses of objects are looked at only where a camera could see them still: before the approach and before lowering.
-No step is wasted waiting: a policy that learns from idle frames learns to stand still.
+Phases: perceive, approach, descend, close, lift, transport, lower, release, retreat, verify; up to three attempts.
+Object poses are read only where a camera could still see them: before the approach and before lowering. No step is
+spent waiting: a policy that learns from idle frames learns to stand still.
 """
 
 from __future__ import annotations
@@ -38,34 +38,34 @@ LIFT_SPEED = 0.3
 TOUCH_DOWN_SPEED = 0.08
 """Peak speeds of the TCP, m/s."""
 MOST_BELOW_LINE = 0.02
-"""Metres (of an arm of task_scale 1) that the TCP may come below the lower end of a line where the arm cannot follow it
-and goes joint by joint."""
+"""Maximum depth, metres (of an arm of task_scale 1), of the TCP below the lower end of a line that the arm cannot
+follow and replaces with a joint motion."""
 SETTLE_TOLERANCE = 0.03
 SETTLE_SECONDS = 0.1
-"""Joint error, rad, at which a motion counts as finished, and the maximum time to wait for it."""
+"""Joint error, rad, at which a motion counts as finished, and the maximum time to wait for it, s."""
 ARRIVAL_TOLERANCE = 0.006
 ARRIVAL_SECONDS = 0.34
-"""The same after a free motion: the expert goes on only where it wanted to be. If it went on while exploration noise
-still held the arm a centimetre off, a policy would learn that a centimetre off is good enough."""
+"""The same after a free motion: the expert continues only at its target. If it continued while exploration noise still
+held the arm a centimetre away, a policy would learn that such an error is acceptable."""
 LOST_WIDTH = 0.012
-"""Opening, metres, below which the hand holds nothing."""
+"""Opening, metres, below which the hand is considered empty."""
 ROCKING_SECONDS = 0.5
-"""Maximum time that a released object may rock."""
+"""Maximum time for which a released object may rock, s."""
 CARRIED_ABOVE_M = 0.04
-"""As `ABOVE_M` for what it holds: fingers must not come down on an object, but what is held may come down aslant."""
+"""`ABOVE_M` for a held object: fingers must not come down on an object, but a held object may descend at an angle."""
 
 
 class Expert:
     """The arm's skills in one episode; its methods yield control steps.
 
     Attributes:
-        world: After reset.
-        behaviour: How fast, how high, with which errors.
-        reach: Where the hand gets to.
+        world: World after reset.
+        behaviour: Speeds, heights and errors.
+        reach: Reachability of poses.
         joint_target, gripper_target: Command of the next step: (n_arm,) rad, and metres.
-        phase: Present phase.
-        num_retries: How often something had to be tried again.
-        trouble: (phase, reason) of what went wrong last.
+        phase: Current phase.
+        num_retries: Number of repeated attempts.
+        trouble: (phase, reason) of the last problem.
     """
 
     def __init__(self, world: World, behaviour: Behaviour | None = None) -> None:
@@ -81,16 +81,16 @@ class Expert:
         self._free, self._clear_height = False, -math.inf
         self._missing = self._has_missed = False
         self._scale, self._closed_width = robot.task_scale, robot.gripper.min_width
-        # A jaw that turns far needs longer than fingers that slide; at the end it slows down.
+        # A jaw that turns far needs longer than sliding fingers, and slows down at the end.
         self._stroke_seconds = robot.gripper.stroke_seconds() + 0.2
 
     @property
     def open_width(self) -> float:
-        """The gripper's full opening, metres."""
+        """Full opening of the gripper, metres."""
         return self.world.robot.gripper.open_width
 
     def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> ExpertFailure:
-        """Note what is wrong with the first of the poses that cannot be reached, and return what is to be raised."""
+        """Note why the first of the poses is unreachable, and return the exception to raise."""
         why = self.reach.why_not(poses[0], self.joint_target) if poses else ""
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
         return ExpertFailure(self.phase, "unreachable")
@@ -102,7 +102,7 @@ class Expert:
             self.trouble = (self.phase, name)
 
     def step(self) -> Step:
-        """The control step that holds the present targets."""
+        """Build the control step that holds the current targets."""
         events, self._events = tuple(self._events), []
         return Step(
             action=self.world.arm.action(self.joint_target.copy(), self.gripper_target),
@@ -113,21 +113,21 @@ class Expert:
         )
 
     def tcp(self) -> Pose:
-        """`world_from_tcp` as sensed."""
+        """Compute the measured `world_from_tcp`."""
         return self.reach.tcp(self.world.arm.arm_position())
 
     def tcp_target(self) -> Pose:
-        """`world_from_tcp` as commanded."""
+        """Compute the commanded `world_from_tcp`."""
         return self.reach.tcp(self.joint_target)
 
     def reaches(self, world_from_tcp: Pose) -> bool:
-        """Whether the arm can get there at once."""
+        """Check whether the arm can reach a pose from its current configuration."""
         return self.reach.at_once(world_from_tcp, self.joint_target)
 
     def first_reachable(self, grasps: Sequence[Pose], above_by: float, *, lift_by: float = 0.0) -> Pose | None:
-        """The first grasp that the arm reaches from `above_by` metres higher, and can lift by `lift_by` metres.
+        """Find the first grasp that the arm reaches from `above_by` metres higher, and can lift by `lift_by` metres.
 
-        From where it is, or failing that at all.
+        Grasps reachable from the current configuration come first.
         """
         for grasp in self._reachable(grasps, up_to=above_by):
             descends = self.reach.descends(grasp, by=above_by, start=self.joint_target)
@@ -136,7 +136,7 @@ class Expert:
         return None
 
     def _reachable(self, poses: Sequence[Pose], *, up_to: float) -> Iterator[Pose]:
-        """Yield poses that are reached from where the arm is, `up_to` metres higher too; then those reached at all."""
+        """Yield poses reachable from here, `up_to` metres higher too; then those reachable from any configuration."""
         yield from within(self.reaches, poses, up_to=up_to)
         yield from within(self.reach.at_all, poses, up_to=up_to)
 
@@ -150,18 +150,19 @@ class Expert:
         settle: bool = True,
         until: Callable[[], bool] | None = None,
     ) -> Iterator[Step]:
-        """Move in a straight line; where the arm cannot follow it and the hand is above everything, joint by joint.
+        """Move in a straight line; if the arm cannot follow it and the hand is above everything, joint by joint.
 
         Args:
-            world_from_tcp: Where to.
+            world_from_tcp: Target pose.
             speed: Peak speed, m/s; multiplied by the behaviour's speed.
             free: Whether exploration noise is allowed.
-            clear_height: Height of the TCP, metres, above which it is; without one the hand is above everything.
+            clear_height: Minimum height of the TCP, metres, for exploration noise; by default the hand is above
+                everything.
             settle: Whether to wait, for a fraction of a second, until the joints have caught up.
-            until: Stop as soon as this holds.
+            until: Condition that stops the motion.
 
         Raises:
-            ExpertFailure: The arm cannot get there so.
+            ExpertFailure: The arm cannot reach the pose this way.
         """
         self._free, self._clear_height = free, clear_height
         may_sink = MOST_BELOW_LINE * self._scale if free and clear_height == -math.inf else None
@@ -199,14 +200,14 @@ class Expert:
         )
 
     def pick_and_place(self, goal: Goal, *, is_begun: bool = False) -> Iterator[Step]:
-        """Bring one object to its goal, trying again after a miss, a drop or a bad placement.
+        """Bring one object to its goal, repeating after a miss, a drop or a bad placement.
 
         Args:
-            goal: Of the object.
-            is_begun: As of `pick`, at the first try.
+            goal: Goal of the object.
+            is_begun: As in `pick`, at the first attempt.
 
         Raises:
-            ExpertFailure: Out of reach, or three tries were not enough.
+            ExpertFailure: Out of reach, or three attempts failed.
         """
         for attempt in range(MAX_TRIES):
             if attempt > 0:
@@ -222,7 +223,7 @@ class Expert:
         raise ExpertFailure(*self.trouble)
 
     def reachable_grasp(self, name: str, *, above_by: float, lift_by: float = 0.0) -> Pose:
-        """`world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and so many metres higher.
+        """Choose `world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and `above_by` higher.
 
         Raises:
             ExpertFailure: Out of reach at every yaw.
@@ -242,7 +243,7 @@ class Expert:
         raise self._out_of_reach(f"{name} at {place}", self.grasps(name))
 
     def reachable_place(self, position: tuple[float, float, float]) -> Pose:
-        """`world_from_tcp` at a position, the hand down at the nearest yaw to which a straight line leads from here.
+        """Choose `world_from_tcp` at a position, the hand down at the nearest yaw reachable in a straight line.
 
         Raises:
             ExpertFailure: Out of reach at every yaw.
@@ -259,8 +260,8 @@ class Expert:
         """Grasp and lift an object; the generator returns whether it is held.
 
         Args:
-            name: Of the object.
-            is_begun: Somebody else has brought the hand here: do not approach if it is above the object already.
+            name: Name of the object.
+            is_begun: Another controller brought the hand here: skip the approach if it is above the object already.
         """
         world, behaviour = self.world, self.behaviour
         self.phase = "perceive"
@@ -289,15 +290,15 @@ class Expert:
         return False
 
     def holds(self, name: str) -> bool:
-        """Whether both fingers press on an object that keeps them apart."""
+        """Check whether both fingers press on an object that keeps them apart."""
         return self.world.grip_force(name) > 0.5 and self._is_apart(0.01)
 
     def place(self, goal: Goal, *, is_begun: bool = False) -> Generator[Step, None, bool]:
-        """Carry the held object to its goal and let go; the generator returns whether it is well placed.
+        """Carry the held object to its goal and release it; the generator returns whether it is placed correctly.
 
         Args:
-            goal: Of the object.
-            is_begun: Somebody else has brought the hand here: only lower it if it is above the goal already.
+            goal: Goal of the object.
+            is_begun: Another controller brought the hand here: only descend if it is above the goal already.
         """
         world, name = self.world, goal.object
         self.phase = "transport"
@@ -314,8 +315,9 @@ class Expert:
             self.phase = "lower"
             wanted = self._place_pose(goal, keep_yaw=True)
             yield from self.move(raised(wanted, 0.015), speed=LIFT_SPEED, settle=False)
-            # A faster behaviour does not hurry here: the target stops in one step, harder than the joints may. And who
-            # looks less often is slower, since the hand presses until it is seen that the object stands.
+            # A faster behaviour does not speed this up: the target stops within one step, faster than the joint limits
+            # allow. A lower control rate slows it down, since the hand presses until it is detected that the object
+            # rests.
             speed = TOUCH_DOWN_SPEED * min(1.0, world.fps / 30) / max(1.0, self.behaviour.speed)
             yield from self.move(raised(wanted, -0.004), speed=speed, until=lambda: on_support(world, name, goal.onto))
         if not self._is_apart(LOST_WIDTH):
@@ -332,7 +334,7 @@ class Expert:
         clear_height = float(here.position[2]) + 0.07 * self._scale
         try:
             yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
-        except ExpertFailure:  # so much is enough to be clear of what was put down
+        except ExpertFailure:  # this far is enough to clear the object
             away = raised(here, self._scale * 0.1)
             yield from self.move(away, speed=LIFT_SPEED, free=True, clear_height=clear_height, settle=False)
         self.phase = "verify"
@@ -346,11 +348,11 @@ class Expert:
         return not failed
 
     def _transport_height(self, place: Pose) -> float:
-        """Height of the TCP, m, on the way to a place: never lower than now."""
+        """Compute the TCP height, m, during transport: never lower than now."""
         return float(max(self.tcp_target().position[2], place.position[2] + self._scale * LEAST_ABOVE_GOAL))
 
     def _is_apart(self, by: float) -> bool:
-        """Whether the fingers are more than so many metres (of an arm of task_scale 1) wider than when closed."""
+        """Check whether the fingers are more than `by` metres (of an arm of task_scale 1) wider than when closed."""
         return self.world.arm.gripper_width() > self._closed_width + self._scale * by
 
     def _recover(self, world_from_tcp: Pose) -> Iterator[Step]:
@@ -362,19 +364,19 @@ class Expert:
         yield from self.move(world_from_tcp, speed=0.4, free=True, clear_height=clear_height)
 
     def grasps(self, name: str) -> list[Pose]:
-        """Grasp poses `world_from_tcp` of an object with the behaviour's errors."""
+        """List grasp poses `world_from_tcp` of an object with the behaviour's errors."""
         world = self.world
         body, pose = world.body(name), world.pose(name)
         grasps = grasps_of(body, pose, now=hand_yaw(self.tcp()), robot=world.robot, behaviour=self.behaviour)
         return clear_first(grasps, self._others(name), world.robot)
 
     def _others(self, name: str) -> list[tuple[Body, Pose]]:
-        """All bodies but one, and their poses."""
+        """List all bodies except one, with their poses."""
         world = self.world
         return [(other, world.pose(other.name)) for other in world.scene.bodies if other.name != name]
 
     def _place_pose(self, goal: Goal, *, keep_yaw: bool = False) -> Pose:
-        """`world_from_tcp` that puts the held object at its goal, with the offset in the hand compensated.
+        """Compute `world_from_tcp` that puts the held object at its goal, compensating its offset in the hand.
 
         Raises:
             ExpertFailure: Out of reach at every allowed yaw.

@@ -1,4 +1,4 @@
-"""Strict conditions of success, one function each, shared by all tasks."""
+"""Strict success conditions, one function each, shared by all tasks."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ MAX_TILT = math.radians(5.0)
 MAX_SPEED = 0.01
 MAX_SPIN = 0.1
 MAX_DISTURBANCE = 0.02
-"""How far an object that is not to be moved may end from where it was, metres."""
+"""Maximum displacement of an object that is not to be moved, metres."""
 MIN_OPENING = 0.875
-"""Share of the gripper's full opening that counts as open."""
+"""Minimum ratio of the gripper's full opening at which it counts as open."""
 
 
 def goal_pose(world: World, goal: Goal) -> Pose:
-    """`world_from_goal` now: it moves with the body that the goal lies on."""
+    """Compute the current `world_from_goal`: it moves with the body that supports the goal."""
     return _support_pose(world, goal) @ goal.onto_from_goal
 
 
@@ -32,33 +32,33 @@ def _support_pose(world: World, goal: Goal) -> Pose:
 
 
 def resting_half_height(body: Body, pose: Pose) -> float:
-    """Half the extent, metres, of the body axis that is nearest to vertical."""
+    """Compute half the extent, metres, of the body axis nearest to vertical."""
     vertical = int(np.argmax(np.abs(pose.rotation[2])))
     return body.shape.extents[vertical] / 2
 
 
 def tilt_of(pose: Pose) -> float:
-    """Angle, rad, between the vertical and the body axis nearest to it."""
+    """Compute the angle, rad, between the vertical and the body axis nearest to it."""
     return math.acos(min(1.0, float(np.abs(pose.rotation[2]).max())))
 
 
 def lean_of(pose: Pose) -> float:
-    """Angle, rad, between the vertical and the body's z axis."""
+    """Compute the angle, rad, between the vertical and the body's z axis."""
     return math.acos(max(-1.0, min(1.0, float(pose.rotation[2, 2]))))
 
 
 def at_most(name: str, value: float, limit: float, unit: str) -> SuccessCheck:
-    """A check that holds when value <= limit."""
+    """Make a check that passes if value <= limit."""
     return SuccessCheck(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value <= limit))
 
 
 def at_least(name: str, value: float, limit: float, unit: str) -> SuccessCheck:
-    """A check that holds when value >= limit."""
+    """Make a check that passes if value >= limit."""
     return SuccessCheck(name=name, value=float(value), limit=limit, unit=unit, passed=bool(value >= limit))
 
 
 def on_support(world: World, name: str, onto: str) -> bool:
-    """Whether a body touches what it is meant to stand on: `onto`, or any support for a place in the world."""
+    """Check whether a body touches its intended support: `onto`, or any support for a goal in the world."""
     if onto:
         return world.touches(name, onto)
     return any(
@@ -67,7 +67,7 @@ def on_support(world: World, name: str, onto: str) -> bool:
 
 
 def rest_checks(world: World, name: str, suffix: str = "") -> tuple[SuccessCheck, SuccessCheck]:
-    """That a body moves no faster than what counts as lying still; the suffix ends the checks' names."""
+    """Check that a body is slow enough to count as at rest; the suffix ends the checks' names."""
     linear, angular = world.velocity(name)
     return (
         at_most(f"speed{suffix}", math.hypot(*linear.tolist()), MAX_SPEED, "m/s"),
@@ -76,15 +76,15 @@ def rest_checks(world: World, name: str, suffix: str = "") -> tuple[SuccessCheck
 
 
 def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
-    """That one object lies at its goal: near, on its support, upright, at rest and let go.
+    """Check that one object is at its goal: near, on its support, upright, at rest and released.
 
-    The names end in the object's name when the scene has more than one goal.
+    The names end in the object's name if the scene has more than one goal.
     """
     suffix = f":{goal.object}" if len(world.scene.goals) > 1 else ""
     pose, wanted = world.pose(goal.object), goal_pose(world, goal)
     distance = goal.distance(_support_pose(world, goal), pose)
     body = world.body(goal.object)
-    # The wanted height is that of the resting face that was meant; a cube may rest on any face.
+    # The target height refers to the intended resting face; a cube may rest on any face.
     height = wanted.position[2] + resting_half_height(body, pose) - resting_half_height(body, wanted)
     return (
         at_most(f"distance_to_goal{suffix}", distance, MAX_DISTANCE, "m"),
@@ -98,5 +98,5 @@ def placement_checks(world: World, goal: Goal) -> tuple[SuccessCheck, ...]:
 
 
 def gripper_open_check(world: World) -> SuccessCheck:
-    """That the hand has let go."""
+    """Check that the hand is open."""
     return at_least("gripper_width", world.arm.gripper_width(), MIN_OPENING * world.robot.gripper.open_width, "m")

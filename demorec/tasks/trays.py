@@ -1,4 +1,4 @@
-"""Cubes go into trays: one into the only tray, several into those of their colours."""
+"""Placing of cubes in trays: one in the only tray, several in those of their colours."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ from demorec.tasks.sampling import Region, Sampler
 TRAY_FLOOR = 0.004
 """Height of a tray's floor above its lower face, metres (tray.urdf)."""
 IN_TRAY = (-0.13, -0.10, 0.13, 0.10)
-"""The floor of a tray in its own frame: least x and y, greatest x and y, metres."""
+"""Floor of a tray in its own frame: minimum x and y, maximum x and y, metres."""
 CUBES = Region(x=(0.35, 0.65), y=(-0.25, 0.15))
 TRAYS = Region(x=(0.40, 0.50), y=(0.36, 0.40))
-"""Of the tray's middle: its far corner must be within the reach of a hand that points down."""
+"""Region of the tray's middle: its far corner must be within reach of a hand that points down."""
 SORTED_CUBES = Region(x=(0.36, 0.65), y=(-0.19, 0.19))
 TRAY_Y = 0.37
 SLOTS = (-0.065, 0.065)
-"""Along a tray's long side, metres: the open fingers must fit between a cube and its neighbour."""
+"""Positions along a tray's long side, metres: the open fingers must fit between a cube and its neighbour."""
 COLOR_PAIRS = (("red", "blue"), ("green", "yellow"), ("red", "yellow"), ("blue", "green"))
 
 
 def tray(name: str, point: tuple[float, float], yaw: float, *, color_name: str) -> Body:
-    """A shallow tray that stands still, its long side (0.27 m) along x at yaw 0."""
+    """Make a fixed shallow tray, its long side (0.27 m) along x at yaw 0."""
     return Body(
         name=name,
         role="target",
         shape=Shape(kind="urdf", file="demorec:tray.urdf", size=(0.27, 0.21, 0.019)),
         world_from_body=Pose.from_yaw((point[0], point[1], 0.0005), yaw),
         lateral_friction=0.6,
-        # Paler than the cubes, so that a cube shows on a tray of its own colour.
+        # Paler than the cubes, so that a cube is visible on a tray of the same colour.
         rgba=_paler(COLORS[color_name]),
         color_name=color_name,
         yaw_symmetry=2,
@@ -40,7 +40,7 @@ def tray(name: str, point: tuple[float, float], yaw: float, *, color_name: str) 
 
 
 def into_tray(cube: Body, target: Body, *, along: float = 0.0) -> Goal:
-    """The goal that a cube is anywhere in a tray; it is put on the middle of the long axis, or `along` it, metres."""
+    """Make the goal of a cube in a tray; it is placed at the middle of the long axis, or `along` it, metres."""
     pose = Pose.from_yaw((along, 0.0, TRAY_FLOOR + cube.shape.size[2] / 2))
     return Goal(object=cube.name, onto=target.name, onto_from_goal=pose, area=IN_TRAY)
 
@@ -51,11 +51,11 @@ def _paler(rgba: Rgba) -> Rgba:
 
 
 class PlaceInTray(TableTask):
-    """Pick up the cube and put it into the tray.
+    """Pick up the cube and place it in the tray.
 
-    Task: one cube on the table, one shallow tray at the robot's left.
-    Randomised: the cube's place (0.30 x 0.40 m), yaw, size (3-6 cm), mass (20-200 g), friction (0.4-1.2) and the
-        tray's place and yaw (within 0.25 rad); the arm's initial joints.
+    Task: one cube on the table, one shallow tray on the robot's left.
+    Randomised: the cube's position (0.30 x 0.40 m), yaw, size (3-6 cm), mass (20-200 g), friction (0.4-1.2) and the
+        tray's position and yaw (within 0.25 rad); the arm's initial joints.
     Success: the cube in the tray, on its floor, upright within 5 degrees, at rest, not touched, the gripper open.
     """
 
@@ -67,7 +67,7 @@ class PlaceInTray(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the cube, the tray and the goal."""
         point = sampler.point(CUBES, what="the cube")
         yaw = sampler.yaw()
         body = random_cube(sampler, "red", point, yaw, sides=(0.03, 0.06))
@@ -79,9 +79,9 @@ class PlaceInTray(TableTask):
 class SortByColor(TableTask):
     """Put every cube into the tray of its colour.
 
-    Task: two to four cubes of two colours, two trays, one on either side.
-    Randomised: how many cubes, which colours, which tray is left; places, yaws, sizes (3-4.5 cm), masses
-        (20-200 g), frictions (0.4-1.2); the trays' places along the table; the arm's initial joints.
+    Task: two to four cubes of two colours, two trays, one on each side.
+    Randomised: number of cubes, colours, which tray is left; positions, yaws, sizes (3-4.5 cm), masses (20-200 g),
+        frictions (0.4-1.2); the trays' positions along the table; the arm's initial joints.
     Success: each cube in the tray of its colour, on its floor, upright within 5 degrees, at rest, not touched; the
         gripper open.
     """
@@ -94,7 +94,7 @@ class SortByColor(TableTask):
     )
 
     def layout(self, sampler: Sampler) -> Layout:
-        """Draw it."""
+        """Draw the cubes, the trays and the goals."""
         colors = sampler.choice(COLOR_PAIRS)
         if sampler.uniform(0.0, 1.0) < 0.5:
             colors = (colors[1], colors[0])

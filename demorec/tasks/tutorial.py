@@ -1,4 +1,4 @@
-"""The scene of the tutorial that this project grew from: a big cube as table, a robot beside it, a small cube."""
+"""Scene of the tutorial that this project grew from: a big cube as table, a robot next to it, a small cube."""
 
 from __future__ import annotations
 
@@ -31,29 +31,28 @@ CUBE_START = (1.0, 1.0, 0.1)
 TABLE_SIDE = 0.5
 ABOVE_CUBE = 0.25
 SINKS = 0.005
-"""Metres: so much lower the cube has to be in reach, since it comes to lie 1.4 mm lower than its size says."""
+"""Depth, metres, below its nominal height to which the cube must be in reach; it comes to rest 1.4 mm lower."""
 RELEASE_POINT = (0.16, 0.14, 0.80)
 MAX_FALL_SECONDS = 3.0
 REST_SECONDS = 0.17
 
 
 class Tutorial(Task):
-    """Carry the cube over the table and let it drop.
+    """Carry the cube over the table and drop it.
 
-    Task: cube.urdf scaled by 0.5 stands fixed at the origin as a table; the Panda, scaled by 1.3, stands at
-        [1, 0, 0.1]; a red cube_small.urdf scaled by 1.5 lies at [1, 1, 0.1]. The steps are the tutorial's: open the
-        hand, go 25 cm above the cube with the hand down, close, hold by a fixed constraint, carry to 80 cm above
-        the table, open, release.
-    Randomised: the cube's place (an arc of 0.5 rad, 8 cm wide, within the tutorial's point), yaw, the arm's initial
+    Task: cube.urdf scaled by 0.5 is fixed at the origin as a table; the Panda, scaled by 1.3, is at [1, 0, 0.1]; a red
+        cube_small.urdf scaled by 1.5 is at [1, 1, 0.1]. The steps are the tutorial's: open the hand, move to 25 cm
+        above the cube with the hand down, close, hold by a fixed constraint, carry to 80 cm above the table, open,
+        release.
+    Randomised: the cube's position (an arc of 0.5 rad, 8 cm wide, within the tutorial's point), yaw, the arm's initial
         joints; nothing with `--fixed`.
-    Success: the cube lies on the table, at rest (1 cm/s, 0.1 rad/s), on a face (5 degrees), not touched, the
-        gripper open.
+    Success: the cube on the table, at rest (1 cm/s, 0.1 rad/s), on a face (5 degrees), not touched, the gripper open.
 
-    What was changed, since the listing cannot work as printed: unscaled, the cube lies 1.0 m from the base and the
-    hand-down reach is 0.80 m, so only the scale of the full listing (1.3) is used. Closing 25 cm above the cube
-    holds nothing, so a step "descend" goes down to it before "close". The cube (75 mm) is wider than the unscaled
-    hand's play allows, and fits the scaled one (104 mm). "80 cm above the table" is taken above its origin (55 cm
-    above its top), over the half that is nearer to the robot: higher or further is out of reach.
+    Changes, since the listing cannot work as printed: unscaled, the cube is 1.0 m from the base and the hand-down reach
+    is 0.80 m, so only the scale of the full listing (1.3) is used. Closing 25 cm above the cube grips nothing, so a
+    step "descend" precedes "close". The cube (75 mm) is too wide for the unscaled hand, and fits the scaled one (104
+    mm). "80 cm above the table" is measured from its origin (55 cm above its top), over the half nearer to the robot:
+    higher or farther is out of reach.
     """
 
     summary = "the tutorial's scene: a cube dropped onto a table from 80 cm, held by a constraint"
@@ -72,11 +71,11 @@ class Tutorial(Task):
 
     @classmethod
     def refusal(cls, robot: RobotSpec) -> str:
-        """Its lengths are the listing's."""
+        """Refuse small arms: the lengths are the listing's."""
         return "" if robot.task_scale == 1.0 else "its table and cube have fixed sizes, which a small arm cannot reach"
 
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
-        """Draw a layout, or give the tutorial's own."""
+        """Draw a layout, or return the tutorial's own."""
         angle, radius, yaw = math.pi / 2, 1.0, 0.0
         spread = sampler.ranges.number("joint_spread")
         if sampler.fixed:
@@ -85,7 +84,7 @@ class Tutorial(Task):
             angle += sampler.placement(-0.25, 0.25)
             radius = sampler.placement(0.90, 0.98)  # 1.0 is beyond the reach of the iiwa
             yaw = sampler.yaw()
-        # Turned towards the side on which cube and table lie.
+        # Turned towards the side of cube and table.
         joints = (robot.home_q[0] + 2.0, *robot.home_q[1:])
         table = Body(
             name="table",
@@ -127,7 +126,7 @@ class Tutorial(Task):
         )
 
     def is_in_reach(self, scene: Scene, robot: RobotSpec, behaviour: Behaviour) -> bool:
-        """A grasp of the cube where it falls to, from 25 cm above it."""
+        """Check a grasp of the cube at its resting position, from 25 cm above it."""
         reach, cube = Reach(scene, robot), scene.body(scene.goals[0].object)
         fallen = raised(cube.world_from_body, CUBE_SIDE / 2 - SINKS - CUBE_START[2])
         now = hand_yaw(reach.tcp(reach.start))
@@ -136,11 +135,11 @@ class Tutorial(Task):
         return any(reach.descends(grasp, by=ABOVE_CUBE, start=reach.start) for grasp in found)
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
+        """Choose a wording of the instruction."""
         return wording(rng, "drop the red cube onto the table", "carry the red cube over the table and let it drop")
 
     def script(self, expert: Expert) -> Iterator[Step]:
-        """The tutorial's steps."""
+        """Yield the tutorial's steps."""
         world = expert.world
         goal = world.scene.goals[0]
         expert.phase = "open"
@@ -158,15 +157,15 @@ class Tutorial(Task):
         release = expert.reachable_place(RELEASE_POINT)
         yield from expert.move(release, speed=0.5)
         expert.phase = "release"
-        # For a while: at the moment of landing the cube can be as slow as at rest. The last state has no frame; at rest
-        # are that one and two recorded ones, at any rate.
+        # The cube must rest for some time: at the moment of landing it can be as slow as at rest. The last state has no
+        # frame; so at least that one and two recorded ones are at rest.
         rests = lasting(
             lambda: all(check.passed for check in self.evaluate(world)), steps=max(3, round(REST_SECONDS * world.fps))
         )
         yield from expert.set_gripper(expert.open_width, max_seconds=MAX_FALL_SECONDS, done=rests)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
-        """The cube lies on the table."""
+        """Check that the cube is on the table."""
         name = world.scene.goals[0].object
         return (
             at_least("on_table", world.touches(name, "table"), 1.0, ""),

@@ -1,4 +1,4 @@
-"""Applies the ranges of `demorec.episode.variation` to a task's scene, whatever the task."""
+"""Task-independent application of the ranges of `demorec.episode.variation` to a scene."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ NEUTRAL_COLORS: tuple[Rgba, ...] = (
     (0.42, 0.27, 0.16, 1.0),
     (0.93, 0.62, 0.70, 1.0),
 )
-"""For distractors: no colour that an instruction names."""
+"""Colours of distractors; instructions do not name them."""
 
 DISTRACTOR_REGION = Region(x=(WORKSPACE.x[0] - 0.03, WORKSPACE.x[1] + 0.06), y=(-0.33, 0.33), max_radius=0.85)
 DISTRACTOR_GAP = 0.12
-"""Between the middles of a distractor and of what the task is about, metres."""
+"""Minimum distance between the middles of a distractor and of the task's objects, metres."""
 DISTRACTOR_MARGIN = 0.045
-"""Between the middle of a distractor and the outline of any of these (trays are large): half its diagonal and 1 cm."""
+"""Minimum distance from a distractor's middle to the outline of such an object (trays are large): half its diagonal and
+1 cm."""
 
 
 def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
-    """How the expert does it in one episode."""
+    """Draw the expert's behaviour in one episode."""
     names = ("speed", "approach_height", "lift_height", "grasp_offset", "action_noise")
     drawn = {name: ranges.draw(name, rng) for name in names}
     misses = float(rng.uniform()) < ranges.number("miss_probability")
-    # To either side along the fingers' faces, up to 0.4 rad askew: across them a finger would land on the object.
+    # To either side along the fingers' faces, up to 0.4 rad askew: across them a finger would come down on the object.
     distance, side = ranges.draw("miss_distance", rng), float(rng.uniform(-1.0, 1.0))
     askew = 0.8 * abs(side) - 0.4
     error_x, error_y, error_yaw = (float(v) for v in rng.normal(0.0, 1.0, 3))
@@ -50,10 +51,10 @@ def draw_behaviour(ranges: Ranges, rng: np.random.Generator) -> Behaviour:
 
 
 def vary_physics(scene: Scene, ranges: Ranges, rng: np.random.Generator, *, distractors: bool = True) -> Scene:
-    """Masses, friction, damping, gravity, table height and, unless the scene has its own, distractors.
+    """Vary masses, friction, damping, gravity, table height and, unless the scene has its own, distractors.
 
     Raises:
-        SceneError: There is no room for the distractors.
+        SceneError: The distractors do not fit.
     """
     bodies = [_other_dynamics(body, ranges, rng) if body.movable else body for body in scene.bodies]
     x, y, z = scene.physics.gravity
@@ -77,7 +78,7 @@ def _other_dynamics(body: Body, ranges: Ranges, rng: np.random.Generator) -> Bod
 
 
 def _lower_table(scene: Scene, drop: float) -> Scene:
-    """The robot on a pedestal of this height: the world's z = 0 stays on the table."""
+    """Put the robot on a pedestal of this height: the world's z = 0 stays on the table."""
     if drop == 0.0:
         return scene
     base = scene.robot.world_from_base
@@ -112,7 +113,7 @@ def _with_distractors(scene: Scene, count: int, rng: np.random.Generator) -> Sce
 
 
 def _from_outline(body: Body, point: tuple[float, float]) -> float:
-    """Metres from a body's bounding rectangle, seen from above, to a point; 0 within it."""
+    """Compute the distance, metres, from a body's bounding rectangle, seen from above, to a point; 0 within it."""
     x, y, _ = body.world_from_body.inverse().apply(np.array([*point, 0.0]))
     width, depth, _ = body.shape.extents
     return math.hypot(max(0.0, abs(x) - width / 2), max(0.0, abs(y) - depth / 2))
@@ -136,14 +137,14 @@ def _distractor(name: str, point: tuple[float, float], sampler: Sampler) -> Body
         world_from_body=Pose.from_yaw((*point, shape.extents[2] / 2 + 5e-4), sampler.uniform(-math.pi, math.pi)),
         mass=0.1,
         rgba=sampler.choice(NEUTRAL_COLORS),
-        # A cylinder that is touched shall not roll off for the rest of the episode.
+        # A touched cylinder must not keep rolling for the rest of the episode.
         rolling_friction=0.001,
         yaw_symmetry=2 if shape.kind == "box" else 0,
     )
 
 
 def vary_looks(scene: Scene, ranges: Ranges, rng: np.random.Generator) -> Scene:
-    """Light, colours and textures; nothing that physics feels."""
+    """Vary light, colours and textures; nothing that affects physics."""
     bodies = []
     for body in scene.bodies:
         if body.color_name and body.rgba != (1.0, 1.0, 1.0, 1.0):
@@ -157,7 +158,7 @@ def vary_looks(scene: Scene, ranges: Ranges, rng: np.random.Generator) -> Scene:
 
 
 def _other_surface(body: Body, ranges: Ranges, rng: np.random.Generator) -> Body:
-    """A muted colour or texture: the named colours stay the only strong ones."""
+    """Draw a muted colour or texture: the named colours remain the only saturated ones."""
     amount = ranges.number("surface_color")
     muted = colorsys.hsv_to_rgb(*(float(rng.uniform(*pair)) for pair in ((0.0, 1.0), (0.0, 0.25), (0.3, 0.9))))
     other = colorsys.hsv_to_rgb(*(float(rng.uniform(*pair)) for pair in ((0.05, 0.12), (0.1, 0.45), (0.3, 0.9))))
@@ -188,7 +189,7 @@ def _other_light(light: Light, ranges: Ranges, rng: np.random.Generator) -> Ligh
 
 
 def vary_cameras(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.random.Generator) -> tuple[SceneCamera, ...]:
-    """Cameras nudged from where they should be; this is recorded as their pose."""
+    """Perturb the nominal camera poses; the result is recorded as their pose."""
     nudged = []
     for camera in cameras:
         nudge = small_pose(rng, position=ranges.number("camera_position"), rotation=ranges.number("camera_rotation"))
@@ -198,18 +199,18 @@ def vary_cameras(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.rando
 
 
 def moved_camera(camera: SceneCamera, by: Pose) -> SceneCamera:
-    """A camera moved along and about its own axes; to the bit the same one where it is not moved."""
+    """Move a camera along and about its own axes; bit-exact if the displacement is zero."""
     return camera if by == Pose() else replace(camera, mount_from_camera=camera.mount_from_camera @ by)
 
 
 def calibration_errors(cameras: tuple[SceneCamera, ...], ranges: Ranges, rng: np.random.Generator) -> dict[str, Pose]:
-    """Camera name -> true_from_recorded: what the recorded extrinsics are wrong by."""
+    """Draw camera name -> true_from_recorded: the error of the recorded extrinsics."""
     position, rotation = ranges.number("calibration_position"), ranges.number("calibration_rotation")
     return {camera.name: small_pose(rng, position=position, rotation=rotation) for camera in cameras}
 
 
 def small_pose(rng: np.random.Generator, *, position: float, rotation: float) -> Pose:
-    """A random small transform: up to `position` m and about `rotation` rad along and about each axis."""
+    """Draw a small transform: up to `position` m and about `rotation` rad along and about each axis."""
     offset = position * rng.uniform(-1.0, 1.0, 3)
     half = 0.5 * rotation * rng.uniform(-1.0, 1.0, 3)
     length = math.sqrt(1.0 + sum(float(v) * float(v) for v in half))

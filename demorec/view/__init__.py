@@ -1,5 +1,5 @@
-"""Looking at episodes in Rerun: the only part that imports it. Needs no simulator, only the files.
+"""Playback of episodes in Rerun, which only this package imports. Needs no simulator, only the files.
 
-`sources.find_episodes` finds what a path holds, `scene.log_episode` puts an episode into a Rerun recording, `layout`
-arranges the views, and `viewer` shows, saves, photographs or serves the result.
+`sources.find_episodes` lists the episodes of a path, `scene.log_episode` logs an episode to a Rerun recording, `layout`
+arranges the views, and `viewer` shows the result, saves it, takes screenshots of it or serves it.
 """

@@ -1,4 +1,4 @@
-"""The robot and the things of the scene: what they look like, how they move, where they shall end."""
+"""Appearance, motion and goals of the robot and the objects of the scene."""
 
 from __future__ import annotations
 
@@ -39,20 +39,20 @@ log = logging.getLogger(__name__)
 
 _OWN_COLOR: Rgba = (1.0, 1.0, 1.0, 1.0)
 _SAME_SIZE = 0.1
-"""How far a model's extents may be from those of the recorded scene, as a part of the largest."""
+"""Maximum difference between a model's extents and those of the recorded scene, relative to the largest extent."""
 
 
 def log_bodies(
     recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene, tint: Rgba | None = None
 ) -> None:
-    """Every body at its place or along its way, and as wire frames the goals and the known ends of objects.
+    """Log every body at its pose or along its trajectory, and wire frames of goals and known final poses of objects.
 
-    A body whose model is not installed here, or is another one, is drawn as the recording describes it.
+    A body with a model that is missing here, or differs from the recorded one, is drawn as the recording describes it.
     """
     for body in scene.bodies:
         entity = paths.body(body.name)
         if tint is not None and body.role in ("support", "fixture"):
-            continue  # the other episode's table, which would lie in the same place
+            continue  # the other episode's table, in the same place
         recording.log(entity, _visible(body, episode, tint), static=True)
         poses = episode.motion.object_poses.get(body.name)
         if poses is not None:
@@ -77,10 +77,10 @@ def _visible(body: Body, episode: Playback, tint: Rgba | None) -> rr.Mesh3D:
         return as_mesh3d(_primitive_mesh(body.shape).placed(Pose(), np.ones(3), color), tint)
     mesh = _installed_mesh(body.shape)
     if mesh is not None:
-        if color != _OWN_COLOR:  # instead of the model's own colours, as in the simulator
+        if color != _OWN_COLOR:  # replaces the model's own colours, as in the simulator
             mesh = replace(mesh, colors=np.full_like(mesh.colors, 255))
         return as_mesh3d(mesh.placed(Pose(), np.ones(3), color), tint)
-    if description := episode.data.description(body.name):  # in the body's colours already
+    if description := episode.data.description(body.name):  # already in the body's colours
         return as_mesh3d(joined(list(urdf_meshes(description, None).values())), tint)
     return as_mesh3d(_unit_mesh("box").placed(Pose(), np.array(body.shape.extents), color), tint)
 
@@ -95,7 +95,7 @@ def _primitive_mesh(shape: Shape) -> SurfaceMesh:
 
 @functools.lru_cache(maxsize=64)
 def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
-    """The model file of a mesh or urdf in the body's frame; None, and a word about it, when it cannot be used."""
+    """Load the model file of a mesh or urdf in the body's frame; None, with a warning, if it is unusable."""
     try:
         mesh = _model_mesh(shape)
     except (DemorecError, OSError, ValueError) as error:
@@ -120,7 +120,7 @@ def _model_mesh(shape: Shape) -> SurfaceMesh:
 
 @functools.cache
 def _unit_mesh(kind: str) -> SurfaceMesh:
-    """A box, ball or cylinder with extents of 1: scaled for each body, since shading a mesh anew takes longer."""
+    """Make a box, sphere or cylinder of extents 1; scaling it for each body is faster than shading it again."""
     if kind == "box":
         return of_trimesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)))
     if kind == "sphere":
@@ -129,7 +129,7 @@ def _unit_mesh(kind: str) -> SurfaceMesh:
 
 
 def _textured_box(size: Array, texture: Texture) -> rr.Mesh3D:
-    """A box each face of which shows the texture once."""
+    """Make a box that shows the texture once on each face."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)])
     vertices, normals = np.zeros((24, 3)), np.zeros((24, 3))
     for face in range(6):
@@ -149,13 +149,13 @@ def _textured_box(size: Array, texture: Texture) -> rr.Mesh3D:
 
 
 _SAME_PLACE = 1e-3
-"""How far joints of the installed model may be from those of the recorded description, metres."""
+"""Maximum distance between joints of the installed model and of the recorded description, metres."""
 
 
 def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Playback, tint: Rgba | None = None) -> None:
-    """Meshes of all links below `paths.robot`, nested as the links are, and how the joints move them.
+    """Log the meshes of all links below `paths.robot`, nested as the links are, and their motion.
 
-    Joints whose positions are not known stay at 0; a robot without a description is not shown.
+    Joints with unknown positions stay at 0; a robot without a description is not shown.
 
     Raises:
         RecordingError: A mesh of the robot's model cannot be read.
@@ -183,10 +183,10 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Playback, ti
 
 
 def _external_model(text: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
-    """The joint tree of a robot that was not simulated, and its links' meshes as far as they are found.
+    """Load the joint tree of a robot that was not simulated, and the meshes found for its links.
 
-    The file that the text comes from counts where it is known and has the same joints. Otherwise a link whose mesh is
-    not found is drawn as rods to the joints that it carries.
+    The text's original file is used if it is known and has the same joints. Otherwise a link without a mesh is drawn as
+    rods to its child joints.
     """
     urdf, path = Urdf.parse(text), known_model(text)
     if path is not None:
@@ -194,7 +194,7 @@ def _external_model(text: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
             original = read_text_limited(path, MAX_BYTES)
             if _same_joints(Urdf.parse(original), urdf):
                 return urdf, urdf_meshes(original, path.parent)
-        except (DemorecError, OSError, ValueError):  # the recording has a description of its own
+        except (DemorecError, OSError, ValueError):  # the recording has its own description
             log.debug("%s has changed since the robot was recorded.", path)
     meshes, reasons = found_meshes(text)
     if not reasons:
@@ -206,7 +206,7 @@ def _external_model(text: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
 
 
 def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:
-    """For Rerun; `tint` multiplies the colours and, as the only way to do so, makes the mesh translucent."""
+    """Convert to Rerun's type; `tint` multiplies the colours and is the only way to make the mesh translucent."""
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         vertex_normals=mesh.normals,
@@ -218,12 +218,13 @@ def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:
 
 @functools.lru_cache(maxsize=4)
 def robot_model(urdf: str, scale: float, description: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
-    """The joint tree and the links' meshes: the installed model, or else the recorded description.
+    """Load the joint tree and the links' meshes from the installed model, else from the recorded description.
 
-    The installed model is used when all of it is there and its joints are where the recording has them.
+    The installed model is used if it is complete and its joints are where the recording has them.
 
     Raises:
-        SceneError, MissingDependencyError, RecordingError: The model is not installed and there is no description.
+        SceneError, MissingDependencyError, RecordingError: The model is not installed and the recording does not
+            describe it.
     """
     recorded = Urdf.parse(description) if description else None
     try:

@@ -23,7 +23,7 @@ _FRUSTUM_ON_ROBOT = 0.04
 
 
 def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """Every camera with its images; encoded images are passed on unchanged."""
+    """Log every camera with its images; encoded images are passed through unchanged."""
     if episode.scene is not None:
         _log_calibrations(recording, paths, episode, episode.scene)
         _log_segmentations(recording, paths, episode)
@@ -54,7 +54,7 @@ def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: Play
 
 
 def _send_video(recording: rr.RecordingStream, entity: str, episode: Playback, camera: str) -> None:
-    """Encoded images, unchanged, each at its time."""
+    """Send encoded images unchanged, each at its time."""
     codec = episode.data.video_settings(camera).codec
     if codec in _CODECS:
         recording.log(entity, rr.VideoStream(codec=_CODECS[codec]), static=True)
@@ -74,7 +74,7 @@ def _send_images(
     images: Iterable[tuple[int, Distances]],
     kind: type[rr.DepthImage] | type[rr.SegmentationImage] = rr.DepthImage,
 ) -> None:
-    """Distances (H, W), uint16 millimetres or float32 metres, or numbers of segments, uint16; each at its time."""
+    """Send distances (H, W), uint16 millimetres or float32 metres, or segment numbers, uint16; each at its time."""
     for batch in batched(images, _IMAGES_AT_ONCE):
         height, width = batch[0][1].shape
         is_float = batch[0][1].dtype == np.float32
@@ -88,7 +88,7 @@ def _send_images(
 
 
 def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """Segments under small numbers, 0 for the background, and the numbers' names."""
+    """Log segments with small numbers, 0 for the background, and the names of these numbers."""
     segment_names = episode.data.segment_names()
     known = np.array(sorted(segment_names))
     for camera in filter(episode.data.has_segmentation, episode.data.cameras):

@@ -1,4 +1,4 @@
-"""An episode as playback shows it: images, motion, and numbers over time as curves."""
+"""An episode prepared for playback: images, motion, and numbers over time as curves."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ Distances = NDArray[np.uint16] | NDArray[np.float32]
 EFFORT_CURVES = "effort (N m)"
 FORCE_CURVES = "contact_force (N)"
 Statements = tuple[tuple[int, str, str], ...]
-"""(frame, kind, sentence), each holds until the next one of its kind."""
+"""(frame, kind, sentence), each valid until the next one of its kind."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curves:
-    """Several numbers over time: one row per time, one column per name.
+    """Several numbers over time: one row per timestamp, one column per name.
 
     Attributes:
         time_ns: (T,) since the episode's start.
-        values: (T, n).
-        names: n.
+        values: (T, n) values.
+        names: n names.
     """
 
     time_ns: NDArray[np.int64]
@@ -43,19 +43,19 @@ class Curves:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Playback:
-    """An open episode to be shown.
+    """An open episode for playback.
 
     Attributes:
-        name: In the list of recordings.
-        group: Run or dataset that it belongs to.
-        identity: Distinguishes it from all others.
-        source: Where it was read from, for people.
+        name: Name in the list of recordings.
+        group: Run or dataset that contains it.
+        identity: Unique identifier.
+        source: Its origin, in readable form.
         data: The episode.
-        motion: Of its robot and scene.
-        roles: Of its features.
-        curves: Name -> measured values; of a simulated episode as of `simulated_curves`, of any other the elements of
+        motion: Motion of its robot and scene.
+        roles: Roles of its features.
+        curves: Name -> measured values; for a simulated episode as in `simulated_curves`, for any other the elements of
             its features, by the features' names.
-        statements: What is said of it.
+        statements: Language statements about it.
     """
 
     name: str
@@ -70,12 +70,12 @@ class Playback:
 
     @property
     def info(self) -> EpisodeInfo:
-        """What is known before the first frame."""
+        """Description available before the first frame."""
         return self.data.info
 
     @property
     def scene(self) -> Scene | None:
-        """The world at the start, where it is known."""
+        """Scene at the start, if known."""
         return scene_of(self.info)
 
     @property
@@ -85,17 +85,17 @@ class Playback:
 
     @cached_property
     def time_ns(self) -> NDArray[np.int64]:
-        """(T,) of the frames, since the first one."""
+        """(T,) timestamps of the frames, since the first one."""
         return times_from_start(self.data)
 
     @cached_property
     def videos(self) -> tuple[str, ...]:
-        """Cameras with images in colour."""
+        """Cameras with colour images."""
         return tuple(camera for camera in self.data.cameras if len(self._stamps[camera]))
 
     @cached_property
     def depth(self) -> Mapping[str, str]:
-        """Camera -> its stream of distances; datasets of simulated episodes name that apart from its colours."""
+        """Camera -> its stream of distances; in datasets of simulated episodes its name differs from the camera's."""
         placed = () if self.scene is None else [camera.name for camera in self.scene.cameras]
         streams = [stream for stream in self.data.depth_cameras if len(self._stamps[stream])]
         owner = {stream: stream.removesuffix(DEPTH_SUFFIX) for stream in streams if stream not in placed}
@@ -103,7 +103,7 @@ class Playback:
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras that there are images of, or that the scene has."""
+        """Names of the cameras that have images or are in the scene."""
         placed = () if self.scene is None else (camera.name for camera in self.scene.cameras)
         return tuple(dict.fromkeys([*placed, *self.videos, *self.depth]))
 
@@ -112,30 +112,30 @@ class Playback:
         return self.data.table().image_stamps
 
     def packets(self, camera: str) -> Iterator[tuple[int, bytes, bool]]:
-        """Yield the encoded images of a camera: time_ns at which each is shown, data, whether it is a keyframe."""
+        """Yield the encoded images of a camera: time_ns of display, data, whether it is a keyframe."""
         shown_ns = shown_at(self.data.table(), camera, self.time_ns)
         for packet in self.data.packets(camera):
             yield int(shown_ns[packet.frame_index]), packet.data, packet.is_keyframe
 
     def distances(self, camera: str) -> Iterator[tuple[int, Distances]]:
-        """Yield the distances of a camera, each image with its time_ns."""
+        """Yield the distance images of a camera, each with its time_ns."""
         stream = self.depth[camera]
         shown_ns = shown_at(self.data.table(), stream, self.time_ns)
         return zip(shown_ns.tolist(), self.data.distances(stream), strict=False)
 
     @property
     def num_frames(self) -> int:
-        """Length."""
+        """Number of frames."""
         return self.data.num_frames
 
     @property
     def duration(self) -> float:
-        """Seconds from the first frame to the end of the last, which lasts as long as the nominal rate says."""
+        """Duration in seconds from the first frame to the end of the last, which lasts one nominal frame."""
         return float(self.time_ns[-1]) / 1e9 + 1 / self.info.fps if self.num_frames else 0.0
 
     @property
     def verdict(self) -> str:
-        """The outcome in a word or two."""
+        """Outcome in one or two words."""
         outcome = self.data.outcome
         if outcome is None or outcome.success is None:
             return "outcome unknown"
@@ -143,15 +143,15 @@ class Playback:
 
 
 def times_from_start(episode: Episode) -> NDArray[np.int64]:
-    """(T,) ns since the first frame."""
+    """Compute (T,) ns since the first frame."""
     times = episode.time_ns
     return times - times[0] if len(times) else times
 
 
 def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(P,) when each image of a camera is shown: with the first frame that holds it, or the next one after it.
+    """Compute (P,) display times of a camera's images: at the first frame that shows each, or the next one after it.
 
-    Not at its own stamp, which may be of another clock.
+    Their own timestamps may come from another clock.
     """
     frames = np.flatnonzero(table.images[camera] != NO_IMAGE)
     numbers = np.maximum.accumulate(table.images[camera][frames])
@@ -161,7 +161,7 @@ def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[n
 
 
 def feature_curves(episode: Episode, roles: Roles) -> dict[str, Curves]:
-    """The elements of each feature, in the order of roles."""
+    """List the elements of each feature, in the order of roles."""
     features, time_ns = episode.table().features, times_from_start(episode)
     ordered = sorted(episode.info.features, key=lambda feature: ROLES.index(roles.of[feature.name]))
     return {
@@ -171,13 +171,13 @@ def feature_curves(episode: Episode, roles: Roles) -> dict[str, Curves]:
 
 
 def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool = True) -> dict[str, Curves]:
-    """The curves of a simulated episode.
+    """Compute the curves of a simulated episode.
 
     They are "position" and "velocity" of the arm's joints, "gripper" (m), "ee" (m) and those of its sensors, split by
-    unit ("wrench (N)"); "target" and "gripper target" are what was asked for.
+    unit ("wrench (N)"); "target" and "gripper target" are the commands.
 
     Args:
-        episode: The episode; an observation that it lacks has no curves.
+        episode: The episode; a missing observation has no curves.
         motion: Its motion.
         has_targets: Whether its actions are joint targets.
     """

@@ -1,9 +1,9 @@
 """Episodes of exported datasets: numbers from the data files, the scene from demorec's own tables.
 
-A dataset without environment state has no trajectories of objects. It has every object's first and last pose, the
-gripper's pose and opening, and the gripper's target. So an object stays at its first pose until closing fingers stop
-around it, then moves with the hand, and takes its last pose when it is released for the last time. A push, a fall or a
-slip between the fingers is not in the data.
+A dataset without environment state has no object trajectories. It has every object's first and last pose, the gripper's
+pose and opening, and the gripper's target. So an object stays at its first pose until closing fingers stop around it,
+then moves with the hand, and takes its last pose when it is released for the last time. A push, a fall or a slip
+between the fingers is not in the data.
 """
 
 from __future__ import annotations
@@ -41,15 +41,15 @@ from demorec.view.episode import Playback, feature_curves, simulated_curves
 
 @contextmanager
 def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playback]:
-    """One episode of a dataset, by its place in it from 0.
+    """Open one episode of a dataset by its index, from 0.
 
     Raises:
-        ConfigError: It lacks a feature that the user names.
+        ConfigError: It lacks a feature that the user named.
         RecordingError: It cannot be read.
     """
     try:
         episode = _read_episode(dataset, number)
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and odd values in its tables
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
         unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
         raise resource_error(error) or unreadable from error
     yield episode
@@ -84,7 +84,7 @@ def _read_episode(dataset: LeRobotFolder, number: int) -> Playback:
 
 
 class ShownEpisode(DatasetRecording):
-    """An episode with the arm that its joints name, where it describes none."""
+    """An episode that, without a robot description, gets the arm identified by its joint names."""
 
     @cached_property
     def info(self) -> EpisodeInfo:
@@ -94,15 +94,15 @@ class ShownEpisode(DatasetRecording):
 
 
 class SimulatedEpisode(DatasetRecording):
-    """An episode that demorec simulated, with the scene and the outcome that the sidecar keeps.
+    """An episode simulated by demorec, with scene and outcome from the sidecar.
 
     Attributes:
         outcome, phases: As in the sidecar.
         has_targets: Whether its actions are joint targets.
 
     Raises:
-        RecordingError: It lacks state or action, or they are of another robot.
-        ValueError, TypeError, KeyError, IndexError: Odd values in its tables.
+        RecordingError: State or action is missing, or belongs to another robot.
+        ValueError, TypeError, KeyError, IndexError: Unexpected values in its tables.
     """
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
@@ -118,17 +118,17 @@ class SimulatedEpisode(DatasetRecording):
         missing = {STATE, ACTION} - self.dataset.info.features.keys()
         if missing:
             raise RecordingError(
-                f"The dataset has no {' and no '.join(sorted(missing))}, so it cannot be shown: {self.path}"
+                f"The dataset lacks {' and '.join(sorted(missing))}, so it cannot be shown: {self.path}"
             )
         state = self.table().features[STATE]
         if not len(state) or state.shape[1] not in {len(state_names(self._spec, kind)) for kind in STATE_KINDS}:
             raise RecordingError(
-                f"The dataset has no rows of episode {self.place.episode_index}, or of another robot: {self.path}"
+                f"The dataset has no rows of episode {self.place.episode_index}, or rows of another robot: {self.path}"
             )
 
     @cached_property
     def info(self) -> EpisodeInfo:
-        """As the sidecar keeps it, with the features of the dataset."""
+        """The sidecar's description, with the features of the dataset."""
         return replace(read_episode_info(self._row["episode_info"]), features=super().info.features)
 
     @property
@@ -137,7 +137,7 @@ class SimulatedEpisode(DatasetRecording):
 
     @cached_property
     def outcome(self) -> Outcome:
-        """How it ended."""
+        """Outcome of the episode."""
         names = ("success", "failure_phase", "failure_reason", "num_retries", "final_state_digest")
         checks = tuple(SuccessCheck(**check) for check in self._row["checks"])
         return Outcome(num_frames=self.num_frames, checks=checks, **{name: self._row[name] for name in names})
@@ -148,16 +148,16 @@ class SimulatedEpisode(DatasetRecording):
         return self._phases
 
     def description(self, body: str = "") -> str:
-        """URDF of the robot; "" if unknown, and for bodies."""
+        """Return the robot's URDF; "" if unknown, and for bodies."""
         return "" if body or self.robot is None else self.robot.urdf
 
     def distances(self, camera: str) -> Iterator[Any]:
-        """The images of a depth camera in order, (H, W) uint16 millimetres, which take half the space of metres."""
+        """Yield a depth camera's images in order, (H, W) uint16 millimetres, half the size of float metres."""
         for metres in super().distances(camera):
             yield np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
 
     def motion(self) -> SceneMotion:
-        """The motion of the robot; objects and cameras as the dataset has them, or as the hand carries them."""
+        """Read the robot's motion; objects and cameras as in the dataset, or moved with the hand."""
         data = {name: values.astype(np.float64) for name, values in self.table().features.items()}
         state, count = data[STATE], len(self._spec.arm_joints)
         fingers = self._spec.gripper.joint_position(state[:, count])
@@ -173,7 +173,7 @@ class SimulatedEpisode(DatasetRecording):
 
 
 def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
-    """(T, 7) from the joints, of a dataset that leaves observation.ee_pose out."""
+    """Compute (T, 7) TCP poses from the joints if the dataset has no observation.ee_pose."""
     spec = info.simulated.robot
     urdf = Urdf.load(asset_path(spec.urdf), scale=info.simulated.scene.robot.scale) if robot is None else robot.model
     arm = ArmKinematics(
@@ -189,7 +189,7 @@ def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> A
 def _object_poses(
     info: EpisodeInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
 ) -> dict[str, Array]:
-    """Name -> (T, 7): recorded where the dataset has `observation.environment_state`, else as the hand carries them."""
+    """Return name -> (T, 7): recorded in `observation.environment_state`, else moved with the hand."""
     if ENVIRONMENT_STATE not in data:
         opening, target = data[STATE][:, len(info.simulated.robot.arm_joints)], data[ACTION][:, -1]
         return held_object_poses(info.simulated.scene, ends, base_from_tcp, opening, target, int(described.fps))
@@ -204,7 +204,7 @@ def _object_poses(
 
 
 def _pose_row(values: Any) -> Array:
-    """(7,) position and quaternion of a table; ValueError for others."""
+    """Convert a table's value to position and quaternion (7,); ValueError if invalid."""
     pose = np.array(values, dtype=np.float64)
     if pose.shape != (7,) or not np.isfinite(pose).all():
         raise ValueError(f"{str(values)[:40]} is not a pose")
@@ -221,24 +221,24 @@ def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
 
 
 def _camera_poses(recording: DatasetRecording) -> dict[str, Array]:
-    """Camera -> (T, 7) of the cameras that move."""
+    """Read camera -> (T, 7) of the moving cameras."""
     rows = recording.dataset.sidecar_rows("camera_poses", recording.place.episode_index)
     names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
     return {name: np.array([row[name] for row in rows]) for name in names}
 
 
 _STOPPED_BEFORE_TARGET = 1e-3
-"""How much wider than asked the opening is at least when something is between the fingers, metres."""
+"""Minimum excess of the opening over its target, metres, that indicates a body between the fingers."""
 _STANDS_STILL = 0.015
-"""Speed of the opening below which closing fingers have met something, m/s."""
+"""Maximum speed of the opening, m/s, of closing fingers stopped by a body."""
 _SNAPS_SHUT = 0.06
-"""Speed of the opening above which they have lost it, m/s; between the two it gives way."""
+"""Minimum speed of the opening, m/s, that indicates a lost body; at speeds in between, the body yields."""
 _WITHIN_REACH = 0.02
 """Maximum distance of a held object's surface from the TCP, metres."""
 
 
 def held(opening: Array, target: Array, fps: int) -> NDArray[np.bool_]:
-    """(T,) whether something is between the fingers.
+    """Detect (T,) whether a body is between the fingers.
 
     Args:
         opening: (T,) measured, metres.
@@ -257,14 +257,14 @@ def held(opening: Array, target: Array, fps: int) -> NDArray[np.bool_]:
 def held_object_poses(
     scene: Scene, end_poses: Mapping[str, Array], base_from_tcp: Array, opening: Array, target: Array, fps: int
 ) -> dict[str, Array]:
-    """Name -> (T, 7) world_from_object of every object with a known end.
+    """Compute name -> (T, 7) world_from_object of every object with a known final pose.
 
     Args:
-        scene: At the start.
+        scene: Scene at the start.
         end_poses: Name -> (7,) world_from_object at the end.
         base_from_tcp: (T, 7).
-        opening: (T,) of the gripper, metres.
-        target: (T,) opening that was asked for, metres.
+        opening: (T,) opening of the gripper, metres.
+        target: (T,) target of the opening, metres.
         fps: Frames per second.
     """
     world_from_base = scene.robot.world_from_base
@@ -290,7 +290,7 @@ def held_object_poses(
 
 
 def _within_reach(scene: Scene, present: Mapping[str, Pose], world_from_tcp: Pose) -> str:
-    """The object nearest to the TCP, "" when none is between the fingers."""
+    """Find the object nearest to the TCP; "" if none is between the fingers."""
 
     def distance(name: str) -> float:
         centre = np.linalg.norm(present[name].position - world_from_tcp.position)

@@ -1,4 +1,4 @@
-"""How the views are arranged: 3D beside the cameras, phases and curves below, all on the seconds' time line."""
+"""Layout of the views: 3D next to the cameras, phases and curves below, all on the timeline of seconds."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ _PLOTS: Mapping[str, tuple[str, ...]] = {
     "joint effort (N m)": (EFFORT_CURVES,),
     "contact force (N)": (FORCE_CURVES,),
 }
-"""Title -> curves of a simulated episode; those of `_SIDE` stand beside the tabs of the others. Any other curve has a
-plot of its own: those of sensors in further tabs, the features of other episodes next to each other."""
+"""Title -> curves of a simulated episode; those of `_SIDE` are next to the tabs of the others. Any other curve has a
+separate plot: those of sensors in further tabs, the features of other episodes next to each other."""
 _COMPARED_PLOTS = {("joints (rad)" if "position" in names else title): names[:1] for title, names in _PLOTS.items()}
-"""Of two episodes over each other: what was asked for would hide what is compared."""
+"""Plots of two overlaid episodes, without targets, which would hide the compared curves."""
 _NOT_IN_3D: tuple[Literal["/depth", "/segmentation", "/boxes"], ...] = ("/depth", "/segmentation", "/boxes")
 _FLOOR = 3.0
-"""Bodies wider than this (metres) are the floor, which would only hide the grid."""
+"""Minimum width, metres, of a body that counts as the floor, which would only hide the grid."""
 
 
 def episode_layout(episode: Playback, *, is_alone: bool = False) -> rrb.Blueprint:
-    """The layout of one episode, or of all that have its streams; one that is alone needs no list of episodes."""
+    """Build the layout of one episode, or of all with the same streams; a single one needs no list of episodes."""
     paths = Paths()
     title = episode.info.robot_name if episode.scene is None else f"{episode.info.simulated.task}: the world"
     is_known = episode.scene is not None or bool(episode.info.urdf)
@@ -58,7 +58,7 @@ def episode_layout(episode: Playback, *, is_alone: bool = False) -> rrb.Blueprin
 
 
 def comparison_layout(a: Playback, b: Playback) -> rrb.Blueprint:
-    """The layout of two episodes in one recording: below /a and /b, the same streams over each other."""
+    """Build the layout of two episodes in one recording: below /a and /b, with the same streams overlaid."""
     roots = [A, B]
     images: list[rrb.View | rrb.Container] = [
         rrb.Horizontal(
@@ -129,7 +129,7 @@ def _view_3d(episode: Playback, roots: list[Paths], name: str) -> rrb.Spatial3DV
     for paths in roots:
         contents.append(f"+ {paths.world}/**")
         for camera in episode.cameras:
-            if episode.scene is None:  # nobody knows where it is
+            if episode.scene is None:  # its pose in the world is unknown
                 contents.append(f"- {paths.camera(camera)}/**")
                 continue
             contents += [f"- {paths.camera(camera, more)}" for more in _NOT_IN_3D]
@@ -158,9 +158,9 @@ def _view_3d(episode: Playback, roots: list[Paths], name: str) -> rrb.Spatial3DV
 
 
 def _eye(episode: Playback) -> rrb.EyeControls3D | None:
-    """Where the 3D view looks from and to: at the gripper's way from the side, with the arm in the image.
+    """Choose the 3D viewpoint: looking at the gripper's trajectory from the side, with the arm in view.
 
-    None where that way is not known: the viewer finds a place itself.
+    None if the trajectory is unknown, so that the viewer chooses.
     """
     if episode.motion.base_from_tcp is None:
         return None
@@ -218,7 +218,7 @@ def _curve_views(roots: list[Paths], episode: Playback) -> rrb.Container:
 
     plots = _PLOTS if len(roots) == 1 else _COMPARED_PLOTS
     known = {name for names in plots.values() for name in names} | {"target", "gripper target"}
-    # A feature whose name is not the usual one of its role has both as its title.
+    # A feature with an unusual name for its role has both in its title.
     roles = episode.roles.of.items()
     titles = {name: f"{role}: {name}" for name, role in roles if role is not None and name not in (STATE, ACTION)}
     tabs = [item for title, names in plots.items() if title not in _SIDE and (item := view(title, *names)) is not None]

@@ -1,7 +1,7 @@
-"""Episodes shown while a run goes on: finished recordings are handed to a process of low priority, which sends them.
+"""Episodes shown during a run: finished recordings are handed to a low-priority process, which sends them.
 
-Generating waits for nothing here: handing over a file is one line into a pipe. `python -m demorec.view.live URL`
-is that process; it reads paths from its standard input.
+The generator never waits: handing over a file is one line into a pipe. `python -m demorec.view.live URL` is that
+process; it reads paths from its standard input.
 """
 
 from __future__ import annotations
@@ -24,21 +24,19 @@ _END_SECONDS = 60.0
 
 
 class LiveViewer(Closing):
-    """Context manager over a window to which finished episodes can be added; the window stays open afterwards.
+    """Context manager over a window that finished episodes are added to; the window stays open afterwards.
 
     Args:
-        url: Of a viewer that runs already ("rerun+http://127.0.0.1:9876/proxy"); None opens a window.
+        url: Address of a running viewer ("rerun+http://127.0.0.1:9876/proxy"); None opens a window.
 
     Raises:
-        ConfigError: There is no screen to open a window on.
+        ConfigError: No screen is available for a window.
     """
 
     def __init__(self, url: str | None = None) -> None:
         if url is None:
             if not has_display():
-                raise ConfigError(
-                    "--view opens a window, but there is no screen: leave it out, then demorec view --web."
-                )
+                raise ConfigError("--view needs a screen for its window: leave it out, then use demorec view --web.")
             port = free_port()
             url = f"rerun+http://127.0.0.1:{port}/proxy"
             command = [viewer_program(), "--port", str(port), "--bind", "127.0.0.1", "--expect-data-soon"]
@@ -48,7 +46,7 @@ class LiveViewer(Closing):
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
-                start_new_session=True,  # Ctrl-C is for the run, not for the window
+                start_new_session=True,  # Ctrl-C must stop the run, not the window
             )
         self._sender = subprocess.Popen(
             [sys.executable, "-m", "demorec.view.live", url],
@@ -61,11 +59,11 @@ class LiveViewer(Closing):
         self._feeder.start()
 
     def add(self, recording: Path) -> None:
-        """Show a finished recording as soon as there is time; returns at once."""
+        """Queue a finished recording for display; returns immediately."""
         self._paths.put(recording)
 
     def close(self) -> None:
-        """Wait until all that was added is in the viewer, within a minute; harmless when called twice."""
+        """Wait up to a minute until everything added is in the viewer; safe to call twice."""
         self._paths.put(None)
         self._feeder.join(_END_SECONDS)
         try:
@@ -81,15 +79,16 @@ class LiveViewer(Closing):
                 pipe.write(f"{path.resolve()}\n")
                 pipe.flush()
             pipe.close()
-        except OSError:  # the sender has ended; the run goes on without it
+        except OSError:  # the sender has ended; the run continues without it
             return
 
 
 def send(recording: Path, url: str, laid_out: set[str]) -> None:
-    """One recording to a running viewer; with the layout unless its application is in `laid_out`, where it is put.
+    """Send one recording to a running viewer; also the layout, unless its application is in `laid_out`, to which it is
+    added.
 
     Raises:
-        DemorecError: It cannot be read.
+        DemorecError: The recording cannot be read.
     """
     from demorec.view.layout import episode_layout
     from demorec.view.scene import application_id, log_episode, new_recording

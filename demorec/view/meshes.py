@@ -1,7 +1,7 @@
-"""What the robot and the objects look like: triangles with normals and colours, from URDF and mesh files.
+"""Appearance of the robot and the objects: triangles with normals and colours, from URDF and mesh files.
 
-Mesh files are simplified once and kept in the user's cache folder: the original robot has 100,000 triangles, of which
-a viewer on a laptop, or in a browser, shows no more than a tenth as something different.
+Mesh files are simplified once and kept in the user's cache folder: the original robot has 100,000 triangles, of which a
+laptop or browser shows at most a tenth with visible effect.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from demorec.robots.collada import read_collada
 from demorec.robots.urdf import Urdf, UrdfLink, UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
-"""Of one mesh file."""
+"""Maximum number of triangles of one mesh file."""
 _CREASE = np.radians(35.0)
-"""Edges sharper than this stay sharp when a surface is shaded."""
+"""Angle, rad, above which edges stay sharp in shading."""
 _ROD_RADIUS = 0.015
-"""Metres."""
+"""Radius of rods, metres."""
 _SHORTEST_ROD = 1e-3
-"""Metres."""
+"""Minimum length of rods, metres."""
 _CACHE_VERSION = b"3"
 _ARRAYS = ("vertices", "normals", "triangles", "colors")
 
@@ -56,9 +56,9 @@ class SurfaceMesh:
     colors: NDArray[np.uint8]
 
     def placed(self, pose: Pose, scale: NDArray[np.float64], rgba: Rgba) -> SurfaceMesh:
-        """Scaled, then moved by `pose`, its colours multiplied by `rgba`."""
+        """Scale, then move by `pose`, and multiply the colours by `rgba`."""
         rotation = pose.rotation
-        normals = (self.normals / scale) @ rotation.T  # only drawn: rounding may differ between CPUs
+        normals = (self.normals / scale) @ rotation.T  # display only: rounding may differ between CPUs
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return SurfaceMesh(
             vertices=pose.apply(self.vertices * scale).astype(np.float32),
@@ -69,7 +69,7 @@ class SurfaceMesh:
 
 
 def joined(meshes: list[SurfaceMesh]) -> SurfaceMesh:
-    """Several meshes as one."""
+    """Merge several meshes into one."""
     offsets = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes[:-1])])
     return SurfaceMesh(
         vertices=np.concatenate([mesh.vertices for mesh in meshes]),
@@ -82,17 +82,17 @@ def joined(meshes: list[SurfaceMesh]) -> SurfaceMesh:
 
 
 def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str, SurfaceMesh]:
-    """Link -> what it looks like, of all links that can be seen.
+    """Load link -> mesh of all visible links.
 
     Args:
         text: The URDF.
-        folder: Where it lay, to find its mesh files; None for one of unknown origin, of which only files in the
-            packages of ROS or below the current folder are found.
+        folder: Its folder, to find its mesh files; None if unknown, in which case only files in ROS packages or below
+            the current folder are found.
         scale: Uniform scale.
 
     Raises:
         RecordingError: A mesh file cannot be read.
-        ValueError: The text is no URDF.
+        ValueError: The text is not a URDF.
     """
     links = {}
     for link in read_links(text, scale=scale):
@@ -102,10 +102,10 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
 
 
 def found_meshes(text: str) -> tuple[dict[str, SurfaceMesh], list[DemorecError]]:
-    """As `urdf_meshes` of a URDF of unknown origin, without the links whose meshes are not found; and why they are not.
+    """Load the meshes of a URDF of unknown origin as `urdf_meshes`, omitting missing ones; also returns the reasons.
 
     Raises:
-        ValueError: The text is no URDF.
+        ValueError: The text is not a URDF.
     """
     links: dict[str, SurfaceMesh] = {}
     errors: list[DemorecError] = []
@@ -127,7 +127,7 @@ def _link_mesh(link: UrdfLink, folder: Path | None) -> SurfaceMesh | None:
 
 
 def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
-    """Link -> rods from its origin to those of the joints that hang on it, of an arm whose looks are not known."""
+    """Make link -> rods from its origin to its child joints, for an arm without meshes."""
     links: dict[str, list[SurfaceMesh]] = {}
     for joint in urdf.joints:
         end = joint.parent_from_joint.position
@@ -158,13 +158,13 @@ def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
 
 
 def sphere_mesh(radius: float) -> SurfaceMesh:
-    """A ball."""
+    """Make a sphere."""
     return of_trimesh(trimesh.creation.icosphere(subdivisions=3, radius=radius))
 
 
 @functools.lru_cache(maxsize=64)
 def mesh_file(path: Path) -> SurfaceMesh:
-    """A mesh file with the colours of its materials, simplified; from the cache when it was read before.
+    """Load a mesh file with the colours of its materials, simplified; from the cache if it was read before.
 
     Raises:
         RecordingError: It cannot be read.
@@ -179,7 +179,7 @@ def mesh_file(path: Path) -> SurfaceMesh:
         mesh = _read_mesh_file(path)
     except (OSError, ValueError, LookupError, ElementTree.ParseError) as error:
         raise RecordingError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
-    with suppress(OSError):  # a folder that cannot be written only costs time
+    with suppress(OSError):  # an unwritable folder only costs time
         write_whole(cached, lambda file: np.savez(file, **{name: getattr(mesh, name) for name in _ARRAYS}))
     return mesh
 
@@ -193,7 +193,7 @@ def _read_mesh_file(path: Path) -> SurfaceMesh:
     parts: list[Any] = list(loaded.geometry.values()) if isinstance(loaded, trimesh.Scene) else [loaded]
     total = sum(len(part.faces) for part in parts)
     is_obj = path.suffix.lower() == ".obj"
-    # As in PyBullet: a texture, or several materials, colour an OBJ file; a single material does not.
+    # A texture or several materials colour an OBJ file, a single material does not, as in PyBullet.
     colored = not is_obj or len(parts) > 1 or _texture(parts[0]) is not None
     keep = min(1.0, MAX_TRIANGLES / total)
     return joined([_simplified(part, keep, _color(part) if colored else None) for part in parts if len(part.faces)])
@@ -215,20 +215,20 @@ def _texture(part: Any) -> Any:
 
 
 def _color(part: Any) -> NDArray[np.uint8] | None:
-    """The part's colour, RGBA; of a texture its mean over the middles of the part's triangles."""
+    """Compute the part's colour, RGBA; for a texture its mean over the centres of the part's triangles."""
     if _texture(part) is not None:
         middles = part.visual.uv[part.faces].mean(axis=1)
         colors = trimesh.visual.uv_to_color(middles, _texture(part)).astype(np.float64)
         mean: NDArray[np.float64] = np.average(colors, axis=0, weights=part.area_faces)
         return np.rint(mean).astype(np.uint8)
     color = getattr(getattr(part.visual, "material", None), "diffuse", None)
-    if color is None and part.visual.defined:  # else trimesh would answer grey
+    if color is None and part.visual.defined:  # otherwise trimesh would return grey
         color = getattr(part.visual, "main_color", None)
     return None if color is None else np.array(color, dtype=np.uint8)
 
 
 def of_trimesh(mesh: Any, rgba: NDArray[np.uint8] | None = None) -> SurfaceMesh:
-    """A trimesh mesh, smooth but for its creases, in one colour (white when None)."""
+    """Convert a trimesh mesh, smooth except at creases, in one colour (white if None)."""
     shaded = trimesh.graph.smooth_shade(mesh, angle=_CREASE)
     color = np.full(4, 255, dtype=np.uint8) if rgba is None else rgba
     return SurfaceMesh(

@@ -1,6 +1,6 @@
-"""Where everything is in the Rerun recording: entity paths, the two time lines, poses along them.
+"""Structure of the Rerun recording: entity paths, the two timelines, poses along them.
 
-The time lines are seconds since the episode's start, and frame numbers.
+The timelines are seconds since the episode's start, and frame numbers.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from demorec.core.geometry import Array
 
 
 class Paths:
-    """Paths below a root, "" for an episode alone or "/a" and "/b" for two that are compared.
+    """Paths below a root, "" for a single episode or "/a" and "/b" for two that are compared.
 
     Attributes:
-        root: As given.
+        root: The root argument.
         world: The scene, z up.
         robot: The robot's base; its links are nested below.
         ee_path: One piece of the gripper's path per frame.
         phase: Phases of the motion as states.
-        events: What happened, as a log.
-        words: What is being done, planned and remembered, in words.
+        events: Log of events.
+        words: Current statements on action, plan and memory, in words.
         summary: The episode in words.
     """
 
@@ -36,23 +36,23 @@ class Paths:
         self.words, self.summary = f"{root}/words", f"{root}/summary"
 
     def body(self, name: str) -> str:
-        """A body of the scene."""
+        """Path of a body of the scene."""
         return f"{self.world}/bodies/{name}"
 
     def goal(self, name: str) -> str:
-        """Where an object shall end."""
+        """Path of an object's goal."""
         return f"{self.world}/goals/{name}"
 
     def end(self, name: str) -> str:
-        """Where an object ended; not below the goal, whose transform would act on it too."""
+        """Path of an object's final pose; not below the goal, because the goal's transform would apply to it."""
         return f"{self.world}/ends/{name}"
 
     def camera(self, name: str, more: Literal["", "/depth", "/segmentation", "/boxes"] = "") -> str:
-        """A camera: its pose, its pinhole and its images; or more images of it, or boxes around what it sees."""
+        """Path of a camera's pose, pinhole and images; or of its other images, or boxes around visible bodies."""
         return f"{self.world}/cameras/{name}{more}"
 
     def curves(self, name: str) -> str:
-        """Numbers over time."""
+        """Path of numbers over time."""
         return f"{self.root}/plots/{_NOT_IN_PATHS.sub('_', name)}"
 
 
@@ -62,7 +62,7 @@ FRAMES = "frame"
 
 
 def indexes(time_ns: NDArray[np.int64], frame_times: NDArray[np.int64] | None) -> list[rr.TimeColumn]:
-    """Time columns of rows at `time_ns`, each of which is the time of a frame; None for rows between frames."""
+    """Build time columns of rows at `time_ns`, each the time of a frame; None for rows between frames."""
     seconds = rr.TimeColumn(SECONDS, duration=time_ns.astype("timedelta64[ns]"))
     if frame_times is None:
         return [seconds]
@@ -70,11 +70,11 @@ def indexes(time_ns: NDArray[np.int64], frame_times: NDArray[np.int64] | None) -
 
 
 def log_pose(recording: rr.RecordingStream, entity: str, pose: Array) -> None:
-    """Of an entity that stays where it is."""
+    """Log the pose of a static entity."""
     recording.log(entity, rr.Transform3D(translation=pose[:3], quaternion=pose[3:]), static=True)
 
 
 def send_poses(recording: rr.RecordingStream, entity: str, time_ns: NDArray[np.int64], poses: Array) -> None:
-    """Of an entity that moves, at every frame."""
+    """Send the poses of a moving entity at every frame."""
     columns = rr.Transform3D.columns(translation=poses[:, :3], quaternion=poses[:, 3:])
     recording.send_columns(entity, indexes(time_ns, time_ns), columns)

@@ -1,4 +1,4 @@
-"""The programs that playback starts: Rerun's viewer, and the ffmpeg that it needs to play H.264."""
+"""External programs of playback: Rerun's viewer, and the ffmpeg that it needs for H.264."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from demorec.core.files import cache_folder
 
 
 def viewer_program() -> str:
-    """The viewer that came with rerun-sdk, so that its version fits the recordings."""
+    """Find the viewer that came with rerun-sdk, so that its version matches the recordings."""
     import rerun_cli
 
     program = Path(rerun_cli.__file__).with_name("rerun")
@@ -22,7 +22,7 @@ def viewer_program() -> str:
 
 
 def viewer_environment() -> dict[str, str]:
-    """The environment for the viewer: with an `ffmpeg` on PATH, that of imageio-ffmpeg when there is no other."""
+    """Build the viewer's environment, with `ffmpeg` on PATH: imageio-ffmpeg's if no other is installed."""
     environment = dict(os.environ)
     environment.setdefault("RUST_LOG", "warn")
     if shutil.which("ffmpeg") is None:
@@ -31,7 +31,7 @@ def viewer_environment() -> dict[str, str]:
 
 
 def _ffmpeg_folder() -> Path:
-    """A folder that holds imageio-ffmpeg's program (ffmpeg-linux-x86_64-v7.0.2 or so) under the name ffmpeg."""
+    """Make a folder with a link named ffmpeg to imageio-ffmpeg's program (such as ffmpeg-linux-x86_64-v7.0.2)."""
     import imageio_ffmpeg
 
     try:
@@ -51,12 +51,12 @@ def _ffmpeg_folder() -> Path:
 
 
 def free_port() -> int:
-    """A TCP port of this machine that nobody listens on."""
+    """Find a free TCP port on this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])
 
 
 def has_display() -> bool:
-    """Whether a window can be opened."""
+    """Check whether a window can be opened."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))

@@ -1,4 +1,4 @@
-"""Episodes to .rrd files, with the layout inside."""
+"""Export of episodes to .rrd files, with the layout inside."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from demorec.view.sources import PlaybackSource
 
 
 def save(source: PlaybackSource, target: Path, *, is_alone: bool = True) -> None:
-    """Write an episode to an .rrd file; one that is alone needs no list of episodes.
+    """Write an episode to an .rrd file; a single one needs no list of episodes.
 
     Raises:
         DemorecError: The episode cannot be read.
@@ -28,9 +28,9 @@ def save(source: PlaybackSource, target: Path, *, is_alone: bool = True) -> None
 
 
 def numbered(target: Path, count: int) -> list[Path]:
-    """The names of `count` files: the target itself for one, NAME-0000.rrd and so on for several.
+    """Name `count` files: the target itself for one, NAME-0000.rrd and so on for several.
 
-    Rerun's viewer shows one recording of a file (it takes the last), so several episodes are several files.
+    Rerun's viewer shows only the last recording of a file, so several episodes are several files.
     """
     if count == 1:
         return [target]
@@ -38,7 +38,7 @@ def numbered(target: Path, count: int) -> list[Path]:
 
 
 def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
-    """Write each episode to an .rrd file of its own.
+    """Write each episode to a separate .rrd file.
 
     Raises:
         DemorecError: An episode cannot be read, or a file cannot be written.
@@ -53,7 +53,7 @@ def save_each(sources: Sequence[PlaybackSource], folder: Path) -> list[Path]:
 
 
 def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
-    """Write two episodes over each other to one .rrd file; raises as `save`, ConfigError if they cannot be compared."""
+    """Overlay two episodes in one .rrd file; raises as `save`, ConfigError if they cannot be compared."""
     with a.open() as first, b.open() as second:
         recording = new_comparison(first, second)
         with _saving(recording, target, comparison_layout(first, second)):
@@ -62,17 +62,17 @@ def save_comparison(a: PlaybackSource, b: PlaybackSource, target: Path) -> None:
 
 @contextmanager
 def _saving(recording: rr.RecordingStream, target: Path, layout: rr.blueprint.Blueprint) -> Iterator[None]:
-    """Write what is logged in the block, with its layout; OSError when that is not possible.
+    """Write everything logged in the block, with its layout; OSError if writing fails.
 
-    An episode is gathered in memory and written from here: Rerun's own thread for files keeps it to its log when the
-    disk is full, or has the program wait for ever.
+    An episode is collected in memory and written here: when the disk is full, Rerun's own file thread only logs the
+    error, or blocks forever.
     """
     stream = recording.binary_stream()
     recording.send_blueprint(layout, make_active=False, make_default=True)
     try:
         yield
     finally:
-        data = stream.read()  # in any case: Rerun warns on the terminal of what nobody has read
+        data = stream.read()  # in any case: Rerun warns on the terminal about unread data
         recording.disconnect()
-    assert data is not None  # there is a layout, at least
+    assert data is not None  # at least the layout
     target.write_bytes(data)

@@ -1,4 +1,4 @@
-"""Episodes into Rerun recordings, in words, numbers and columns: one, or two over each other below /a and /b."""
+"""Logging of episodes to Rerun recordings, in words, numbers and columns: one, or two overlaid below /a and /b."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def log_episode(
     label: str = "",
     tint: Rgba | None = None,
 ) -> None:
-    """Send all of an episode below `root`; `label` is a prefix of its curves' names, `tint` colours its robot.
+    """Log a whole episode below `root`; `label` is a prefix of its curves' names, `tint` colours its robot.
 
     Raises:
         DemorecError: The source is damaged, or a model is neither installed nor recorded.
@@ -66,7 +66,7 @@ def log_episode(
 
 
 def new_recording(episode: Playback) -> rr.RecordingStream:
-    """An empty Rerun recording with the episode's name and properties."""
+    """Create an empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(entry(episode))
     recording.send_property("episode", rr.AnyValues(**properties(episode)))
@@ -74,13 +74,13 @@ def new_recording(episode: Playback) -> rr.RecordingStream:
 
 
 def application_id(episode: Playback) -> str:
-    """The group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
+    """Group in the viewer's list: episodes of one group, task and set of cameras share a layout."""
     words = ["" if episode.scene is None else episode.info.simulated.task, *episode.cameras]
     return "-".join(re.sub(r"[^A-Za-z0-9_]+", "-", word).strip("-") for word in (episode.group, *words) if word)
 
 
 def log_ee_path(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """The gripper's path: one piece per frame, so that a view can show the past; coloured by phase."""
+    """Log the gripper's path, one piece per frame so that a view can show the past, coloured by phase."""
     if episode.num_frames < 2 or episode.motion.base_from_tcp is None:
         return
     points = episode.world_from_base.apply(episode.motion.base_from_tcp[:, :3])
@@ -101,7 +101,7 @@ def log_curves(
     *,
     is_second: bool = False,
 ) -> None:
-    """All plots; `label` is a prefix of the curves' names, a second episode has other colours."""
+    """Log all plots; `label` is a prefix of the curves' names, a second episode has other colours."""
     for name, curves in episode.curves.items():
         entity = paths.curves(name)
         lines = rr.SeriesLines(
@@ -118,7 +118,7 @@ def log_curves(
 
 
 def _curve_names(name: str, curves: Curves, label: str, *, is_second: bool) -> list[str]:
-    """Names for the legend: curves of one name share a line, since it has room for eight."""
+    """Name the curves for the legend: curves of one name share a line, since it has room for eight."""
     short = [curve.removeprefix("panda_") for curve in curves.names]
     if name == "target":
         short = ["target"] * len(short)
@@ -135,7 +135,7 @@ def _curve_colors(name: str, curves: Curves, *, is_second: bool) -> list[Color]:
 
 
 def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """The phases of the motion as states over time."""
+    """Log the phases of the motion as states over time."""
     colors = phase_colors(episode.data.phases)
     if not colors or set(colors) == {""}:
         return
@@ -146,12 +146,12 @@ def log_phases(recording: rr.RecordingStream, paths: Paths, episode: Playback) -
 
 
 def _phase_starts(episode: Playback) -> list[int]:
-    """The frames at which the phase is another than before."""
+    """Find the frames at which the phase changes."""
     return [i for i, name in enumerate(episode.data.phases) if i == 0 or name != episode.data.phases[i - 1]]
 
 
 def log_events(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """Changes of phase and what happened, in order."""
+    """Log phase changes and events, in order."""
     colors = phase_colors(episode.data.phases)
     rows: list[tuple[int, str, str, Color]] = [
         (int(episode.time_ns[i]), "INFO", episode.data.phases[i], colors[episode.data.phases[i]])
@@ -176,7 +176,7 @@ def log_events(recording: rr.RecordingStream, paths: Paths, episode: Playback) -
 
 
 def log_words(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """The page of present statements, written again at each change."""
+    """Log the page of current statements, rewritten at each change."""
     holds: dict[str, str] = {}
     frames, pages = [], []
     shown = sorted((item for item in episode.statements if item[1] in _HEADINGS), key=lambda item: item[0])
@@ -190,7 +190,7 @@ def log_words(recording: rr.RecordingStream, paths: Paths, episode: Playback) ->
 
 
 def log_boxes(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
-    """Boxes around what each camera sees, frame by frame; their names, which would hide small images, on pointing."""
+    """Log boxes around the bodies visible to each camera, frame by frame, named on hovering (names hide images)."""
     found = {camera: list(episode.data.boxes(camera)) for camera in episode.data.cameras}
     colors = segment_colors(sorted({name for boxes in found.values() for _, name, _ in boxes}))
     for camera, boxes in found.items():
@@ -222,7 +222,7 @@ def entry(episode: Playback) -> str:
 
 
 def properties(episode: Playback) -> dict[str, str | int | float | bool]:
-    """Properties that the viewer lists next to the recording's name."""
+    """Collect the properties that the viewer lists next to the recording's name."""
     info, outcome = episode.info, episode.data.outcome
     values: dict[str, str | int | float | bool] = {
         "instruction": info.instruction,
@@ -245,13 +245,13 @@ def properties(episode: Playback) -> dict[str, str | int | float | bool]:
 
 
 def _origin(episode: Playback) -> str:
-    """Where it comes from, "" for a generated one."""
+    """Describe the origin; "" for a generated episode."""
     origin = episode.info.origin
     return origin if isinstance(origin, str) else ", ".join([origin.kind, *(file.name for file in origin.files)])
 
 
 def summary(episode: Playback) -> str:
-    """Markdown: task, outcome and its checks, the failed ones first."""
+    """Write Markdown: task, outcome and its checks, failed ones first."""
     info, facts = episode.info, simulation_facts(episode.info)
     about = [facts.get("task", info.robot_name), f"episode {info.episode_index}"]
     about += [f"seed {facts['root_seed']}"] if facts else []
@@ -262,7 +262,7 @@ def summary(episode: Playback) -> str:
 
 
 def _checks(outcome: Outcome) -> list[str]:
-    """A table of the conditions of success, the failed ones first."""
+    """Write a table of the success conditions, failed ones first."""
     rows = ["| | check | value | limit |", "|---|---|---|---|"]
     for check in sorted(outcome.checks, key=lambda check: check.passed):
         mark = "✓" if check.passed else "**✗**"
@@ -272,13 +272,13 @@ def _checks(outcome: Outcome) -> list[str]:
 
 
 _ORANGE = (1.0, 0.62, 0.25, 0.6)
-"""Translucent, so that an episode in exactly the same place hides nothing of the other one."""
+"""Translucent, so that overlapping episodes do not hide each other."""
 A, B = Paths("/a"), Paths("/b")
 DIFFERENCES = "/differences"
 
 
 def new_comparison(a: Playback, b: Playback) -> rr.RecordingStream:
-    """An empty Rerun recording named after both."""
+    """Create an empty Rerun recording named after both."""
     recording = rr.RecordingStream("demorec-compare", recording_id=f"{a.identity}-{b.identity}")
     recording.send_recording_name(f"A {entry(a)}, B {entry(b)}")
     recording.send_property("a", rr.AnyValues(**properties(a)))
@@ -287,15 +287,15 @@ def new_comparison(a: Playback, b: Playback) -> rr.RecordingStream:
 
 
 def log_comparison(recording: rr.RecordingStream, a: Playback, b: Playback) -> None:
-    """Send both episodes and how far they are apart.
+    """Log both episodes and their distances.
 
     Raises:
-        ConfigError: The robots differ, so that nothing can be laid over each other.
+        ConfigError: The robots differ, so that the episodes cannot be overlaid.
         DemorecError: A source is damaged.
     """
     if a.scene is None or b.scene is None:
         raise ConfigError(
-            "Only simulated episodes can be compared: the place of other robots is unknown. View them without "
+            "Only simulated episodes can be compared: the poses of other robots are unknown. View them without "
             "--compare."
         )
     if [*a.motion.joint_position] != [*b.motion.joint_position]:
@@ -313,7 +313,7 @@ def log_comparison(recording: rr.RecordingStream, a: Playback, b: Playback) -> N
 
 
 def differences(a: Playback, b: Playback) -> dict[str, Curves]:
-    """Frame by frame, as long as both last: the gripper's and the objects' distance (mm), the joints' largest (rad)."""
+    """Compute per common frame: distances of gripper and objects (mm), and the largest joint difference (rad)."""
     count = min(a.num_frames, b.num_frames)
     time_ns = a.time_ns[:count]
     first, second = (np.stack([*episode.motion.joint_position.values()])[:, :count] for episode in (a, b))

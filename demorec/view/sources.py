@@ -29,8 +29,8 @@ class PlaybackSource:
     """An episode that can be opened.
 
     Attributes:
-        name: For people.
-        open: A context manager that gives the episode; RecordingError when it cannot be read.
+        name: Readable name.
+        open: Context manager that yields the episode; RecordingError if it cannot be read.
         notes: Sentences on how its dataset was read.
     """
 
@@ -42,19 +42,19 @@ class PlaybackSource:
 def find_episodes(
     paths: Sequence[Path], *, include_failures: bool = False, named: NamedRoles = NO_NAMES
 ) -> list[PlaybackSource]:
-    """Every episode below the paths, in their order; a run's failures only when asked for, an evaluation's always.
+    """List every episode below the paths, in their order; a run's failures only on request, an evaluation's always.
 
     Args:
         paths: Recordings, runs, folders of recordings, datasets.
-        include_failures: Whether failed attempts count.
-        named: Features whose role the user names.
+        include_failures: Whether to include failed attempts.
+        named: Features with a role named by the user.
 
     Raises:
-        ConfigError: A path is not there, or holds nothing that can be shown.
+        ConfigError: A path does not exist, or contains nothing that can be shown.
         RecordingError: A recording is unfinished, or a dataset cannot be read.
     """
     if not paths:
-        raise ConfigError("No path is given: name a recording, a run or a dataset, e.g. demorec view recordings/demo.")
+        raise ConfigError("Missing path: give a recording, a run or a dataset, e.g. demorec view recordings/demo.")
     return [source for path in paths for source in _sources(path, include_failures, named)]
 
 
@@ -74,20 +74,21 @@ def _sources(path: Path, include_failures: bool, named: NamedRoles) -> list[Play
             )
             for number, place in enumerate(dataset.places)
         ]
-    shows_failures = include_failures or found.kind == "evaluation"  # whose failed rollouts are results like others
+    # Failed rollouts are regular results of an evaluation.
+    shows_failures = include_failures or found.kind == "evaluation"
     files = [*found.recordings, *(found.failed if shows_failures else ())]
     if not files and found.failed:
-        raise ConfigError(f"The folder holds failed attempts only, which --include-failures shows: {path}")
+        raise ConfigError(f"The folder contains only failed attempts: add --include-failures to show them: {path}")
     expect_recordings(found, files)
     return [PlaybackSource(name=str(file), open=partial(open_recorded, file, named)) for file in files]
 
 
 @contextmanager
 def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback]:
-    """The episode of a recording; its images can be read until the context is left.
+    """Open the episode of a recording; its images can be read until the context exits.
 
     Raises:
-        ConfigError: It lacks a feature whose role the user names, or is simulated.
+        ConfigError: It lacks a feature that the user named, or is simulated.
         RecordingError: It cannot be read.
     """
     folder = path.resolve().parent
@@ -113,7 +114,7 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
 
 
 def _joint_curves(recording: Recording, of_frames: Mapping[str, Curves]) -> dict[str, Curves]:
-    """The curves of the joints at the rate of the physics."""
+    """Read the curves of the joints at the physics rate."""
     samples = list(recording.joint_samples())
     time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
     found = {}
@@ -125,7 +126,7 @@ def _joint_curves(recording: Recording, of_frames: Mapping[str, Curves]) -> dict
 
 
 def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSource]:
-    """Those of "7", "0:20" or "3,5,8:10", numbered from 0; all for "".
+    """Select "7", "0:20" or "3,5,8:10", numbered from 0; "" for all.
 
     Raises:
         ConfigError: No such numbers.
@@ -142,6 +143,6 @@ def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSou
             raise OptionError("episodes", f"is {episodes!r}, expected numbers and ranges like 7 or 0:20.") from error
         part = list(sources[low:high]) if 0 <= low < high else []
         if not part:
-            raise ConfigError(f"--episodes {word}: there are {len(sources)} episodes, numbered from 0.")
+            raise ConfigError(f"--episodes {word} is out of range: choose from 0 to {len(sources) - 1}.")
         chosen += part
     return chosen

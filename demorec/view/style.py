@@ -1,4 +1,4 @@
-"""Colours: one palette for joints, one for the phases of a motion, the same in plots, paths and time lines."""
+"""Colours: one palette for joints, one for the phases of a motion, the same in plots, paths and timelines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ SERIES: tuple[Color, ...] = (
     (150, 210, 80),
     (200, 200, 200),
 )
-"""Of the joints, base to fingers; after Okabe and Ito, who chose colours that colour-blind people tell apart."""
+"""Colours of the joints, base to fingers; after Okabe and Ito, distinguishable for colour-blind people."""
 
 PHASES: tuple[Color, ...] = (
     (70, 130, 255),
@@ -31,12 +31,12 @@ PHASES: tuple[Color, ...] = (
     (165, 105, 60),
     (255, 170, 205),
 )
-"""Of the phases, in the order in which they come up."""
+"""Colours of the phases, in the order of their appearance."""
 
 MEASURED: Color = (86, 180, 233)
 TARGET: Color = (255, 170, 60)
 ASKED: Color = (235, 235, 235)
-"""Of the targets of all joints over what the joints did, and of a second episode's joints over those of the first."""
+"""Colour of all joint targets over the measured joints, and of a second episode's joints over the first's."""
 SECOND: Color = (255, 140, 60)
 FORCE: Color = (240, 90, 90)
 GOAL: Color = (60, 230, 120)
@@ -44,22 +44,22 @@ FRUSTUM: Color = (255, 200, 60)
 
 
 def series_colors(count: int) -> list[Color]:
-    """One colour a curve."""
+    """Choose one colour per curve."""
     return [SERIES[index % len(SERIES)] for index in range(count)]
 
 
 def phase_colors(phases: Iterable[str]) -> dict[str, Color]:
-    """Phase -> colour."""
+    """Map each phase to a colour."""
     return {name: PHASES[index % len(PHASES)] for index, name in enumerate(dict.fromkeys(phases))}
 
 
 def segment_colors(names: Iterable[str]) -> dict[str, Color]:
-    """Segment -> colour: bodies in the colours of the curves, the robot's links (ROBOT/LINK) in greys."""
+    """Map each segment to a colour: bodies in the colours of the curves, the robot's links (ROBOT/LINK) in greys."""
     colors: dict[str, Color] = {}
     num_bodies = num_links = 0
     for name in names:
         if "/" in name:
-            # Steps of the golden ratio: links that hang together get greys that lie apart.
+            # Steps of the golden ratio: adjacent links get clearly different greys.
             grey = round(70 + 160 * (num_links * 0.618034 % 1))
             colors[name] = (grey, grey, min(255, grey + 15))
             num_links += 1

@@ -26,12 +26,12 @@ _SETTLE_SECONDS = 30.0
 _END_SECONDS = 5.0
 _PANIC = re.compile(r"panicked at '(?P<message>.*)'$", re.MULTILINE)
 _NO_DRIVER = ("Failed to create render state", "Failed to get render context")
-"""How the viewer's panic begins where there is no Vulkan driver, or where OpenGL alone is not enough for it."""
+"""First words of the viewer's panic if the Vulkan driver is missing, or OpenGL alone is not enough for it."""
 _NO_GLYPH = re.compile(r'No glyph for "(?P<character>.+?)" \((?P<code>U\+[0-9A-F]+)\)')
 
 
 def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
-    """The viewer, which nobody but this machine reaches; `options` are those of `start_program`."""
+    """Start the viewer, reachable only from this machine; `options` are those of `start_program`."""
     command = [viewer_program(), "--bind", "127.0.0.1", *arguments]
     return start_program(command, env=viewer_environment(), **options)
 
@@ -40,7 +40,7 @@ def need_screen() -> None:
     """Raise ConfigError unless a window can be opened."""
     if not has_display():
         raise ConfigError(
-            "There is no screen to open a window on: use --screenshot x.png, --web for a browser, or, unless it is an "
+            "No screen is available for a window: use --screenshot x.png, --web for a browser, or, unless it is an "
             ".rrd file already, --save x.rrd."
         )
 
@@ -49,7 +49,7 @@ def show(recordings: Sequence[Path]) -> None:
     """Open a window with .rrd files and wait until it is closed.
 
     Raises:
-        ConfigError: There is no screen.
+        ConfigError: No screen is available.
         RecordingError: The viewer failed.
     """
     need_screen()
@@ -59,7 +59,7 @@ def show(recordings: Sequence[Path]) -> None:
 
 
 def why_it_ended(said: str) -> DemorecError:
-    """The error for a viewer that ended by itself, from what it wrote to its standard error."""
+    """Build the error for a viewer that ended unexpectedly, from its standard error."""
     panic = _PANIC.search(said)
     message = panic["message"] if panic else ""
     if message.startswith(_NO_DRIVER):
@@ -80,14 +80,14 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     """Context manager over a viewer without a screen that shows .rrd or .mcap files in order, the first one in front.
 
     Raises:
-        RecordingError: There is no graphics driver, the viewer does not come up or ends by itself, or it cannot load
-            the file.
+        RecordingError: The graphics driver is missing, the viewer does not start or ends unexpectedly, or it cannot
+            load the file.
     """
 
     def __init__(self, *recordings: Path, width: int = 1600, height: int = 950) -> None:
         self._port = free_port()
         self._recordings = recordings
-        # Not a pipe, which would fill up when nobody reads it.
+        # Not a pipe, which would fill up unread.
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
         self._process = _start_viewer(
             "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
@@ -105,19 +105,20 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     ) -> None:
         try:
             if isinstance(exc, (OSError, RuntimeError, ValueError)):
-                with suppress(subprocess.TimeoutExpired):  # one that panics has left us before it has said why
+                # A panicking viewer disconnects before it has printed the reason.
+                with suppress(subprocess.TimeoutExpired):
                     self._process.wait(_END_SECONDS)
                     raise self._reason() from exc
         finally:
             self.close()
 
     def close(self) -> None:
-        """End the viewer; harmless when called twice."""
+        """End the viewer; safe to call twice."""
         _end_process(self._process)
         self._said.close()
 
     def _reason(self) -> DemorecError:
-        """Why the viewer has ended, by what it said."""
+        """Determine why the viewer has ended, from its output."""
         self._said.seek(0)
         return why_it_ended(self._said.read())
 
@@ -132,7 +133,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         raise _not_loaded(self._recordings[0])
 
     def _add(self, recordings: Sequence[Path]) -> None:
-        """Load more files; the viewer lists them as they come, but names and reads only what it has shown."""
+        """Load more files; the viewer lists them as they arrive, but names and reads only those it has shown."""
         for count, recording in enumerate(recordings, start=2):
             self.client.open(str(recording), navigate=False)
             if not any(_loaded(self.client, count) for _ in _tries(0.1)):
@@ -145,7 +146,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
 
     @property
     def end(self) -> float:
-        """Seconds of the last row of the recording in front; 0 when it has no such time line."""
+        """Return seconds of the last row of the recording in front; 0 if it lacks that timeline."""
         first = self.client.get_state().recordings[0]
         return max((line.end / 1e9 for line in first.timelines if line.name == SECONDS), default=0.0)
 
@@ -160,7 +161,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
             before, same = now, same + 1 if now == before else 0
 
     def _image(self, *view: Any) -> bytes:
-        """PNG of the window or of one view; the client waits for some seconds only, too short for a busy machine."""
+        """Take a PNG of the window or of one view; retries, since the client's timeout is too short when busy."""
         deadline = time.monotonic() + _START_SECONDS
         while True:
             try:
@@ -178,19 +179,19 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         target.write_bytes(self._image())
 
     def view_image(self, name: str) -> bytes:
-        """One view as PNG; KeyError when no view has that name."""
+        """Take one view as PNG; KeyError if the view does not exist."""
         for view in self.client.get_state().views:
             if view.name == name:
                 return self._image(view.view_id)
         raise KeyError(name)
 
     def reports(self) -> list[tuple[str, Any]]:
-        """Every warning and error of a view: (its name, what Rerun tells)."""
+        """List every warning and error of a view: (its name, Rerun's report)."""
         return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
 
 
 def _tries(pause: float) -> Iterator[None]:
-    """Again and again, with a pause in seconds in between, until the viewer should long have come up."""
+    """Yield repeatedly, with a pause in seconds in between, until the viewer's start has timed out."""
     deadline = time.monotonic() + _START_SECONDS
     while time.monotonic() < deadline:
         yield
@@ -207,24 +208,24 @@ def _not_loaded(recording: Path) -> RecordingError:
 
 
 def moment(seconds: float | None, end: float) -> float:
-    """A time of an episode that lasts until `end`, seconds; by default its middle.
+    """Choose a time of an episode that lasts until `end`, seconds; by default its middle.
 
     Raises:
-        ConfigError: It is outside of the episode.
+        ConfigError: It is outside the episode.
     """
     if seconds is None:
         return end / 2
     if not 0.0 <= seconds <= end + 1e-9:
-        raise ConfigError(f"--at is {seconds:g}, allowed are 0 to {end:.3f} s, the episode's last frame.")
+        raise ConfigError(f"--at {seconds:g} is out of range: choose 0 to {end:.3f} s, the episode's last frame.")
     return seconds
 
 
 def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | None, width: int, height: int) -> None:
-    """An image of the viewer with .rrd files at a time of the first of them, by default its middle.
+    """Save an image of the viewer with .rrd files at a time of the first of them, by default its middle.
 
     Raises:
-        ConfigError: The time is outside of it.
-        DemorecError: The viewer cannot work here, or a view reports an error.
+        ConfigError: The time is outside it.
+        DemorecError: The viewer cannot work on this machine, or a view reports an error.
         OSError: The image cannot be written.
     """
     with HeadlessViewer(*recordings, width=width, height=height) as viewer:
@@ -243,7 +244,7 @@ def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tupl
         The address for the browser, and a function that waits until the server ends and returns its exit code.
 
     Raises:
-        RecordingError: The port is taken, or the server does not come up.
+        RecordingError: The port is taken, or the server does not start.
     """
     data_port, web_port = free_port(), web_port or free_port()
     memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
@@ -269,7 +270,7 @@ def _wait_for_page(page: str, process: subprocess.Popen[Any]) -> None:
 
 
 def _end_process(process: subprocess.Popen[Any]) -> None:
-    """Ask a process to end, and make it when it does not within some seconds."""
+    """Ask a process to end, and kill it if it does not within some seconds."""
     if process.stdin is not None:
         process.stdin.close()
     if process.poll() is None:

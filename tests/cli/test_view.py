@@ -65,8 +65,8 @@ def test_bad_requests_are_one_sentence(
         ("runs", (), "it holds runs, name one (cubes)"),
         ("saved.rrd", ("--compare",), "is shown as it is"),
         ("nothing.rrd", (), "There is no such file"),
-        ("episode.mcap", ("--screenshot", "x.png", "--at", "-1"), "--at is -1, allowed are 0 to 0.133 s"),
-        ("episode.mcap", ("--screenshot", "x.png", "--at", "999"), "--at is 999, allowed are 0 to 0.133 s"),
+        ("episode.mcap", ("--screenshot", "x.png", "--at", "-1"), "--at -1 is out of range: choose 0 to 0.133 s"),
+        ("episode.mcap", ("--screenshot", "x.png", "--at", "999"), "--at 999 is out of range: choose 0 to 0.133 s"),
     ],
 )
 def test_what_cannot_be_shown_is_said(

@@ -277,7 +277,7 @@ def test_a_folder_of_meshes_is_a_shelf_and_a_ring_keeps_its_hole(tmp_path: Path)
     ("mesh", "wrong"),
     [
         (trimesh.creation.box(extents=(30.0, 50.0, 30.0)), "is it in millimetres"),
-        (trimesh.creation.box(extents=(0.09, 0.08, 0.08)), "a gripper takes 0.07"),
+        (trimesh.creation.box(extents=(0.09, 0.08, 0.08)), "a gripper takes up to 0.07"),
         (trimesh.creation.icosphere(subdivisions=5, radius=0.03), "simplify it"),
         (trimesh.Trimesh([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05]], [[0, 2, 1], [0, 1, 3]]), "is open"),
     ],
