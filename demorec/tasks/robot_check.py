@@ -136,6 +136,6 @@ def finger_problem(spec: RobotSpec, fingers: FingerBoxes) -> str:
             "tips, its z axis out of the hand"
         )
     return (
-        f"the finger tips are {fingers.depth:.3f} m beyond tcp_link {spec.tcp_link!r}, but finger_depth is "
+        f"the finger tips are {fingers.depth:.3f} m beyond tcp_link {spec.tcp_link!r}; finger_depth is "
         f"{gripper.finger_depth:g}; move tcp_link by {error:.3f} m along its z axis, or correct finger_depth"
     )

@@ -186,7 +186,7 @@ def fixed_to_the_tool(origin: str) -> str:
 @pytest.mark.parametrize(
     ("origin", "words"),
     [
-        ("0 0 -0.06", r"the finger tips are 0\.0\d\d m beyond tcp_link 'tcp', but finger_depth is 0.01; move tcp_link by"),
+        ("0 0 -0.06", r"the finger tips are 0\.0\d\d m beyond tcp_link 'tcp'; finger_depth is 0.01; move tcp_link by"),
         ("0 0 0.1", r"the fingers end 0\.0\d\d m before tcp_link 'tcp'; place it between the finger tips"),
     ],
 )
