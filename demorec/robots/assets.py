@@ -68,7 +68,7 @@ def asset_path(name: str) -> Path:
         folder = limit = Path(__file__).parent.parent / "sim" / "assets" if module else data_folder()
     path = Path(os.path.normpath(folder / relative))
     if not path.is_relative_to(limit):
-        raise SceneError(f"The model file {name!r} lies outside of {limit}, where it has to be.")
+        raise SceneError(f"The model file {name!r} is outside {limit}: move it there.")
     if not path.is_file():
         raise SceneError(
             f"The model file {name!r} was not found: give a path below pybullet_data, demorec:NAME, or a file beside "

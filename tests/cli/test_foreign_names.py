@@ -223,7 +223,7 @@ def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
     from demorec.core.errors import DemorecError
     from demorec.robots.assets import asset_path
 
-    with pytest.raises(DemorecError, match=r"lies outside of|add --allow stranger\."):
+    with pytest.raises(DemorecError, match=r"is outside|add --allow stranger\."):
         asset_path(file)
 
 
