@@ -20,6 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from demorec.check.proof import prove
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_json, to_json
@@ -28,8 +29,6 @@ from demorec.core.tables import load_robot
 from demorec.episode.episode import Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
-from demorec.extensions.remake.demonstration import ReplayOptions, open_file
-from demorec.extensions.remake.drive import replay_all
 from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.mcap import EpisodeWriter
 from demorec.robots.assets import allow_models, asset_path
@@ -155,10 +154,10 @@ class TaskContract:
                 f"the arm's position at frame {old.frame_index} differs when the episode is run again"
             )
 
-    def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
-        """Check that `demorec check` finds no fault, and that replaying the commands repeats the task."""
+    def test_its_recording_passes_every_check_and_is_made_again_to_the_bit(self, tmp_path: Path) -> None:
+        """Check that the checks find no fault, and that config and seed give the same recording again."""
         frames, outcome = run_expert(self.task, self.robot, self.seed, 0)
-        path, allowed = tmp_path / "episode_000000.mcap", modules_of([self.task, self.robot])
+        path = tmp_path / "episode_000000.mcap"
         with EpisodeWriter(path, self._episode(0).info) as writer:
             for frame in frames:
                 writer.write(frame)
@@ -166,10 +165,8 @@ class TaskContract:
         report = check_subject(Subject(path=path, kind="recording"), CheckOptions())
         failed = [f"{result.check}: {result.detail}" for result in report.results if result.level == "fail"]
         assert not failed, "; ".join(failed)
-        options = ReplayOptions(allowed=allowed)
-        ((replayed, _),) = replay_all([open_file(path, options)], options)
-        assert replayed.is_identical, f"the replay differs: {replayed.first_difference}"
-        assert replayed.success == outcome.success, "the replay has a different outcome"
+        for proof in prove([path], modules_of([self.task, self.robot])):
+            assert proof.level == "pass", proof.problem or "this machine cannot make the episode again"
 
     def _episode(self, index: int, *, attempt: int = 0) -> PreparedEpisode:
         return prepare(replace(plan_of(self.task, self.robot, self.seed, index), attempt=attempt))

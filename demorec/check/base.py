@@ -74,7 +74,7 @@ class Check:
     """One check.
 
     Attributes:
-        name: Its row in `demorec.core.tables.CHECKS`.
+        name: Its row in `demorec.core.tables.FILE_CHECKS`.
         group: What it is about.
         on: What it can look at, whatever else it needs.
         needs: What it needs, in few words.

@@ -14,7 +14,7 @@ from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import check_option
 from demorec.core.processes import process_pool
-from demorec.core.tables import CHECKS
+from demorec.core.tables import FILE_CHECKS
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
@@ -43,7 +43,7 @@ class CheckOptions:
     def validate(self) -> None:
         """Raise ConfigError for unknown names or impossible numbers."""
         for name in self.only:
-            CHECKS.check_name(name)
+            FILE_CHECKS.check_name(name)
         check_option("workers", self.workers, 1, 1024)
 
     def checks(self, *forms: Form) -> list[Check]:
@@ -56,7 +56,7 @@ class CheckOptions:
 
 @cache
 def _all_checks() -> tuple[Check, ...]:
-    return tuple(CHECKS.load(name) for name in CHECKS.names())
+    return tuple(FILE_CHECKS.load(name) for name in FILE_CHECKS.names())
 
 
 @dataclass(frozen=True, kw_only=True)

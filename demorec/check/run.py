@@ -1,18 +1,14 @@
-"""Checks of a run's folder against its run.json, of its episodes against each other, and the findings of an import.
-
-`demorec import` keeps its findings in import.json: the bags themselves may be gone.
-"""
+"""Checks of a run's folder against its run.json, and of its episodes against each other."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
 from dataclasses import asdict
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from demorec.check.base import Form, Found, Measurement, check, counted, run_check
+from demorec.check.base import Form, Measurement, counted, run_check
 from demorec.core.errors import DemorecError, resource_error
 from demorec.core.files import sha256_of
 from demorec.core.plain import to_plain
@@ -20,10 +16,6 @@ from demorec.episode.info import EpisodeInfo
 from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
 
-if TYPE_CHECKING:
-    from demorec.extensions.imports.import_file import ImportFile
-
-_MAX_LISTED = 5
 _ANY_RUN: tuple[Form, ...] = ("run", "external run")
 _NOT_RECORDED = ("file", "seconds")
 """What run.json has of an attempt that is not in its recording."""
@@ -59,13 +51,6 @@ class CheckedRun:
     def recordings(self) -> list[Path]:
         """Every existing recording, successes first."""
         return [path for folder in (EPISODES, FAILED) for path in sorted((self.path / folder).glob("*.mcap"))]
-
-    @property
-    def import_file(self) -> ImportFile | None:
-        """The findings of its import; None where there are none."""
-        from demorec.extensions.imports.import_file import load_import_file
-
-        return load_import_file(self.path)
 
 
 @run_check(measures="files missing, changed, or not in run.json", on=_ANY_RUN, needs="a run")
@@ -130,29 +115,3 @@ def _other_config(run: RunFile, info: EpisodeInfo) -> Iterator[str]:
     )
     if run.versions and dict(info.versions) != dict(run.versions):
         yield "versions"
-
-
-import_check = partial(check, group="import", on=("external run",), needs="a run that was imported", fail=math.inf)
-
-
-@import_check(measures="findings of the import about clocks and losses")
-def import_findings(run: CheckedRun) -> Found:
-    """List the findings of the import."""
-    if (found := run.import_file) is None:
-        return None
-    words = [
-        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
-        for bag in found.bags
-        for finding in bag.odd
-    ]
-    return Measurement(value=len(words), detail="; ".join(words[:_MAX_LISTED]))
-
-
-@import_check(measures="episodes that an import dropped, skipped files")
-def import_dropped(run: CheckedRun) -> Found:
-    """List the episodes of the imported files that are not in the run, except those that a marker discards."""
-    if (found := run.import_file) is None:
-        return None
-    rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
-    dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
-    return Measurement(value=len(dropped), detail="; ".join(dropped[:_MAX_LISTED]))

@@ -19,6 +19,8 @@ from typing import Protocol
 from demorec.cli.shared.flags import parse, terminal_width
 from demorec.cli.shared.output import PrintableFormatter, say, tell
 from demorec.core.errors import DemorecError, MissingDependencyError, OptionError, resource_error
+from demorec.core.extension import GROUPS
+from demorec.core.extensions import ExtensionRows, command_rows, extensions
 from demorec.core.own_code import own_line
 from demorec.core.registry import Registry, nearest_match
 
@@ -33,26 +35,7 @@ class Command(Protocol):
         """Do it and return the exit code."""
 
 
-COMMANDS: Registry[type[Command]] = Registry(
-    kind="command",
-    rows={
-        "generate": "demorec.cli.generate:Generate",
-        "import": "demorec.extensions.imports.command:Import",
-        "info": "demorec.cli.info:Info",
-        "view": "demorec.cli.view:View",
-        "export": "demorec.cli.export:Export",
-        "dataset": "demorec.extensions.editing.commands:DatasetCommand",
-        "check": "demorec.extensions.doctor.check_command:CheckCommand",
-        "report": "demorec.extensions.report.command:ReportCommand",
-        "replay": "demorec.extensions.remake.replay_command:Replay",
-        "render": "demorec.extensions.remake.render_command:Render",
-        "evaluate": "demorec.extensions.policies.command:Evaluate",
-        "correct": "demorec.extensions.policies.command:Correct",
-        "recover": "demorec.cli.recover:Recover",
-        "list": "demorec.cli.list_rows:ListRows",
-        "explain": "demorec.extensions.doctor.explain_command:Explain",
-    },
-)
+COMMANDS: Registry[type[Command]] = Registry(kind="command", rows=ExtensionRows("commands"))
 
 _LONGEST = 4000
 """Of an error's sentence."""
@@ -75,6 +58,8 @@ def generate_dataset_main(argv: Sequence[str] | None = None) -> None:
 def _run_named(commands: Registry[type[Command]], args: Sequence[str], *, prog: str, about: str) -> int:
     """Run the command that the first word names; without one, say what the program is about and list all of them."""
     name = args[0] if args else ""
+    if commands is COMMANDS:
+        tell(*(f"{prog}: {problem}" for problem in extensions().problems))
     if not name or name.startswith("-"):
         code = _reported(prog, lambda: _print(_overview(commands, prog, about)))
         return code if name in ("-h", "--help") else code or 2
@@ -177,8 +162,19 @@ def _keep_traceback() -> str:
 def _overview(commands: Registry[type[Command]], prog: str, about: str) -> list[str]:
     lines = textwrap.wrap(f"{prog}: {' '.join(about.split())}", terminal_width(), break_on_hyphens=False)
     lines += ["", f"usage: {prog} COMMAND ... (COMMAND --help for more)", ""]
+    if commands is not COMMANDS:
+        return lines + _summaries(commands, commands.names())
+    for group in GROUPS:
+        names = [name for name, row in command_rows().items() if row.group == group]
+        lines += [f"{group}:", *_summaries(commands, names), ""]
+    return [*lines, "generate-dataset ... is the same as demorec generate ..."]
+
+
+def _summaries(commands: Registry[type[Command]], names: Sequence[str]) -> list[str]:
+    """The first line of each command's help."""
     width = max(10, *map(len, commands.names()))
-    for name in commands.names():
+    lines: list[str] = []
+    for name in names:
         summary = (commands.load(name).__doc__ or "").strip().splitlines()[0]
         lines += textwrap.wrap(
             f"{name:<{width}} {summary}",
@@ -187,6 +183,4 @@ def _overview(commands: Registry[type[Command]], prog: str, about: str) -> list[
             subsequent_indent=" " * (width + 3),
             break_on_hyphens=False,
         )
-    if commands is COMMANDS:
-        lines += ["", "generate-dataset ... is the same as demorec generate ..."]
     return lines

@@ -41,8 +41,8 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     Returns:
         What was found, for the closing table, and one line for each check that failed.
     """
+    from demorec.check.proof import prove
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
-    from demorec.extensions.remake.deep.check import deep_checks
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
@@ -57,17 +57,17 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
         warned.update(r.check for r in report.results if r.level == "warn")
         failures += [f"{report.path.name}: {r.check}: {r.detail}" for r in report.results if r.level == "fail"]
     paths = [result.folder / file for file in sample]
-    for done, again in enumerate(deep_checks(paths, allowed=result.run.config.modules), start=len(subjects) + 1):
-        progress(done, total)
-        warned.update(["made again"] if again.level == "warn" else [])
-        if again.level == "fail":
-            first = again.error or str(again.differences[0])
-            failures.append(f"{again.path.name}: made again, it is not the same: {first}")
+    proofs = []
+    for proof in prove(paths, result.run.config.modules):
+        proofs.append(proof)
+        progress(len(subjects) + len(proofs), total)
+        warned.update(["made again"] if proof.level == "warn" else [])
+        failures += [f"{proof.path.name}: {proof.problem}"] if proof.problem else []
     found = [f"{len(failures)} failed" if failures else "none failed", f", {counted(warned.total(), 'warning')}"]
     if warned:
         found.append(f" ({', '.join(sorted(warned))})")
-    if sample:
-        found.append(f"; {counted(len(sample), 'episode')} made again and compared")
+    if proofs:
+        found.append(f"; {counted(len(proofs), 'episode')} made again and compared")
     return "".join(found), failures
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -16,6 +17,7 @@ from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.simulated import simulation_facts
 from demorec.runs.find import Found, expect, find
+from demorec.runs.foreign import dropped_by_import, formats
 
 if TYPE_CHECKING:
     from demorec.episode.roles import NamedRoles, Roles
@@ -46,13 +48,11 @@ class Info:
         """Read and print; 1 when something among several paths cannot be read."""
         need_paths(self.paths, "info")
         named = self.roles.named
-        bags = [path for path in self.paths if self.mapping is None and not named and find(path).kind == "rosbag"]
-        others = [path for path in self.paths if path not in bags]
+        described = {} if self.mapping is not None or named else _described(self.paths)
+        others = [path for path in self.paths if path not in described]
         with reading(others, self.mapping) as read:
             places = dict(zip(others, read, strict=True))
-            self._show(
-                [_describe(places[path], named) if path in places else _bag_or_bags(path) for path in self.paths]
-            )
+            self._show([_describe(places[path], named) if path in places else described[path] for path in self.paths])
         return 0
 
     def _show(self, found: Sequence[tuple[dict[str, Any], list[str]]]) -> None:
@@ -62,6 +62,14 @@ class Info:
         else:
             for number, (_, lines) in enumerate(found):
                 say(*([""] if number else []), *lines)
+
+
+def _described(paths: Sequence[Path]) -> dict[Path, tuple[dict[str, Any], list[str]]]:
+    """Describe foreign files that need no import for it."""
+    forms = formats()
+    kinds = {path: find(path).kind for path in paths}
+    hooks = {path: forms[kind].describer for path, kind in kinds.items() if kind in forms}
+    return {path: pkgutil.resolve_name(hook)(path) for path, hook in hooks.items() if hook}
 
 
 def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
@@ -75,35 +83,6 @@ def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]
         plain["unfinished"] = [str(file) for file in found.unfinished]
         lines += ["", f"Left out: {found.left}."]
     return plain, lines
-
-
-def _bag_or_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """A bag, or each one of a folder of bags."""
-    from demorec.extensions.imports.bag import bags_in
-
-    found = [_bag(bag) for bag in bags_in(path)]
-    if len(found) == 1:
-        return found[0]
-    plain = {"kind": "bags", "path": str(path), "bags": [plain for plain, _ in found]}
-    lines = [f"{len(found)} bags in {path}"]
-    for _, described in found:
-        lines += ["", *described]
-    return plain, lines
-
-
-def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
-    from demorec.extensions.imports.bag import summarize_bag
-
-    plain = summarize_bag(path)
-    length = f"{plain['seconds']:.2f} s, {counted(plain['messages'], 'message')}"
-    facts = [("bag", f"{path} ({size_in_words(plain['bytes'])})"), ("length", length)]
-    facts += [("problem", problem) for problem in plain["problems"][:_MOST_PROBLEMS]]
-    rows = [("topic", "messages", "rate", "type")]
-    for topic in plain["topics"]:
-        rate = f"{topic['rate']:.1f} Hz" if topic["rate"] else ""
-        rows.append((topic["topic"], str(topic["messages"]), rate, topic["type"]))
-    lines = [*aligned(facts), "", *aligned(rows)]
-    return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
 
 
 def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
@@ -185,7 +164,7 @@ def _run(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     run = load_any_run_file(path)
     known = {"path": str(path), "complete": run.is_complete, "digest": run.digest}
     if run.generation is None:
-        left_out = _left_out(path)
+        left_out = dropped_by_import(path)
         roles = role_lines.roles_of_run(path, run, named)
         plain = {"kind": "external run", **known, **run.plain()}
         plain |= {"roles": None if roles is None else role_lines.roles_as_plain(roles), "left_out": left_out}
@@ -263,21 +242,6 @@ def _external_run_lines(path: Path, run: RunFile, roles: Roles | None) -> list[s
         for line in run.attempts
     ]
     return [*aligned(facts), "", *aligned(rows)]
-
-
-def _left_out(path: Path) -> list[dict[str, str]]:
-    """What an import did not take into the run: episodes that it dropped and bags that it skipped, each with why."""
-    from demorec.extensions.imports.import_file import load_import_file
-
-    if (imported := load_import_file(path)) is None:
-        return []
-    dropped = [
-        {"bag": bag.name, "what": f"episode from {row.begin_s:.2f} to {row.end_s:.2f} s", "reason": row.reason}
-        for bag in imported.bags
-        for row in bag.episodes
-        if row.episode_index is None
-    ]
-    return dropped + [{"bag": bag.name, "what": "the bag", "reason": bag.reason} for bag in imported.skipped]
 
 
 def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:

@@ -4,42 +4,53 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
-from tyro.conf import Positional
+from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import aligned, say, say_json
+from demorec.core.extensions import extensions
+from demorec.core.registry import Registry, check_choice
+from demorec.core.tables import CAMERAS, EXPORTERS, LISTS, OBJECTS, RENDERERS, ROBOTS, TASKS
 
 if TYPE_CHECKING:
-    from demorec.core.registry import Registry
     from demorec.objects.shelf import Shelf
     from demorec.robots.robot import RobotSpec
 
 
+_TABLES: Mapping[str, Registry[Any]] = {
+    "tasks": TASKS,
+    "cameras": CAMERAS,
+    "robots": ROBOTS,
+    "objects": OBJECTS,
+    "renderers": RENDERERS,
+    "exporters": EXPORTERS,
+}
+_NAMES = (*_TABLES, *LISTS.names(), "extensions")
+
+
 @dataclass(frozen=True, kw_only=True)
 class ListRows:
-    """List the available tasks, cameras, robots, objects, renderers, export formats or checks.
+    """List what can be chosen from: tasks, cameras, robots, objects, renderers, export formats and more.
 
     Examples:
       demorec list tasks
       demorec list cameras --json
     """
 
-    what: Positional[Literal["tasks", "cameras", "robots", "objects", "renderers", "exporters", "checks"]]
-    """What to list."""
+    what: Annotated[Positional[str], arg(metavar="LIST", help=f"One of: {', '.join(_NAMES)}.")]
     json: bool = False
     """Print JSON: a list of names and summaries."""
 
     def run(self) -> int:
         """Print one line each."""
-        from demorec.core import tables
-
-        if self.what == "checks":
-            from demorec.extensions.doctor.explain_command import check_rows
-
-            rows = list(check_rows())
+        check_choice("list", self.what, _NAMES)
+        if self.what in LISTS.rows:
+            rows = list(LISTS.load(self.what)())
+        elif self.what == "extensions":
+            rows = [(each.name, each.summary) for each in extensions().found]
         else:
-            registry: Registry[Any] = getattr(tables, self.what.upper())
+            registry = _TABLES[self.what]
             describe = _DESCRIBED.get(self.what, lambda row: str(row.summary))
             rows = [(name, describe(registry.load(name))) for name in registry.names()]
         if self.json:

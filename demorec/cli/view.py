@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 from tyro.conf import Positional, arg
 
@@ -26,6 +26,7 @@ from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.atomic import atomic_write, atomic_write_all
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
+from demorec.core.tables import RANKINGS
 from demorec.core.targets import OptionalTarget
 from demorec.robots.assets import allow_models
 from demorec.runs.find import expect
@@ -37,6 +38,7 @@ _MOST = 50
 """Maximum number of episodes to show unless --episodes asks for more."""
 _MOST_REASONS = 10
 """Maximum number of episodes of --rank whose reasons are printed."""
+_RANK_HELP = f"Order of the episodes, the worst first: {', '.join(RANKINGS.names()) or 'none is installed'}."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -62,9 +64,7 @@ class View:
     """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""
     """Which episodes, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
-    rank: Literal["score"] | None = None
-    """Show the episodes of LeRobot datasets in this order, the worst first: by the verdict and score of demorec
-    check --no-images."""
+    rank: Annotated[str | None, arg(help=_RANK_HELP)] = None
     include_failures: bool = False
     """Also show the failed attempts of a run."""
     save: OptionalTarget = None
@@ -155,26 +155,18 @@ class View:
         say(f"{self.size[0]}x{self.size[1]}: {self.screenshot}")
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
-        """The worst first; and what is wrong with them."""
-        from demorec.extensions.doctor.diagnosis import diagnose
-        from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
-        from demorec.runs.find import find
-
-        if others := [path for path in self.paths if find(path).kind != "dataset"]:
-            raise ConfigError(f"--rank score is for LeRobot datasets, which this is not: {others[0]}")
-        options = ReadOptions(images=False, named=self.roles.named)
-        found = {
-            f"{path}: episode {each.episode}": each
-            for path in self.paths
-            for each in diagnose(evidence_of_dataset(path, options)).episodes
-        }
-        ranked = sorted(sources, key=lambda source: found[source.name].rank)
-        for each in [found[source.name] for source in ranked[:_MOST_REASONS]]:
-            reasons = "; ".join(each.reasons)
-            tell(f"{each.verdict}, {each.score:.2f}  episode {each.episode}{': ' * bool(reasons)}{reasons}")
-        return ranked
+        """Order episodes as --rank asks, and print why the first ones are first."""
+        assert self.rank is not None
+        ranked = RANKINGS.load(self.rank)(self.paths, self.roles.named)
+        names = {source.name for source in sources}
+        shown = [each for each in ranked if each.name in names]
+        tell(*(each.line for each in shown[:_MOST_REASONS]))
+        places = {each.name: place for place, each in enumerate(shown)}
+        return sorted(sources, key=lambda source: places.get(source.name, len(places)))
 
     def _validate(self) -> None:
+        if self.rank is not None:
+            RANKINGS.check_name(self.rank)
         if self.web and (self.save is not None or self.screenshot is not None):
             raise ConfigError("--web serves until Ctrl-C: give --save or --screenshot in a call of its own.")
         check_option("port", self.port, 1, 65535)

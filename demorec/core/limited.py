@@ -22,16 +22,14 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
+from demorec.core.extensions import command_rows
+
 VARIABLE = "DEMOREC_LIMITS"
 """Environment variable; "off" removes the limits, for files that the user trusts."""
-READING_COMMANDS = frozenset({"info", "import", "view", "export", "dataset", "check", "report", "recover"})
-DRAWING_COMMANDS = frozenset({"replay", "render"})
-"""Commands that simulate or draw: their time and memory depend on frames and pixels, not on bytes."""
-DEEP_FLAG = "--deep"
-"""Makes a command of the former kind one of the latter."""
 READING_MEMORY_BYTES = 500_000_000
 DRAWING_MEMORY_BYTES = 4_000_000_000
-"""Rendering two cameras at 1920x1080 to AV1 with depth takes 0.8 GB."""
+"""For commands that simulate or draw: their time and memory depend on frames and pixels, not on bytes. Rendering two
+cameras at 1920x1080 to AV1 with depth takes 0.8 GB."""
 MEMORY_RATIO = 20
 """Bytes of memory for each byte of input."""
 READING_CPU_S = 20
@@ -77,9 +75,10 @@ class Limits(NamedTuple):
     def of(cls, words: Sequence[str]) -> Limits | None:
         """Limits of a command line without the program's name; None for a command that has none."""
         command = words[0] if words else ""
-        is_drawing = command in DRAWING_COMMANDS or DEEP_FLAG in words
-        if not is_drawing and command not in READING_COMMANDS:
+        row = command_rows().get(command)
+        if row is None or row.limits == "none":
             return None
+        is_drawing = row.limits == "drawing" or any(flag in words for flag in row.drawing_flags)
         paths = tuple(_paths_in(words[1:]))
         size = sum(_sizes_below(paths))
         floor = DRAWING_MEMORY_BYTES if is_drawing else READING_MEMORY_BYTES

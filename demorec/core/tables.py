@@ -1,14 +1,12 @@
-"""The tables of everything that a user can name, but for commands (`COMMANDS` in demorec/cli).
-
-A row here and one file make a new one (CONTRIBUTING.md).
-"""
+"""The tables of everything that a user can name; their rows are those of `demorec.core.extensions`."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from demorec.core.extensions import ExtensionRows
 from demorec.core.registry import Registry, modules_of, split_name
 from demorec.robots.assets import model_name
 
@@ -21,89 +19,21 @@ if TYPE_CHECKING:
     from demorec.robots.robot import RobotSpec
     from demorec.tasks.base import Task
 
-
-def _named_alike(package: str, *modules: tuple[str, ...]) -> dict[str, str]:
-    """The rows of objects that are called as their rows are: a module of the package, then what it has, in order."""
-    return {name: f"{package}.{module}:{name}" for module, *names in modules for name in names}
-
-
-TASKS: Registry[type[Task]] = Registry(
-    kind="task",
-    rows={
-        "pick_place": "demorec.tasks.pick:PickPlace",
-        "place_in_tray": "demorec.tasks.trays:PlaceInTray",
-        "stack": "demorec.tasks.cubes:Stack",
-        "stack_three": "demorec.tasks.cubes:StackThree",
-        "unstack": "demorec.tasks.cubes:Unstack",
-        "sort_by_color": "demorec.tasks.trays:SortByColor",
-        "line_up": "demorec.tasks.cubes:LineUp",
-        "pick_from_clutter": "demorec.tasks.pick:PickFromClutter",
-        "pick_shapes": "demorec.tasks.pick:PickShapes",
-        "pick_anything": "demorec.tasks.anything:PickAnything",
-        "tutorial": "demorec.tasks.tutorial:Tutorial",
-    },
-    subclass_of="demorec.tasks.base:Task",
-)
-
+TASKS: Registry[type[Task]] = Registry(kind="task", rows=ExtensionRows("tasks"), subclass_of="demorec.tasks.base:Task")
 ROBOTS: Registry[RobotSpec] = Registry(
-    kind="robot",
-    rows={
-        "panda": "demorec.robots.panda:PANDA",
-        "iiwa": "demorec.robots.iiwa:IIWA",
-        "so101": "demorec.robots.so101:SO101",
-    },
-    instance_of="demorec.robots.robot:RobotSpec",
+    kind="robot", rows=ExtensionRows("robots"), instance_of="demorec.robots.robot:RobotSpec"
 )
-
 CAMERAS: Registry[CameraPreset] = Registry(
-    kind="camera",
-    rows={
-        "front": "demorec.render.cameras:FRONT",
-        "wrist": "demorec.render.cameras:WRIST",
-        "top": "demorec.render.cameras:TOP",
-        "workspace": "demorec.render.cameras:WORKSPACE",
-    },
-    instance_of="demorec.render.cameras:CameraPreset",
+    kind="camera", rows=ExtensionRows("cameras"), instance_of="demorec.render.cameras:CameraPreset"
 )
-
 OBJECTS: Registry[Shelf] = Registry(
-    kind="shelf",
-    rows={
-        "household": "demorec.objects.household:HOUSEHOLD",
-        "blocks": "demorec.objects.blocks:BLOCKS",
-        "cubes": "demorec.objects.blocks:CUBES",
-        "random": "demorec.objects.folder:RANDOM",
-    },
-    instance_of="demorec.objects.shelf:Shelf",
+    kind="shelf", rows=ExtensionRows("objects"), instance_of="demorec.objects.shelf:Shelf"
 )
-
-RENDERERS: Registry[type[Renderer]] = Registry(
-    kind="renderer",
-    rows={
-        "raster": "demorec.render.raster:RasterRenderer",
-        "tiny": "demorec.sim.renderers:TinyRenderer",
-        "egl": "demorec.sim.renderers:EglRenderer",
-    },
-)
-
-EXPORTERS: Registry[Exporter[Any]] = Registry(
-    kind="format",
-    rows={"lerobot": "demorec.datasets.lerobot.options:LEROBOT", "hdf5": "demorec.extensions.hdf5.options:HDF5"},
-)
-
-CHECKS: Registry[Check] = Registry(
-    kind="check",
-    rows=_named_alike(
-        "demorec.check",
-        ("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps", "video_frames"),
-        ("file", "missing_images"),
-        ("images", "images_decode"),
-        ("run", "run_files", "run_complete", "run_agrees"),
-        ("run_dataset", "run_dataset"),
-        ("run", "import_findings", "import_dropped"),
-        ("sidecar", "dataset_sidecar"),
-    ),
-)
+RENDERERS: Registry[type[Renderer]] = Registry(kind="renderer", rows=ExtensionRows("renderers"))
+EXPORTERS: Registry[Exporter[Any]] = Registry(kind="format", rows=ExtensionRows("exporters"))
+FILE_CHECKS: Registry[Check] = Registry(kind="check", rows=ExtensionRows("file_checks"))
+LISTS: Registry[Callable[[], Any]] = Registry(kind="list", rows=ExtensionRows("lists"))
+RANKINGS: Registry[Callable[..., Any]] = Registry(kind="ranking", rows=ExtensionRows("rankings"))
 
 
 def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:

@@ -13,29 +13,19 @@ from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import BinaryIO, Literal
+from typing import BinaryIO
 
 from demorec.core.errors import ConfigError, resource_error
+from demorec.core.extensions import reader_rows
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 from demorec.core.replacing import shown
 from demorec.core.targets import is_utf8
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
 
-PathKind = Literal[
-    "recording",
-    "unfinished",
-    "rrd",
-    "hdf5",
-    "rosbag",
-    "run",
-    "evaluation",
-    "dataset",
-    "recordings",
-    "nothing",
-    "unreadable",
-]
-"""What a path can be. "recordings" is a folder of recordings without a run.json."""
+PathKind = str
+"""Kind of a path: "recording", "unfinished", "rrd", "run", "evaluation", "dataset", "recordings" (a folder of them that
+is not a run), "hdf5", "rosbag", the kind of an extension's reader, "nothing" or "unreadable"."""
 
 EPISODE_FOLDERS: tuple[PathKind, ...] = ("run", "recordings", "evaluation")
 """What holds recordings, in itself or in episodes/ and failed/."""
@@ -46,16 +36,14 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
     "recording": ("a recording (.mcap)", ""),
     "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps what is whole in it"),
     "rrd": ("a Rerun file (.rrd)", "; demorec view shows it by a name that ends in .rrd"),
-    "hdf5": ("an HDF5 file", "; name the run that it was made from, or make one of it (demorec import hdf5)"),
-    "rosbag": ("a bag of another program", "; demorec import makes a run of it"),
+    "hdf5": ("an HDF5 file", "; name the run that it was made from"),
+    "rosbag": ("a bag of another program", ""),
     "run": ("a run", "; name one of its recordings"),
     "evaluation": ("an evaluation", "; name one of its recordings"),
     "dataset": ("a LeRobot dataset", "; name the run that it was made from"),
     "recordings": ("a folder of recordings", "; name one of them"),
 }
 """What each kind is called, and what to do where it was not expected."""
-IMPORT_WORDS: dict[PathKind, str] = {"dataset": "lerobot", "hdf5": "hdf5"}
-"""Kind of path -> the word after `demorec import` that imports it; bags need none."""
 ROSBAG2 = "metadata.yaml"
 """In a folder that is a bag of rosbag2."""
 BAG_SUFFIXES = (".db3", ".bag", ".mcap.zstd", ".db3.zstd")
@@ -152,7 +140,21 @@ def find(path: Path) -> Found:
 
 def name_of(kind: PathKind) -> str:
     """What a kind is called in a sentence: "an HDF5 file"."""
-    return _WORDS[kind][0]
+    return _words(kind)[0]
+
+
+def import_word(kind: PathKind) -> str:
+    """Return the word after `demorec import` that stands for a kind; "" if it needs none or is not imported."""
+    row = reader_rows().get(kind)
+    return "" if row is None else row.word
+
+
+def _words(kind: PathKind) -> tuple[str, str]:
+    """Name of a kind in a sentence, and what to do where it was not expected."""
+    row = reader_rows().get(kind)
+    if row is None or (kind in _WORDS and not row.advice):
+        return _WORDS[kind]
+    return row.name, f"; {row.advice}" if row.advice else ""
 
 
 def expect(path: Path, *kinds: PathKind) -> Found:
@@ -166,7 +168,7 @@ def expect(path: Path, *kinds: PathKind) -> Found:
     if found.reason:
         raise ConfigError(f"{found.reason}: {found.path}")
     if found.kind not in kinds:
-        taken, (name, advice) = [_WORDS[kind][0] for kind in kinds], _WORDS[found.kind]
+        taken, (name, advice) = [_words(kind)[0] for kind in kinds], _words(found.kind)
         if kinds == ("dataset",) and found.kind == "run":
             inside = path / DATASET
             advice = (
@@ -183,13 +185,15 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
         return
     only = " but failed attempts, in failed/" if found.failed else ""
     left = f"; {found.left}" if found.left else ""
-    raise ConfigError(f"There is no finished recording in {_WORDS[found.kind][0]}{only}{left}: {found.path}")
+    raise ConfigError(f"There is no finished recording in {_words(found.kind)[0]}{only}{left}: {found.path}")
 
 
 def _file(path: Path) -> Found:
     with open_regular(path) as file:
         head = file.read(max(len(magic) for magic, _ in _MAGICS))
         kind: PathKind | None = "rosbag" if path.name.endswith(BAG_SUFFIXES) else _SUFFIXES.get(path.suffix)
+        if kind is None:
+            kind = next((kind for kind, row in reader_rows().items() if path.name.endswith(row.suffixes)), None)
         if kind != "unfinished":
             kind = next((kind for magic, kind in _MAGICS if head.startswith(magic)), kind)
         if kind == "recording" and _is_foreign(file):

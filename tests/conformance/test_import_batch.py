@@ -23,7 +23,7 @@ from support.commands import exit_code
 
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.core.tables import CHECKS
+from demorec.core.tables import FILE_CHECKS
 from demorec.episode.info import Origin
 from demorec.extensions.imports import planning
 from demorec.extensions.imports.bag_files import BagError
@@ -153,7 +153,7 @@ def test_bad_bags_are_skipped_and_listed(
         assert left_out[number]["bag"] == f"run_{2 * number + 1}.mcap"
         assert reason in left_out[number]["reason"]
         assert left_out[number]["reason"] in shown
-    judged = CHECKS.load("import_dropped").run(CheckedRun(run))
+    judged = FILE_CHECKS.load("import_dropped").run(CheckedRun(run))
     assert judged.value == len(BAD)
     assert "run_1.mcap: The bag is empty" in judged.detail
 

@@ -16,7 +16,7 @@ from support.commands import exit_code
 from support.tasks import QUICK_TASKS
 
 from demorec.core.config import VideoConfig
-from demorec.core.tables import CHECKS, ROBOTS
+from demorec.core.tables import FILE_CHECKS, ROBOTS
 from demorec.mcap import channels, recover
 
 Fault = Callable[[Spoilt], None]
@@ -46,7 +46,7 @@ def findings(path: Path) -> list[tuple[str, str]]:
 
 def test_the_good_ones_pass(good: Path, filmed: Path) -> None:
     assert findings(good) == findings(filmed) == []
-    assert {result.level for result in checked(filmed, only=CHECKS.names()).results} == {"pass"}
+    assert {result.level for result in checked(filmed, only=FILE_CHECKS.names()).results} == {"pass"}
 
 
 @pytest.mark.parametrize("task", QUICK_TASKS)
@@ -170,7 +170,7 @@ def test_a_truncated_file(good: Path, tmp_path: Path) -> None:
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
     report = checked(tmp_path / "cut.mcap")
     assert findings(tmp_path / "cut.mcap")[0] == ("opens", "fail")
-    integrity = [result.level for result in report.results if result.check in CHECKS.names()]
+    integrity = [result.level for result in report.results if result.check in FILE_CHECKS.names()]
     assert "fail" not in integrity[1:]
 
 

@@ -34,8 +34,8 @@ class TestEveryTask(TaskContract):
 
     # `test_check_recordings.py` and `test_replay.py` have quick ones.
     @pytest.mark.slow
-    def test_its_recording_passes_every_check_and_replays_to_the_bit(self, tmp_path: Path) -> None:
-        super().test_its_recording_passes_every_check_and_replays_to_the_bit(tmp_path)
+    def test_its_recording_passes_every_check_and_is_made_again_to_the_bit(self, tmp_path: Path) -> None:
+        super().test_its_recording_passes_every_check_and_is_made_again_to_the_bit(tmp_path)
 
     # `test_determinism.py` does it with every robot.
     test_an_episode_repeats_to_the_bit = None  # type: ignore[assignment]

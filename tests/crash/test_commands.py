@@ -24,9 +24,9 @@ from support.crash_rows import LONG, MAKERS, ROWS, SLOW, make_base
 from support.export import content_of, files_of
 from support.options import TARGETS
 
+from demorec.core.extensions import reader_rows
 from demorec.core.limited import VARIABLE
 from demorec.core.tables import EXPORTERS
-from demorec.runs.find import IMPORT_WORDS
 
 KILLS = 8
 MINE = "years of work"
@@ -301,7 +301,7 @@ def test_closed_streams(name: str, sources: Path, tmp_path: Path) -> None:
 def test_every_command_that_writes_has_a_row() -> None:
     words = {option: " ".join(option.command) for option in TARGETS if option.command != ("export",)}
     wanted = {(head, option.name) for option, head in words.items()}
-    wanted |= {(f"import {word}", "out") for word in IMPORT_WORDS.values()}
+    wanted |= {(f"import {word}", "out") for row in reader_rows().values() if (word := row.word)}
     wanted |= {(f"export {word}", "out") for word in EXPORTERS.names()}
     calls = [row.call for row in ROWS.values()]
     without = {

@@ -19,7 +19,7 @@ import pyarrow.parquet as pq
 
 from demorec.core.config import GenerateConfig
 from demorec.core.plain import to_plain
-from demorec.core.tables import CHECKS
+from demorec.core.tables import FILE_CHECKS
 from demorec.extensions.policies.evaluation import Evaluation, Settings
 from demorec.mcap import Recording
 from demorec.render.raster.renderer import warm_up
@@ -71,7 +71,7 @@ dataset = "actions"
 dataset = "obs/agentview_image"
 colors = "rgb"
 """
-_CHECKS = tuple(name for name in CHECKS.names() if name.startswith("dataset_") and name != "lerobot_opens")
+_CHECKS = tuple(name for name in FILE_CHECKS.names() if name.startswith("dataset_") and name != "lerobot_opens")
 """Of datasets; LeRobot takes seconds to load."""
 Case = tuple[str, list[str]]
 

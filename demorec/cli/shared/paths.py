@@ -11,16 +11,16 @@ from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import renamed, tell
 from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.extensions import reader_rows
 from demorec.core.processes import terminate_as_interrupt
 from demorec.core.replacing import json_object, use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
-from demorec.extensions.imports.formats import FORMATS, import_kind, opened
 from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
+from demorec.runs.foreign import import_kind, opened
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED, load_any_run_file
 
-WHAT_IS_READ = (
-    f"recordings, runs, {', '.join(form.name for form in FORMATS.values())}, bags, folders of recordings or bags"
-)
+_FOREIGN = [row.plural for kind, row in reader_rows().items() if kind != "dataset"]
+WHAT_IS_READ = ", ".join(["recordings", "runs", "LeRobot datasets", *_FOREIGN, "folders of these"])
 Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}.")]
 MappingFile = Annotated[
     Path | None,
@@ -111,7 +111,7 @@ def reading(
 ) -> Iterator[tuple[Path, ...]]:
     """What to read in the place of each path; until the context is left, all output names the user's paths.
 
-    Imported files (`demorec.extensions.imports.formats`) are read through a temporary run. No output names that run:
+    Imported files (`demorec.runs.foreign`) are read through a temporary run. No output names that run:
     its episodes are called "demo.hdf5: episode 3".
 
     Args:

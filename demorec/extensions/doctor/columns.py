@@ -1,29 +1,48 @@
-"""The doctor's verdict and score as columns of a dataset's episodes, to choose and sort them by."""
+"""Verdict and score of episodes, as columns to choose and sort them by, and as an order to view them in."""
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING, Any
+from collections.abc import Collection, Sequence
+from pathlib import Path
+from typing import Any
 
-if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-
-_JUDGED = ("verdict", "score")
+from demorec.core.errors import ConfigError
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.episode.roles import NamedRoles
+from demorec.extensions.doctor.diagnosis import diagnose
+from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
+from demorec.runs.find import find
+from demorec.view.sources import RankedEpisode
 
 
 def judged_columns(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:
-    """Read the columns of a dataset's episodes, with verdict and score if they are asked for and not columns already.
+    """Judge each episode: the "verdict", the "score", or both.
 
     The verdict needs the images, which takes as long as `demorec check`; the score is from the tables alone.
     """
-    from demorec.datasets.lerobot.episode_records import episode_columns
-    from demorec.extensions.doctor.diagnosis import diagnose
-    from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
-
-    columns = episode_columns(folder)
-    wanted = [name for name in _JUDGED if name in names and not any(name in row for row in columns)]
-    if not wanted:
-        return columns
-    evidence = evidence_of_dataset(folder.root, ReadOptions(images="verdict" in wanted))
+    evidence = evidence_of_dataset(folder.root, ReadOptions(images="verdict" in names))
     found = {each.episode: each for each in diagnose(evidence).episodes}
-    return [row | {name: getattr(found.get(row["episode_index"]), name, None) for name in wanted} for row in columns]
+    numbers = [place.episode_index for place in folder.places]
+    return [{name: getattr(found.get(number), name, None) for name in names} for number in numbers]
+
+
+def by_score(paths: Sequence[Path], named: NamedRoles) -> list[RankedEpisode]:
+    """Rank the episodes of datasets by verdict and score, the worst first.
+
+    Raises:
+        ConfigError: A path is not a dataset.
+    """
+    if others := [path for path in paths if find(path).kind != "dataset"]:
+        raise ConfigError(f"--rank score is for LeRobot datasets, and this is not one: {others[0]}")
+    options = ReadOptions(images=False, named=named)
+    found = [(path, each) for path in paths for each in diagnose(evidence_of_dataset(path, options)).episodes]
+    ranked = []
+    for path, each in sorted(found, key=lambda pair: pair[1].rank):
+        reasons = "; ".join(each.reasons)
+        ranked.append(
+            RankedEpisode(
+                name=f"{path}: episode {each.episode}",
+                line=f"{each.verdict}, {each.score:.2f}  episode {each.episode}{': ' * bool(reasons)}{reasons}",
+            )
+        )
+    return ranked

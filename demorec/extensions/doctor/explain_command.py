@@ -30,10 +30,10 @@ class Explain:
 
     def run(self) -> int:
         """Print its page."""
-        from demorec.core.tables import CHECKS
+        from demorec.core.tables import FILE_CHECKS
 
         _, doctors = split_checks((self.check,))
-        found = doctors[0] if doctors else CHECKS.load(self.check)
+        found = doctors[0] if doctors else FILE_CHECKS.load(self.check)
         width = min(terminal_width(), 100)
         lines = [self.check, ""]
         for paragraph in found.page.split("\n\n"):
@@ -55,25 +55,25 @@ def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[FaultChec
     Raises:
         ConfigError: There is no such check.
     """
-    from demorec.core.tables import CHECKS
+    from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 
     if not names:
         return (), all_checks()
     doctors = {check.name: check for check in all_checks()}
     for name in names:
-        if name not in doctors and name not in CHECKS.names():
-            near = nearest_match(name, [*doctors, *CHECKS.names()])
+        if name not in doctors and name not in FILE_CHECKS.names():
+            near = nearest_match(name, [*doctors, *FILE_CHECKS.names()])
             raise ConfigError(f"There is no check {name!r}.{near} demorec list checks prints them.")
     return tuple(n for n in names if n not in doctors), tuple(doctors[n] for n in names if n in doctors)
 
 
 def check_rows() -> Iterator[tuple[str, str]]:
     """Yield (name, what it finds) of every check, the doctor's first."""
-    from demorec.core.tables import CHECKS
+    from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 
     for check in all_checks():
         yield check.name, check.measures
-    for name in CHECKS.names():
-        yield name, CHECKS.load(name).measures
+    for name in FILE_CHECKS.names():
+        yield name, FILE_CHECKS.load(name).measures

@@ -31,7 +31,7 @@ from demorec.extensions.imports.bag_files import (
 )
 from demorec.extensions.imports.words import in_natural_order
 from demorec.mcap.scan import ScannedMessage
-from demorec.runs.find import BAG_SUFFIXES, IMPORT_WORDS, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, name_of
+from demorec.runs.find import BAG_SUFFIXES, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, import_word, name_of
 
 NS = 1_000_000_000
 _SUFFIXES = (".mcap", *BAG_SUFFIXES)
@@ -113,7 +113,7 @@ def bags_in(path: Path) -> list[Path]:
     They are rosbag2 folders, MCAP, .db3 and .bag files, and those files in folders in it whose metadata.yaml was lost.
     A folder that holds none of them is given back itself.
     """
-    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or find(path).kind in IMPORT_WORDS:
+    if not path.is_dir() or os.path.lexists(path / ROSBAG2) or import_word(find(path).kind):
         return [path]
     found: list[Path] = []
     for entry in _entries(path):
@@ -176,10 +176,8 @@ def _magic_of(path: Path) -> bytes:
 def _refuse_other_formats(path: Path) -> None:
     """Raise ConfigError for a format that another word of `demorec import` reads."""
     kind = find(path).kind
-    if kind in IMPORT_WORDS:
-        raise ConfigError(
-            f"This is {name_of(kind)}, no bag: demorec import {IMPORT_WORDS[kind]} {path} imports it: {path}"
-        ) from None
+    if word := import_word(kind):
+        raise ConfigError(f"This is {name_of(kind)}, no bag: demorec import {word} {path} imports it: {path}") from None
 
 
 def _folder(path: Path) -> Bag:

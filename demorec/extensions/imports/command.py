@@ -16,8 +16,9 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.registry import nearest_match
 from demorec.core.targets import OptionalTarget
-from demorec.extensions.imports.formats import BAGS, FORMATS, SourceFormat
+from demorec.extensions.imports.formats import BAGS, formats_by_word
 from demorec.runs.find import find, name_of
+from demorec.runs.foreign import SourceFormat
 
 if TYPE_CHECKING:
     from demorec.extensions.imports.episode_writer import FramesImport
@@ -25,7 +26,7 @@ if TYPE_CHECKING:
 
 MAX_WORKERS = 1000
 _BAGS = "Bags; each is an episode, or several, as the mapping says."
-_WORDS = ", ".join(f"{word} ({form.name})" for word, form in FORMATS.items())
+_WORDS = ", ".join(f"{word} ({form.plural})" for word, form in formats_by_word().items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -79,7 +80,7 @@ class Import:
             refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
-        form = FORMATS.get(word, BAGS)
+        form = formats_by_word().get(word, BAGS)
         self._check_flags(form)
         paths = self.bags if form is BAGS else self.bags[1:]
         if not paths:
@@ -88,9 +89,9 @@ class Import:
                 f"Name {name} after the word {word}: {form.command} {form.example}. A bag of that name is given with "
                 "its folder."
             )
-        if form is BAGS and not paths[0].exists() and (near := nearest_match(word, FORMATS)):
+        if form is BAGS and not paths[0].exists() and (near := nearest_match(word, formats_by_word())):
             raise ConfigError(
-                f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(FORMATS)} and its files."
+                f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(formats_by_word())} and its files."
             )
         from demorec.extensions.imports.bag import bags_in, open_bag
 
@@ -100,7 +101,7 @@ class Import:
                 tell(f"Note: demorec made this recording, and reads it as it is, without an import: {paths[0]}")
             say(*lines)
             return 0
-        if form.mapping and (self.mapping is None or self.out is None):
+        if form.suggester and (self.mapping is None or self.out is None):
             if form is BAGS:
                 open_bag(bags_in(paths[0])[0])  # says what it is, if it is not a bag
             raise ConfigError(
@@ -117,25 +118,25 @@ class Import:
 
     def _check_flags(self, form: SourceFormat) -> None:
         """Raise ConfigError for flags of another format."""
-        if form.mapping and self.motors.named is not None:
+        if form.suggester and self.motors.named is not None:
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
-        if form.mapping and self.roles.named:
+        if form.suggester and self.roles.named:
             raise ConfigError(
                 "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
                 "bags and HDF5 files say it in their mapping."
             )
-        if form is not BAGS and (self.workers > 1 or (self.skip_bad and form.mapping)):
+        if form is not BAGS and (self.workers > 1 or (self.skip_bad and form.suggester)):
             raise ConfigError(
                 "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
                 "--workers, --skip-bad out."
             )
-        if form.mapping is None and (self.suggest or self.mapping is not None):
+        if not form.suggester and (self.suggest or self.mapping is not None):
             name = name_of(form.kind)
             raise ConfigError(f"The import of {name} needs no mapping: leave --mapping and --suggest out.")
 
     def _import_frames(self, form: SourceFormat, paths: Sequence[Path], out: Path) -> int:
         options: dict[str, Any] = {"video": self.video}
-        if form.mapping is None:
+        if not form.suggester:
             options |= {"motors": self.motors.named, "named": self.roles.named, "skip_bad": self.skip_bad}
         result = cast("FramesImport", form.read(paths, self.mapping, out, **options))
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())

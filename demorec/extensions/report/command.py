@@ -15,8 +15,8 @@ from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import REPORT
 from demorec.core.targets import Target
-from demorec.extensions.imports.formats import IMPORTED
 from demorec.runs.find import EPISODE_FOLDERS, expect
+from demorec.runs.foreign import imported_kinds
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ class ReportCommand:
         check_option("workers", self.workers, 1, 1024)
         if self.images and not self.checks:
             raise ConfigError("--images chooses checks, and --no-checks runs none: leave one of them out.")
-        expect(self.path, "recording", "dataset", *IMPORTED, *EPISODE_FOLDERS)
+        expect(self.path, "recording", "dataset", *imported_kinds(), *EPISODE_FOLDERS)
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: there is no folder {self.out.parent}.")
         refuse_inside([self.out])

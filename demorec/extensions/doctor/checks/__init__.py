@@ -1,4 +1,4 @@
-"""The checks: every module of this folder adds those that it defines."""
+"""The checks: those that the modules of this folder define, and rows `checks` of other extensions."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import importlib
 import pkgutil
 from functools import cache
 
+from demorec.core.extensions import rows_of
 from demorec.extensions.doctor.base import Family, FaultCheck
 
 FAMILIES: tuple[Family, ...] = ("files", "time", "numbers", "alignment", "images", "set")
@@ -17,4 +18,5 @@ def all_checks() -> tuple[FaultCheck, ...]:
     modules = sorted(module.name for module in pkgutil.iter_modules(__path__))
     loaded = [importlib.import_module(f"{__name__}.{name}") for name in modules]
     found = [value for module in loaded for value in vars(module).values() if isinstance(value, FaultCheck)]
+    found += [pkgutil.resolve_name(target) for _, target in rows_of("checks")]
     return tuple(sorted(dict.fromkeys(found), key=lambda check: FAMILIES.index(check.family)))

@@ -27,10 +27,10 @@ class Chosen(EditOne):
 
     def chosen(self, source: LeRobotFolder) -> list[int]:
         """Numbers of the chosen episodes."""
-        from demorec.extensions.doctor.columns import judged_columns
+        from demorec.extensions.editing.columns import columns_of
         from demorec.extensions.editing.operations import chosen, names_in
 
-        rows = judged_columns(source, names_in(self.where))
+        rows = columns_of(source, names_in(self.where))
         return chosen(source, rows, self.where, episode_numbers(self.episodes) if self.episodes else None)
 
 
@@ -152,10 +152,10 @@ class Split(EditOne):
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """Name of each part -> its episodes."""
-        from demorec.extensions.doctor.columns import judged_columns
+        from demorec.extensions.editing.columns import columns_of
         from demorec.extensions.editing.operations import split
 
-        rows = judged_columns(sources[0], {self.by})
+        rows = columns_of(sources[0], {self.by})
         return split(sources[0], rows, self._shares(), self.seed, by=self.by)
 
     def _shares(self) -> Mapping[str, float]:
@@ -263,10 +263,10 @@ class Reorder(EditOne):
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes in the new order."""
-        from demorec.extensions.doctor.columns import judged_columns
+        from demorec.extensions.editing.columns import columns_of
         from demorec.extensions.editing.operations import reorder
 
-        rows = judged_columns(sources[0], {self.by}) if self.by else ()
+        rows = columns_of(sources[0], {self.by}) if self.by else ()
         return reorder(sources[0], rows, self.by, episode_numbers(self.order), descending=self.descending)
 
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.check.dataset import CheckedDataset, DescribedEpisode
+from demorec.check.proof import Proof
 from demorec.check.run_dataset import episode_differences, export_options
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
@@ -219,6 +220,15 @@ def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[st
                 yield deep_check(path, simulators, allowed)
         return
     yield from in_turn(partial(deep_check, allowed=tuple(allowed)), paths, workers)
+
+
+def proofs(paths: Sequence[Path], allowed: Sequence[str]) -> Iterator[Proof]:
+    """Prove each recording by making it again; a row `proofs` of the extension."""
+    for report in deep_checks(paths, allowed=allowed):
+        problem = ""
+        if report.level == "fail":
+            problem = f"made again, it is not the same: {report.error or report.differences[0]}"
+        yield Proof(path=report.path, level=report.level, problem=problem)
 
 
 def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:

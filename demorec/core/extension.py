@@ -1,0 +1,107 @@
+"""Declaration of an extension: the names that it adds, each with the place of the code behind it.
+
+A declaration imports nothing heavy. Its values are texts "module:name", which are loaded when they are used, so that
+`demorec --help` costs as much with twenty extensions as with none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, get_args
+
+Group = Literal["make", "look", "judge", "edit", "learn", "repair"]
+GROUPS: tuple[Group, ...] = get_args(Group)
+"""Groups of commands, in the order of `demorec --help`."""
+Rows = Mapping[str, str]
+"""Name -> "module:name"."""
+
+
+def _no_rows() -> Rows:
+    return {}
+
+
+@dataclass(frozen=True, kw_only=True)
+class CommandRow:
+    """A command of `demorec`.
+
+    Attributes:
+        target: "module:Class" of a dataclass whose fields are the flags (`demorec.cli.Command`).
+        group: Heading in `demorec --help`.
+        limits: Limits of its process (`demorec.core.limited`): those for reading files of unknown origin, those for
+            simulating or drawing what such files describe, or none.
+        drawing_flags: Flags with which it simulates or draws.
+    """
+
+    target: str
+    group: Group
+    limits: Literal["none", "reading", "drawing"] = "none"
+    drawing_flags: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class ReaderRow:
+    """A kind of foreign files or folders that can be imported.
+
+    Attributes:
+        target: "module:name" of a `demorec.runs.foreign.SourceFormat`.
+        name: Name of one in a sentence: "an HDF5 file".
+        plural: Name of several: "HDF5 files".
+        advice: What to do with one where a recording is expected: "make a run of it (demorec import)".
+        word: Word after `demorec import` that stands for this kind; "" for the kind that needs none.
+        suffixes: Endings of its files, for a kind that the core does not know.
+    """
+
+    target: str
+    name: str
+    plural: str
+    advice: str = ""
+    word: str = ""
+    suffixes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Extension:
+    """Everything that an extension adds.
+
+    Attributes:
+        name: Name of its folder, or of its package.
+        summary: What it does, in one line.
+        needs: Names of the extensions that it imports.
+        commands: Name -> command.
+        readers: Kind of path -> reader. "dataset", "hdf5" and "rosbag" are kinds that the core knows.
+        tasks: Name -> subclass of `demorec.tasks.base.Task`.
+        robots: Name -> `demorec.robots.robot.RobotSpec`.
+        cameras: Name -> `demorec.render.cameras.CameraPreset`.
+        objects: Name -> `demorec.objects.shelf.Shelf`.
+        renderers: Name -> class with the methods of `demorec.render.Renderer`.
+        exporters: Name -> `demorec.datasets.options.Exporter`.
+        file_checks: Name -> `demorec.check.base.Check` of the integrity of recordings, runs and their datasets.
+        checks: Name -> check of any dataset, for the extension that judges datasets.
+        operations: Name -> command of `demorec dataset`, for the extension that edits datasets.
+        columns: Name of a column of a dataset's episodes, for `--where` and `--by` -> function (folder, names) that
+            returns a mapping with these names for each episode.
+        rankings: Name for `demorec view --rank` -> function (paths, named roles) that returns the episodes, worst
+            first, as `demorec.view.sources.RankedEpisode`.
+        lists: Name for `demorec list` -> function that returns (name, summary) of each row.
+        proofs: Name -> function (recordings, allowed modules) that yields a `Proof` of each recording.
+    """
+
+    name: str
+    summary: str
+    needs: tuple[str, ...] = ()
+    commands: Mapping[str, CommandRow] = field(default_factory=dict)
+    readers: Mapping[str, ReaderRow] = field(default_factory=dict)
+    tasks: Rows = field(default_factory=_no_rows)
+    robots: Rows = field(default_factory=_no_rows)
+    cameras: Rows = field(default_factory=_no_rows)
+    objects: Rows = field(default_factory=_no_rows)
+    renderers: Rows = field(default_factory=_no_rows)
+    exporters: Rows = field(default_factory=_no_rows)
+    file_checks: Rows = field(default_factory=_no_rows)
+    checks: Rows = field(default_factory=_no_rows)
+    operations: Rows = field(default_factory=_no_rows)
+    columns: Rows = field(default_factory=_no_rows)
+    rankings: Rows = field(default_factory=_no_rows)
+    lists: Rows = field(default_factory=_no_rows)
+    proofs: Rows = field(default_factory=_no_rows)

@@ -1,0 +1,135 @@
+"""The extensions that there are: the core itself, the folders of `demorec/extensions/`, and those of other packages.
+
+An installed package brings extensions by entry points of the group `demorec.extensions`, each "module:EXTENSION". An
+extension that cannot be used is left out and named; it harms no other.
+"""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from functools import cache
+from importlib.metadata import entry_points
+from typing import Any
+
+from demorec.core.extension import CommandRow, Extension, ReaderRow
+
+ENTRY_POINTS = "demorec.extensions"
+"""Group of the entry points of other packages, and the package of our own folders."""
+
+
+@dataclass(frozen=True)
+class Extensions:
+    """The usable extensions, and what keeps others from being used.
+
+    Attributes:
+        found: The core first, then the others by name.
+        problems: One sentence for each that is left out.
+    """
+
+    found: tuple[Extension, ...]
+    problems: tuple[str, ...]
+
+
+@cache
+def extensions() -> Extensions:
+    """Find all extensions; the same for as long as the process lives."""
+    problems: list[str] = []
+    declared = [_declaration("demorec", "demorec.extension:EXTENSION", problems)]
+    declared += [_declaration(place, target, problems) for place, target in _targets()]
+    usable: dict[str, Extension] = {}
+    for extension in filter(None, declared):
+        if problem := _clash(extension, usable):
+            problems.append(problem)
+        else:
+            usable[extension.name] = extension
+    while lacking := [each for each in usable.values() if not set(each.needs) <= usable.keys()]:
+        for each in lacking:
+            missing = ", ".join(sorted(set(each.needs) - usable.keys()))
+            problems.append(f"The extension {each.name} is left out, since it needs {missing}.")
+            del usable[each.name]
+    return Extensions(found=tuple(usable.values()), problems=tuple(problems))
+
+
+def _targets() -> Iterator[tuple[str, str]]:
+    """Yield (place, "module:name") of each declaration."""
+    package = importlib.import_module(ENTRY_POINTS)
+    for module in sorted(pkgutil.iter_modules(package.__path__), key=lambda module: module.name):
+        yield f"{ENTRY_POINTS}.{module.name}", f"{ENTRY_POINTS}.{module.name}.extension:EXTENSION"
+    for point in sorted(entry_points(group=ENTRY_POINTS), key=lambda point: point.name):
+        distribution = point.dist.name if point.dist is not None else point.module
+        yield f"the package {distribution}", point.value
+
+
+def _declaration(place: str, target: str, problems: list[str]) -> Extension | None:
+    """Load a declaration; None, with a sentence among the problems, if that fails."""
+    module, _, name = target.partition(":")
+    try:
+        found = getattr(importlib.import_module(module), name)
+    except (Exception, SystemExit) as error:  # code of another package may raise anything
+        problems.append(f"The extension of {place} is left out: {target} cannot be loaded ({_words(error)}).")
+        return None
+    if not isinstance(found, Extension):
+        problems.append(f"The extension of {place} is left out: {target} is not a demorec.core.extension.Extension.")
+        return None
+    return found
+
+
+def _words(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}".rstrip(": ")
+
+
+def _clash(extension: Extension, others: Mapping[str, Extension]) -> str:
+    """Name what an extension has in common with another one; "" if nothing."""
+    if extension.name in others:
+        return f"The extension {extension.name} is left out, since another one has that name."
+    for other in others.values():
+        for table, rows in vars(other).items():
+            own = getattr(extension, table)
+            if isinstance(rows, Mapping) and (both := sorted(rows.keys() & own.keys())):
+                kind = table.replace("_", " ")
+                return (
+                    f"The extension {extension.name} is left out, since {other.name} has {kind} of the same name: "
+                    f"{', '.join(both)}."
+                )
+    return ""
+
+
+def rows_of(table: str) -> Iterator[tuple[str, Any]]:
+    """Yield (name, value) of a table, a field of `Extension`, over all extensions."""
+    for extension in extensions().found:
+        yield from getattr(extension, table).items()
+
+
+def command_rows() -> dict[str, CommandRow]:
+    """Name -> command of `demorec`."""
+    return dict(rows_of("commands"))
+
+
+def reader_rows() -> dict[str, ReaderRow]:
+    """Kind of path -> its reader."""
+    return dict(rows_of("readers"))
+
+
+class ExtensionRows(Mapping[str, str]):
+    """Name -> "module:name" of one table, read when it is first used."""
+
+    def __init__(self, table: str) -> None:
+        self._table = table
+
+    def _rows(self) -> dict[str, str]:
+        return {name: getattr(row, "target", row) for name, row in rows_of(self._table)}
+
+    def __getitem__(self, name: str) -> str:
+        """The place of the code."""
+        return self._rows()[name]
+
+    def __iter__(self) -> Iterator[str]:
+        """The names, the core's first."""
+        return iter(self._rows())
+
+    def __len__(self) -> int:
+        """Number of names."""
+        return len(self._rows())

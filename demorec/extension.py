@@ -1,0 +1,67 @@
+"""Declaration of the core: what demorec has without any extension."""
+
+from __future__ import annotations
+
+from demorec.core.extension import CommandRow, Extension
+
+
+def _checks(module: str, *names: str) -> dict[str, str]:
+    return {name: f"demorec.check.{module}:{name}" for name in names}
+
+
+EXTENSION = Extension(
+    name="core",
+    summary="generate, record, play back, export",
+    commands={
+        "generate": CommandRow(target="demorec.cli.generate:Generate", group="make"),
+        "info": CommandRow(target="demorec.cli.info:Info", group="look", limits="reading"),
+        "view": CommandRow(target="demorec.cli.view:View", group="look", limits="reading"),
+        "export": CommandRow(target="demorec.cli.export:Export", group="make", limits="reading"),
+        "recover": CommandRow(target="demorec.cli.recover:Recover", group="repair", limits="reading"),
+        "list": CommandRow(target="demorec.cli.list_rows:ListRows", group="look"),
+    },
+    tasks={
+        "pick_place": "demorec.tasks.pick:PickPlace",
+        "place_in_tray": "demorec.tasks.trays:PlaceInTray",
+        "stack": "demorec.tasks.cubes:Stack",
+        "stack_three": "demorec.tasks.cubes:StackThree",
+        "unstack": "demorec.tasks.cubes:Unstack",
+        "sort_by_color": "demorec.tasks.trays:SortByColor",
+        "line_up": "demorec.tasks.cubes:LineUp",
+        "pick_from_clutter": "demorec.tasks.pick:PickFromClutter",
+        "pick_shapes": "demorec.tasks.pick:PickShapes",
+        "pick_anything": "demorec.tasks.anything:PickAnything",
+        "tutorial": "demorec.tasks.tutorial:Tutorial",
+    },
+    robots={
+        "panda": "demorec.robots.panda:PANDA",
+        "iiwa": "demorec.robots.iiwa:IIWA",
+        "so101": "demorec.robots.so101:SO101",
+    },
+    cameras={
+        "front": "demorec.render.cameras:FRONT",
+        "wrist": "demorec.render.cameras:WRIST",
+        "top": "demorec.render.cameras:TOP",
+        "workspace": "demorec.render.cameras:WORKSPACE",
+    },
+    objects={
+        "household": "demorec.objects.household:HOUSEHOLD",
+        "blocks": "demorec.objects.blocks:BLOCKS",
+        "cubes": "demorec.objects.blocks:CUBES",
+        "random": "demorec.objects.folder:RANDOM",
+    },
+    renderers={
+        "raster": "demorec.render.raster:RasterRenderer",
+        "tiny": "demorec.sim.renderers:TinyRenderer",
+        "egl": "demorec.sim.renderers:EglRenderer",
+    },
+    exporters={"lerobot": "demorec.datasets.lerobot.options:LEROBOT"},
+    file_checks={
+        **_checks("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps"),
+        **_checks("file", "video_frames", "missing_images"),
+        **_checks("images", "images_decode"),
+        **_checks("run", "run_files", "run_complete", "run_agrees"),
+        **_checks("run_dataset", "run_dataset"),
+        **_checks("sidecar", "dataset_sidecar"),
+    },
+)

@@ -1,0 +1,23 @@
+"""Declaration of the doctor, which judges anybody's data."""
+
+from __future__ import annotations
+
+from demorec.core.extension import CommandRow, Extension
+
+EXTENSION = Extension(
+    name="doctor",
+    summary="judge datasets, runs and recordings before training",
+    needs=("remake",),
+    commands={
+        "check": CommandRow(
+            target="demorec.extensions.doctor.check_command:CheckCommand",
+            group="judge",
+            limits="reading",
+            drawing_flags=("--deep",),
+        ),
+        "explain": CommandRow(target="demorec.extensions.doctor.explain_command:Explain", group="judge"),
+    },
+    columns=dict.fromkeys(("verdict", "score"), "demorec.extensions.doctor.columns:judged_columns"),
+    rankings={"score": "demorec.extensions.doctor.columns:by_score"},
+    lists={"checks": "demorec.extensions.doctor.explain_command:check_rows"},
+)

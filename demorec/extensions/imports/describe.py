@@ -1,0 +1,51 @@
+"""What `demorec info` prints about bags, and about the bags and episodes that an import left out of a run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from demorec.cli.shared.output import aligned, counted, size_in_words
+from demorec.extensions.imports.bag import bags_in, summarize_bag
+from demorec.extensions.imports.import_file import load_import_file
+
+_MOST_PROBLEMS = 5
+"""Problems of a bag that are listed."""
+
+
+def describe_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """A bag, or each one of a folder of bags."""
+    found = [_bag(bag) for bag in bags_in(path)]
+    if len(found) == 1:
+        return found[0]
+    plain = {"kind": "bags", "path": str(path), "bags": [plain for plain, _ in found]}
+    lines = [f"{len(found)} bags in {path}"]
+    for _, described in found:
+        lines += ["", *described]
+    return plain, lines
+
+
+def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
+    plain = summarize_bag(path)
+    length = f"{plain['seconds']:.2f} s, {counted(plain['messages'], 'message')}"
+    facts = [("bag", f"{path} ({size_in_words(plain['bytes'])})"), ("length", length)]
+    facts += [("problem", problem) for problem in plain["problems"][:_MOST_PROBLEMS]]
+    rows = [("topic", "messages", "rate", "type")]
+    for topic in plain["topics"]:
+        rate = f"{topic['rate']:.1f} Hz" if topic["rate"] else ""
+        rows.append((topic["topic"], str(topic["messages"]), rate, topic["type"]))
+    lines = [*aligned(facts), "", *aligned(rows)]
+    return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
+
+
+def dropped_rows(path: Path) -> list[dict[str, str]]:
+    """What an import did not take into the run: episodes that it dropped and bags that it skipped, each with why."""
+    if (imported := load_import_file(path)) is None:
+        return []
+    dropped = [
+        {"bag": bag.name, "what": f"episode from {row.begin_s:.2f} to {row.end_s:.2f} s", "reason": row.reason}
+        for bag in imported.bags
+        for row in bag.episodes
+        if row.episode_index is None
+    ]
+    return dropped + [{"bag": bag.name, "what": "the bag", "reason": bag.reason} for bag in imported.skipped]

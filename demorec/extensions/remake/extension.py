@@ -1,0 +1,15 @@
+"""Declaration of deep checks, replay and drawing again."""
+
+from __future__ import annotations
+
+from demorec.core.extension import CommandRow, Extension
+
+EXTENSION = Extension(
+    name="remake",
+    summary="make recordings again and compare, replay them, draw them again",
+    commands={
+        "replay": CommandRow(target="demorec.extensions.remake.replay_command:Replay", group="look", limits="drawing"),
+        "render": CommandRow(target="demorec.extensions.remake.render_command:Render", group="make", limits="drawing"),
+    },
+    proofs={"remake": "demorec.extensions.remake.deep.check:proofs"},
+)

@@ -1,0 +1,14 @@
+"""Declaration of the report."""
+
+from __future__ import annotations
+
+from demorec.core.extension import CommandRow, Extension
+
+EXTENSION = Extension(
+    name="report",
+    summary="one page about a run or a dataset",
+    needs=("doctor", "policies"),
+    commands={
+        "report": CommandRow(target="demorec.extensions.report.command:ReportCommand", group="look", limits="reading")
+    },
+)
