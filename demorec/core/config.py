@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
 from demorec.core.plain import from_plain
-from demorec.core.registry import modules_of
+from demorec.core.registry import is_foreign, modules_of
 from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
 
 MAX_PIXELS = 16_000_000
@@ -120,8 +120,16 @@ class GenerateConfig:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """The user's own modules that it names; whoever makes a config of their own words allows them thereby."""
-        return modules_of((self.task, self.robot, *self.cameras, *self.objects))
+        """Modules outside demorec of what it names, the user's own and those of extensions.
+
+        A config that the user wrote allows them.
+        """
+        from demorec.core.tables import CAMERAS, OBJECTS, ROBOTS, TASKS
+
+        targets = [TASKS.target(self.task), ROBOTS.target(self.robot)]
+        targets += [CAMERAS.target(name) for name in self.cameras]
+        targets += [OBJECTS.target(name) for name in self.objects]
+        return tuple(module for module in modules_of(targets) if is_foreign(module))
 
     def check_names(self, allowed: Iterable[str]) -> None:
         """Raise ConfigError unless all that it names may be loaded.

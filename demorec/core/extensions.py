@@ -113,6 +113,14 @@ def reader_rows() -> dict[str, ReaderRow]:
     return dict(rows_of("readers"))
 
 
+@cache
+def extension_packages() -> frozenset[str]:
+    """Packages outside demorec whose extensions are installed, and whose files may therefore be read."""
+    targets = [target for table in ("robots", "objects") for _, target in rows_of(table)]
+    packages = {target.partition(":")[0].partition(".")[0] for target in targets}
+    return frozenset(packages - {"demorec"})
+
+
 class ExtensionRows(Mapping[str, str]):
     """Name -> "module:name" of one table, read when it is first used."""
 

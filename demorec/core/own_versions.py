@@ -15,8 +15,8 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.core.registry import import_root, is_allowed, module_file, split_name
-from demorec.core.tables import load_robot
+from demorec.core.registry import import_root, is_allowed, is_foreign, module_file
+from demorec.core.tables import ROBOTS, load_robot
 from demorec.robots.assets import allow_models, asset_path, mesh_path
 from demorec.robots.urdf import mesh_names
 
@@ -40,7 +40,7 @@ def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
         versions[SOURCE + module] = source_digest(module)
         for distribution in _distributions().get(module.partition(".")[0], ()):
             versions[distribution] = importlib.metadata.version(distribution)
-    if split_name(robot) is not None:
+    if robot and is_foreign(ROBOTS.target(robot)):
         allow_models(modules)
         urdf = load_robot(robot, modules).urdf
         if ":" in urdf:

@@ -69,6 +69,10 @@ class Registry[T]:
         """Every name, in the order of the table."""
         return tuple(self.rows)
 
+    def target(self, name: str) -> str:
+        """Return "module:attribute" of a name, which is the name itself for a thing of the user's own."""
+        return self.rows.get(name, name)
+
     def check_name(self, name: str, allowed: Iterable[str] = ()) -> None:
         """Raise ConfigError with the nearest match unless `name` may be loaded; imports nothing.
 
@@ -137,6 +141,11 @@ def modules_of(names: Iterable[str]) -> tuple[str, ...]:
     """The modules that those of the names which are "package.module:Thing" lie in, each once."""
     found = (split_name(name) for name in names)
     return tuple(dict.fromkeys(parts[0] for parts in found if parts is not None))
+
+
+def is_foreign(module: str) -> bool:
+    """Whether a module belongs to another package than demorec."""
+    return module.partition(".")[0] != "demorec"
 
 
 def is_allowed(module: str, allowed: Iterable[str]) -> bool:

@@ -7,7 +7,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from demorec.core.extensions import ExtensionRows
-from demorec.core.registry import Registry, modules_of, split_name
+from demorec.core.registry import Registry, is_foreign, modules_of, split_name
 from demorec.robots.assets import model_name
 
 if TYPE_CHECKING:
@@ -43,8 +43,8 @@ def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:
         ConfigError: As `Registry.load`, or the model lies where a recording cannot name it.
     """
     robot = ROBOTS.load(name, allowed)
-    module, *_ = modules_of([name]) or ("",)
-    return replace(robot, urdf=model_name(robot.urdf, module)) if module else robot
+    module, *_ = modules_of([ROBOTS.target(name)])
+    return replace(robot, urdf=model_name(robot.urdf, module)) if is_foreign(module) else robot
 
 
 def environment_name(task: str) -> str:

@@ -12,7 +12,7 @@ from demorec.core.config import EpisodePlan, GenerateConfig, cpu_type, deciding_
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.plain import digest, to_plain
-from demorec.core.registry import modules_of
+from demorec.core.registry import is_foreign, modules_of
 from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
 from demorec.episode.camera_error import error_values, true_cameras
@@ -154,7 +154,7 @@ def _layout(plan: EpisodePlan, robot: RobotSpec, ranges: Ranges, task: Task, beh
             raise ConfigError(
                 f"sample_scene of the task {config.task!r} returned {type(scene).__name__}; return a Scene at its end."
             )
-        for module in modules_of([config.task]):
+        for module in filter(is_foreign, modules_of([TASKS.target(config.task)])):
             scene = _with_model_names(scene, module)
         scene = replace(scene, physics=replace(scene.physics, hz=config.physics_hz))
         scene = vary_physics(scene, ranges, _rng(plan, "physics"), distractors=not task.draws_distractors)

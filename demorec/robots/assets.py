@@ -16,6 +16,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
+from demorec.core.extensions import extension_packages
 from demorec.core.files import cache_folder, write_whole
 from demorec.core.registry import import_root, is_allowed, is_module_name, module_file
 from demorec.episode.mesh import decode_mesh
@@ -57,7 +58,7 @@ def asset_path(name: str) -> Path:
     """
     module, _, relative = name.rpartition(":")
     if modules_of_models([name]):
-        if not is_allowed(module, _modules_with_models):
+        if not is_allowed(module, _modules_with_models | extension_packages()):
             raise NotAllowedError(
                 f"The model {name!r} lies beside a module from outside of demorec: if you trust that module, add "
                 f"--allow {module}."

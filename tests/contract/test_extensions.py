@@ -1,0 +1,167 @@
+"""Extensions: every command uses those of other packages, a broken one harms nothing, each folder can be deleted."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from demorec.core.extensions import extensions
+from demorec.mcap import open_recording
+
+PACKAGE = Path(__file__).parents[1] / "support" / "lab_extension"
+SOURCE = Path(__file__).parents[2] / "demorec"
+IMPORT = "from demorec.core.extension import Extension"
+BROKEN = {
+    "raises": ("raise RuntimeError('no licence')", "RuntimeError: no licence"),
+    "missing": ("OTHER = 1", "AttributeError"),
+    "other kind": ("EXTENSION = 1", "is not a demorec.core.extension.Extension"),
+    "clash": (
+        f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', tasks={{'stack': 'broken_extension:Stack'}})",
+        "core has tasks of the same name: stack",
+    ),
+    "needs": (
+        f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', needs=('y',))",
+        "it needs y",
+    ),
+}
+OWN = [extension.name for extension in extensions().found if extension.name != "core"]
+
+
+def install(site: Path, module: str) -> None:
+    """Write what pip writes beside a package that has an entry point."""
+    info = site / f"{module}-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
+    (info / "top_level.txt").write_text(f"{module}\n")
+    (info / "entry_points.txt").write_text(f"[demorec.extensions]\n{module} = {module}:EXTENSION\n")
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    site = tmp_path_factory.mktemp("site")
+    shutil.copytree(PACKAGE, site / PACKAGE.name, ignore=shutil.ignore_patterns("__pycache__"))
+    install(site, PACKAGE.name)
+    return site
+
+
+def demorec(path: Path, *words: object, code: int = 0, program: str = "main") -> str:
+    """Run a command with a folder in front of the path of modules; return what it printed."""
+    start = f"import sys; from demorec.cli import {program} as main; main(sys.argv[1:])"
+    paths = [str(path), str(SOURCE.parent)]
+    done = subprocess.run(
+        [sys.executable, "-c", start, *map(str, words)],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(paths), "COLUMNS": "100"},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+        cwd=path,
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    return done.stdout + done.stderr
+
+
+@pytest.fixture(scope="module")
+def run(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of the package's task, robot and camera."""
+    out = tmp_path_factory.mktemp("made") / "run"
+    words = ["--task", "lab_pick", "--robot", "lab_panda", "--cameras", "corner", "--width", 64, "--height", 64]
+    told = demorec(
+        site, *words, "--num-episodes", 1, "--workers", 1, "--no-export", "--out", out, program="generate_dataset_main"
+    )
+    assert "none failed" in told
+    assert "1 episode made again and compared" in told
+    return out
+
+
+def test_lists_and_help_show_what_a_package_brings(site: Path) -> None:
+    for table, name in (
+        ("tasks", "lab_pick"),
+        ("robots", "lab_panda"),
+        ("cameras", "corner"),
+        ("exporters", "labcsv"),
+        ("checks", "late_start"),
+        ("extensions", "lab"),
+    ):
+        rows = json.loads(demorec(site, "list", table, "--json"))
+        assert name in [row["name"] for row in rows], table
+    assert "count-frames" in demorec(site, "--help")
+    assert "labcsv (CSV" in demorec(site, "import", "--help")
+    assert "A policy learns to wait." in demorec(site, "explain", "late_start")
+
+
+def test_a_package_brings_a_task_a_robot_a_camera_and_a_command(site: Path, run: Path) -> None:
+    (path,) = (run / "episodes").iterdir()
+    with open_recording(path) as recording:
+        info, num_frames = recording.info, recording.num_frames
+    assert (info.instruction, info.simulated.robot.name) == ("tidy up our table", "lab_panda")
+    assert [camera.name for camera in info.cameras] == ["corner"]
+    assert info.versions["lab_extension"] == "1.0"
+    assert "source of lab_extension.scenes" in info.versions
+    assert demorec(site, "count-frames", path) == f"{num_frames} frames\n"
+
+
+def test_a_package_brings_a_format_and_a_check(site: Path, run: Path, tmp_path: Path) -> None:
+    table, again = tmp_path / "cup.labcsv", tmp_path / "again"
+    demorec(site, "export", "labcsv", run, "--out", table, "--digits", 12)
+    (path,) = (run / "episodes").iterdir()
+    rows = np.array(list(csv.reader(table.open()))[1:], dtype=float)
+    with open_recording(path) as recording:
+        np.testing.assert_allclose(rows[:, 1:], recording.table().features["observation.state"], atol=1e-11)
+    demorec(site, "import", "labcsv", table, "--out", again)
+    assert str(len(rows)) in demorec(site, "info", table).split()
+    rows[:5, 1:] = rows[0, 1:]
+    late = tmp_path / "late.labcsv"
+    late.write_text("time_s,q\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")
+    for file, is_late in ((table, False), (late, True)):
+        diagnosis = json.loads(demorec(site, "check", file, "--only", "late_start", "--json").partition("\n\n")[0])
+        assert [finding["check"] for finding in diagnosis["findings"]] == ["late_start"] * is_late
+
+
+@pytest.mark.parametrize("fault", BROKEN)
+def test_a_broken_extension_is_named_and_harms_nothing(fault: str, site: Path, tmp_path: Path) -> None:
+    shutil.copytree(site, tmp_path / "site")
+    content, words = BROKEN[fault]
+    (tmp_path / "site" / "broken_extension.py").write_text(content + "\n")
+    install(tmp_path / "site", "broken_extension")
+    told = demorec(tmp_path / "site", "list", "tasks")
+    assert words in told
+    assert "left out" in told
+    assert "lab_pick" in told
+    assert "stack_three" in told
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", OWN)
+def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
+    """Without it, and what needs it, the rest is imported and works, and no list or help mentions it."""
+    shutil.copytree(SOURCE, tmp_path / "demorec", ignore=shutil.ignore_patterns("__pycache__"))
+    gone = [name, *(each.name for each in extensions().found if name in each.needs)]
+    gone += [each.name for each in extensions().found if set(each.needs) & set(gone) and each.name not in gone]
+    for folder in gone:
+        shutil.rmtree(tmp_path / "demorec" / "extensions" / folder)
+    code = (
+        "import importlib, pkgutil, demorec\n"
+        "for module in pkgutil.walk_packages(demorec.__path__, 'demorec.'):\n"
+        "    importlib.import_module(module.name)\n"
+        "print(demorec.__file__)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.stdout.startswith(str(tmp_path)), done.stderr
+    lists = demorec(tmp_path, "list", "extensions").split()
+    assert not set(gone) & set(lists)
+    commands = [row for each in extensions().found if each.name in gone for row in each.commands]
+    told = demorec(tmp_path, "--help")
+    assert not [command for command in commands if f"  {command} " in told]
+    out = tmp_path / "run"
+    words = ["--num-episodes", 1, "--cameras", "none", "--workers", 1, "--no-export", "--out", out]
+    assert "none failed" in demorec(tmp_path, *words, program="generate_dataset_main")
+    assert "pick_place" in demorec(tmp_path, "info", out)

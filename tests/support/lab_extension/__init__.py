@@ -1,0 +1,25 @@
+"""A package of somebody else that brings one of everything to demorec."""
+
+from demorec.core.extension import CommandRow, Extension, ReaderRow
+
+EXTENSION = Extension(
+    name="lab",
+    summary="what our lab uses",
+    needs=("doctor",),
+    commands={"count-frames": CommandRow(target="lab_extension.commands:CountFrames", group="look", limits="reading")},
+    readers={
+        "labcsv": ReaderRow(
+            target="lab_extension.csv_files:READER",
+            name="a CSV file of our lab",
+            plural="CSV files of our lab",
+            advice="make a run of it (demorec import labcsv)",
+            word="labcsv",
+            suffixes=(".labcsv",),
+        )
+    },
+    exporters={"labcsv": "lab_extension.csv_files:EXPORTER"},
+    tasks={"lab_pick": "lab_extension.scenes:LabPick"},
+    robots={"lab_panda": "lab_extension.scenes:LAB_PANDA"},
+    cameras={"corner": "lab_extension.scenes:CORNER"},
+    checks={"late_start": "lab_extension.checks:late_start"},
+)
