@@ -36,16 +36,21 @@ def estimate(config: GenerateConfig, options: RunOptions) -> tuple[list[Made], l
     """
     workers = options.workers or available_cores()
     with tempfile.TemporaryDirectory(prefix="demorec-pilot-") as temporary:
-        folder = Path(temporary)
-        for name in (EPISODES, FAILED, UNFINISHED):
-            (folder / name).mkdir()
+        folder = _new_run(Path(temporary) / "with_images")
         measured = _make(folder, config, _MEASURED, workers=1)
         recordings = [folder / report.attempt.file for report in measured if report.attempt.file]
         dataset_bytes = _added_to_dataset(recordings, folder) if options.export else 0
-        # Last, since these have the names of the measured ones, and no images.
         count = min(_TRIED, options.num_episodes)
+        folder = _new_run(Path(temporary) / "without_images")
         tried = _make(folder, replace(config, cameras=()), count, workers=min(workers, available_cores()))
     return measured, tried, dataset_bytes
+
+
+def _new_run(folder: Path) -> Path:
+    """Create the folders of a run; returns the run."""
+    for name in (EPISODES, FAILED, UNFINISHED):
+        (folder / name).mkdir(parents=True)
+    return folder
 
 
 def _make(folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:

@@ -55,3 +55,10 @@ def test_the_size_is_about_that_of_the_run(
     told = len(LENGTHS) * (measured[-1].attempt.num_bytes + dataset_bytes)
     assert told == pytest.approx(size, rel=0.15)
     assert bool(dataset_bytes) == exports
+
+
+def test_pilots_with_and_without_images_stay_apart(tmp_path: Path) -> None:
+    config = GenerateConfig(cameras=("front",), width=32, height=32)
+    options = RunOptions(out=tmp_path / "new", num_episodes=2, export=False, workers=1)
+    measured, tried, _ = estimating.estimate(config, options)
+    assert measured[-1].attempt.num_bytes > max(pilot.attempt.num_bytes for pilot in tried)
