@@ -15,7 +15,7 @@ STAMP := .venv/.stamp-$(PYBULLET)
 # Containers often set this; every process would then compile LeRobot's and PyTorch's modules again, for 10 s each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo sample test test-slow test-long setup lint constraints clean
+.PHONY: demo sample test test-slow test-long setup lint docs constraints clean
 
 demo: $(STAMP)
 	@echo "Generating five episodes into $(DEMO)"
@@ -46,6 +46,10 @@ lint: $(STAMP)
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# The pages that are made from the code.
+docs: $(STAMP)
+	$(BIN)/python tools/api_page.py > docs/api.md
 
 setup: $(STAMP)
 

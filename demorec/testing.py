@@ -1,6 +1,6 @@
 """Contracts of every task and every robot, as pytest tests. Custom ones run them in three lines:
 
-from demorec.testing import RobotContract, TaskContract
+from demorec.api import RobotContract, TaskContract
 
 class TestMyTask(TaskContract):
     task = "my_package.my_module:MyTask"

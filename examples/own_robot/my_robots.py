@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 
-from demorec.render.cameras import CameraPreset
-from demorec.robots.robot import ParallelGripper, RobotSpec
+from demorec.api import CameraPreset, ParallelGripper, RobotSpec
 
 TURN = 2 * math.pi
 

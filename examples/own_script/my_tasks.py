@@ -11,18 +11,30 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.episode.episode import SuccessCheck
-from demorec.episode.scene import Scene
-from demorec.robots.robot import RobotSpec
-from demorec.sim.world import World
-from demorec.tasks.base import Task
-from demorec.tasks.furniture import mark, robot_at_origin, table_and_floor
-from demorec.tasks.grasping import hand_down, hand_yaw, raised, symmetric_yaws
-from demorec.tasks.placing import on_table, random_cube
-from demorec.tasks.sampling import Region, Sampler, wording
-from demorec.tasks.script import ExpertFailure, Step, steady_width
-from demorec.tasks.skills import Expert
-from demorec.tasks.success import placement_checks
+from demorec.api import (
+    Expert,
+    ExpertFailure,
+    Region,
+    RobotSpec,
+    Sampler,
+    Scene,
+    Step,
+    SuccessCheck,
+    Task,
+    World,
+    hand_down,
+    hand_yaw,
+    mark,
+    on_table,
+    placement_checks,
+    raised,
+    random_cube,
+    robot_at_origin,
+    steady_width,
+    symmetric_yaws,
+    table_and_floor,
+    wording,
+)
 
 STARTS = Region(x=(0.40, 0.48), y=(-0.12, 0.12))
 """Where the cube may start: metres in front of the robot's base and to its left."""

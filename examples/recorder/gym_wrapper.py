@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 
 from demorec import Recorder
-from demorec.mcap.recorder import RecordedEpisode
+from demorec.api import RecordedEpisode
 
 
 class RecordEpisodes(gymnasium.Wrapper):  # type: ignore[misc]

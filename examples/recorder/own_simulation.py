@@ -16,7 +16,7 @@ import pybullet_data
 from numpy.typing import NDArray
 
 from demorec import Recorder
-from demorec.episode.info import Camera
+from demorec.api import Camera
 
 URDF = Path(pybullet_data.getDataPath()) / "kuka_iiwa" / "model.urdf"
 FPS, PHYSICS_HZ = 30, 240

@@ -17,8 +17,7 @@ from lerobot.envs.configs import EnvConfig
 from lerobot.envs.utils import freeze_after_episode_end
 from lerobot.utils.constants import ACTION, OBS_IMAGES
 
-from demorec.episode import features
-from demorec.extensions.policies.gym_env import DemorecEnv, env_id
+from demorec.api import ENVIRONMENT_STATE, DemorecEnv, env_id
 
 __all__ = ["DemorecEnvConfig"]
 
@@ -63,7 +62,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
                 for camera, pixels in space.spaces.items():
                     self._add(f"pixels/{camera}", f"{OBS_IMAGES}.{camera}", FeatureType.VISUAL, pixels.shape)
         for name, key in env.keys.items():
-            kind = FeatureType.ENV if name == features.ENVIRONMENT_STATE else FeatureType.STATE
+            kind = FeatureType.ENV if name == ENVIRONMENT_STATE else FeatureType.STATE
             self._add(key, name, kind, env.observation_space[key].shape)
         self._add(ACTION, ACTION, FeatureType.ACTION, env.action_space.shape)
 

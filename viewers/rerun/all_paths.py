@@ -11,9 +11,7 @@ from pathlib import Path
 import rerun as rr
 import rerun.blueprint as rrb
 
-from demorec.core.errors import DemorecError
-from demorec.datasets.sources import find_recordings
-from demorec.mcap import Recording
+from demorec.api import DemorecError, Recording, find_recordings
 
 GREEN, RED = (80, 220, 120), (240, 80, 80)
 

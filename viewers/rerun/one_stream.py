@@ -11,9 +11,7 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from demorec.core.errors import DemorecError
-from demorec.datasets.sources import find_recordings
-from demorec.mcap import Recording
+from demorec.api import DemorecError, Recording, find_recordings
 
 
 def main(source: Path, target: Path) -> None:

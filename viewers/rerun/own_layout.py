@@ -10,10 +10,7 @@ from pathlib import Path
 
 import rerun.blueprint as rrb
 
-from demorec.core.errors import DemorecError
-from demorec.view.paths import Paths
-from demorec.view.scene import log_episode, new_recording
-from demorec.view.sources import find_episodes
+from demorec.api import DemorecError, Paths, find_episodes, log_episode, new_recording
 
 
 def main(source: Path, target: Path, camera: str) -> None:

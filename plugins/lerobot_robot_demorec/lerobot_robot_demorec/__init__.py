@@ -19,16 +19,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 from lerobot.robots import Robot
+from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError
-from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Outcome
-from demorec.episode.features import state_names
-from demorec.extensions.policies.gym_env import DemorecEnv
-from demorec.mcap import EpisodeWriter
-from demorec.robots.motors import Motors
-from demorec.robots.robot import RobotSpec
-from demorec.robots.so101 import SO101_FOLLOWER
+from demorec.api import (
+    SO101_FOLLOWER,
+    ConfigError,
+    DemorecEnv,
+    EpisodeWriter,
+    Motors,
+    Outcome,
+    Pose,
+    RobotSpec,
+    state_names,
+)
 from lerobot_robot_demorec.config import DemorecPandaConfig, DemorecSO101Config, SimulatedArmConfig
 
 __all__ = ["DemorecPanda", "DemorecPandaConfig", "DemorecSO101", "DemorecSO101Config"]
@@ -91,12 +94,12 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         """Of the elements of state and action."""
         return state_names(self.spec, "joint")
 
-    def state_values(self, joint_position: Array) -> Array:
+    def state_values(self, joint_position: NDArray[np.float64]) -> NDArray[np.float64]:
         """(D,) values of (n_joints,) positions, rad and m."""
         arm = len(self.spec.arm_joints)
         return np.append(joint_position[:arm], self.spec.gripper.width(joint_position[arm:]))
 
-    def joint_targets(self, values: Array) -> Array:
+    def joint_targets(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(n_arm + 1,) joint targets, rad, and opening, m, of (D,) values."""
         return values
 
@@ -195,7 +198,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
     def _state(self) -> dict[str, float]:
         return self._named(self.state_values(self._env.situation.observation.joint_position))
 
-    def _named(self, values: Array) -> dict[str, float]:
+    def _named(self, values: NDArray[np.float64]) -> dict[str, float]:
         return dict(zip(self.names, values.tolist(), strict=True))
 
     def _record(self) -> None:
@@ -227,11 +230,11 @@ class DemorecSO101(SimulatedArm):
         """As of the real arm."""
         return self.motors.names
 
-    def state_values(self, joint_position: Array) -> Array:
+    def state_values(self, joint_position: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6,) values of (6,) positions, rad."""
         return np.asarray(self.motors.values(joint_position[np.newaxis])[0])
 
-    def joint_targets(self, values: Array) -> Array:
+    def joint_targets(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
         """(6,) joint targets, rad, and opening, m, of (6,) values."""
         factor, offset = np.array(self.motors.to_positions).T
         position = values * factor + offset

@@ -1,6 +1,6 @@
 """A package of somebody else that brings one of everything to demorec."""
 
-from demorec.core.extension import CommandRow, Extension, ReaderRow
+from demorec.api import CommandRow, Extension, ReaderRow
 
 EXTENSION = Extension(
     name="lab",

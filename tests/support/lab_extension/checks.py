@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from demorec.extensions.doctor.base import Fault, check
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.api import Evidence, Fault, check
 
 
 @check(

@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.cli.shared.flags import Positional
-from demorec.cli.shared.output import say
+from demorec.api import Positional, say
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,7 +21,7 @@ class CountFrames:
 
     def run(self) -> int:
         """Count and print."""
-        from demorec.mcap import open_recording
+        from demorec.api import open_recording
 
         with open_recording(self.path) as recording:
             say(f"{recording.num_frames} frames")

@@ -11,12 +11,17 @@ from typing import Any
 import numpy as np
 
 from demorec import Recorder
-from demorec.core.atomic import atomic_write
-from demorec.core.replacing import ReplaceableKind
-from demorec.datasets.options import CommonOptions, Exporter, ExportReport, ProgressCallback
-from demorec.datasets.sources import find_recordings
-from demorec.mcap import open_recording
-from demorec.runs.foreign import SourceFormat
+from demorec.api import (
+    CommonOptions,
+    Exporter,
+    ExportReport,
+    ProgressCallback,
+    ReplaceableKind,
+    SourceFormat,
+    atomic_write,
+    find_recordings,
+    open_recording,
+)
 
 HEAD = "time_s"
 KIND = ReplaceableKind(name="a CSV file of our lab", recognises=lambda path: path.read_text().startswith(HEAD))

@@ -6,10 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from demorec.episode.scene import Scene
-from demorec.render.cameras import CameraPreset
-from demorec.robots.panda import PANDA
-from demorec.tasks.pick import PickPlace
+from demorec.api import PANDA, CameraPreset, PickPlace, Scene
 
 LAB_PANDA = replace(PANDA, name="lab_panda")
 CORNER = CameraPreset(summary="from the corner of our table", eye=(1.2, 0.6, 0.8), target=(0.45, 0.0, 0.1))
