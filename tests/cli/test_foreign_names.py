@@ -95,6 +95,7 @@ COMMANDS = {
 """Every command that reads what others may have made."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["recording", "run", "dataset"])
 def test_no_command_imports_what_a_file_names(
     kind: str, tmp_path: Path, marker: Path, capsys: pytest.CaptureFixture[str]
@@ -123,6 +124,7 @@ def test_no_command_imports_what_a_file_names(
     assert refused == expected[kind]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "words",
     [["check", "--no-images", "--deep"], ["replay"]],

@@ -126,6 +126,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", [NAME, "version.mcap", "names.mcap", "keys.mcap"])
 def test_recordings(hostile: Path, name: str, tmp_path: Path) -> None:
     path = hostile / name
@@ -143,6 +144,7 @@ def test_that_the_fields_are_printed_at_all(hostile: Path) -> None:
     assert "\\x1b[31mred\\u202e.mcap" in text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["run", "dataset", "damaged"])
 def test_runs_and_datasets(hostile: Path, name: str, tmp_path: Path) -> None:
     path = hostile / name

@@ -30,6 +30,7 @@ def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int, layout: La
     return row
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LAYOUTS))
 def test_a_suggestion_is_right_unedited(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     layout = LAYOUTS[name]

@@ -40,6 +40,7 @@ def dataset(folder: Path) -> Path:
     return folder / "exported" / "dataset"
 
 
+@pytest.mark.slow
 def test_info_of_a_recording(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("info", folder / "a.mcap") == 0
     text = capsys.readouterr().out

@@ -27,6 +27,7 @@ def recordings(out: Path) -> dict[str, int]:
     return {path.name: path.stat().st_mtime_ns for path in sorted((out / "episodes").glob("*.mcap"))}
 
 
+@pytest.mark.slow
 def test_the_same_command_keeps_what_is_drawn(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -69,6 +69,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate(tmp_path_factory.mktemp("source") / "episode_000000.mcap", cameras=("front",), width=64, height=48)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sensors", [(), (SLIP,), (SLIP, FT)], ids=["none", "unknown", "two unknown"])
 def test_every_command_goes_by_the_sensors_that_a_recording_lists(
     source: Path, sensors: tuple[Feature, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -49,6 +49,7 @@ def make(checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
     return subprocess.run(command, cwd=checkout, env=environment, capture_output=True, text=True, check=False)
 
 
+@pytest.mark.slow
 def test_without_a_compiler_a_fork_takes_pybullets_place(checkout: Path) -> None:
     done = make(checkout, "setup")
     assert done.returncode == 0, done.stderr
@@ -75,6 +76,7 @@ def test_a_compiler_is_asked_for_where_pybullet_shall_be_compiled(checkout: Path
     assert not (checkout / "asked").exists()
 
 
+@pytest.mark.slow
 def test_the_official_package_is_the_default_and_another_choice_sets_up_again(checkout: Path) -> None:
     (checkout / "programs" / "c++").symlink_to("bash")
     for choice, last in ((), "pybullet-arm64"), (("PYBULLET=wheel",), "pybullet"), ((), None):

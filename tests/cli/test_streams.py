@@ -29,6 +29,7 @@ CLOSED = {"<&- >&-": ("out",), "2>&-": ("err",), "<&- >&- 2>&-": ("out", "err")}
 """Redirections -> what cannot be heard then."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("words", "code"), [(f"info {SAMPLE}", 0), ("info nowhere", 2)], ids=["done", "refused"])
 def test_closed_streams_change_nothing_else(words: str, code: int) -> None:
     heard = shell(words, "")
@@ -41,6 +42,7 @@ def test_closed_streams_change_nothing_else(words: str, code: int) -> None:
         assert shell(words, redirections) == Ended(code, out, err), redirections
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", ["--help", "--version", "list --help", "list tasks", f"info {SAMPLE}"])
 def test_a_reader_that_has_left_is_exit_code_1_without_a_word(words: str) -> None:
     assert shell(words, "| true") == Ended(1, "", "")

@@ -100,6 +100,7 @@ def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path, flags: tuple[st
     assert num_colors(pixels((tmp_path / "x.png").read_bytes())) > 200
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
@@ -161,6 +162,7 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
     np.testing.assert_allclose(shown[height // 2, width // 8 :: width // 4][:4], colours, atol=4)
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_a_screenshot_of_an_episode(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()

@@ -31,6 +31,7 @@ def parts_of(frames: list[dict[str, Any]], *edges: int) -> list[list[dict[str, A
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("video", [True, False])
 def test_parts_at_given_frames(video: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = write_with_lerobot(tmp_path / "d", video=video, episodes=3)

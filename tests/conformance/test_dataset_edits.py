@@ -121,6 +121,7 @@ def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None
         statistics_are_exact(out)
 
 
+@pytest.mark.slow
 def test_in_another_order_and_in_parts(dataset: Path, tmp_path: Path) -> None:
     before = items(dataset)
     assert edit("reorder", dataset, "--order", "5,0,3,1,4,2", "--out", tmp_path / "r") == 0
@@ -183,6 +184,7 @@ def test_idle_ends_are_cut_off(small: Path, tmp_path: Path, capsys: pytest.Captu
     assert [len(episode) for episode in items(tmp_path / "t")] == [8 + number for number in range(5)]
 
 
+@pytest.mark.slow
 def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
     before = items(small)
     assert edit("rename", small, f"{TOP}=observation.images.front", "action=act", "--out", tmp_path / "a") == 0
@@ -197,6 +199,7 @@ def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
     assert [str(episode[0]["task"]) for episode in found[:3]] == ["put it there", "push", "put it there"]
 
 
+@pytest.mark.slow
 def test_all_differences_are_named_and_a_mapping_solves_them(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -57,6 +57,7 @@ def failing(root: Path) -> set[str]:
     return {result.check for result in results if result.level == "fail" and result.check.startswith("dataset")}
 
 
+@pytest.mark.slow
 def test_attempts_boxes_and_poses_follow_their_episodes(
     simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

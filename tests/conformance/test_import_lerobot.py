@@ -130,6 +130,7 @@ def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
     return codes
 
 
+@pytest.mark.slow
 def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
     """LeRobot says what its codes stand for, and writes the same ones when they come back."""
     from lerobot.datasets.depth_utils import dequantize_depth

@@ -54,6 +54,7 @@ def write_bag(path: Path, seconds: float, *, rate: float) -> Path:
     return bags.write_mcap(bags.in_order(notes), path)
 
 
+@pytest.mark.slow
 def test_what_is_kept_of_messages(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(MAPPING)
     mapping = read_mapping(tmp_path / "robot.toml")

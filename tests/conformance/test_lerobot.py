@@ -145,6 +145,7 @@ def test_statistics_of_each_episode_are_of_that_episode(dataset: Path) -> None:
         assert np.allclose(row["stats/action/q90"], np.quantile(values, 0.9, axis=0), rtol=1e-12)
 
 
+@pytest.mark.slow
 def test_depth_is_read_as_metres(tmp_path: Path) -> None:
     run = make_run(tmp_path / "run", (6, 5), depth=True)
     export(run, tmp_path / "d", depth=True)

@@ -61,6 +61,7 @@ def test_a_key_that_is_held_moves_the_hand(key: str, axis: int, sign: int, teleo
     teleoperator.disconnect()
 
 
+@pytest.mark.slow
 def test_increments_move_the_hand_along_the_base(tmp_path: Path) -> None:
     """As of LeRobot's gamepad: x forward, y to the left, z up; the hand keeps its direction, and stays in reach."""
     robot = DemorecPanda(DemorecPandaConfig(calibration_dir=tmp_path, cameras=[]))

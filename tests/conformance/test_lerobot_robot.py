@@ -44,6 +44,7 @@ def actions(dataset: Path) -> Array:
     return np.array(data_table(dataset)["action"].to_pylist())
 
 
+@pytest.mark.slow
 def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
     run: Path, dataset: Path, tmp_path: Path
 ) -> None:

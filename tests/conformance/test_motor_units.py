@@ -250,6 +250,7 @@ def test_a_recording_cut_off_by_a_crash_stays_out(run: Path, tmp_path: Path) -> 
     assert (report.num_episodes, report.skipped_failures, report.skipped_unknown) == (1, 0, 1)
 
 
+@pytest.mark.slow
 def test_recordings_that_differ_are_told_apart_by_what_differs(run: Path, tmp_path: Path) -> None:
     (path,) = (run / "episodes").glob("*.mcap")
     other = simulate(tmp_path / "other.mcap", robot="so101", seed=11, cameras=("wrist",))

@@ -160,6 +160,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
 """Fault, with a public report of it -> what makes it, and words of the sentence about it."""
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("fault", DAMAGES)
 def test_lerobot_gives_every_frame_of_what_was_repaired(
     fault: str, whole: Path, frames: list[list[dict[str, Any]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -226,6 +227,7 @@ def test_episodes_in_files_that_cannot_be_read_are_left_out_and_named(
     assert "Nothing to repair" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_an_old_dataset_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     root = write_v21(tmp_path / "d")
     assert repair(root, "--dry-run") == 0
@@ -237,6 +239,7 @@ def test_an_old_dataset_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert all(same(a, b) for a, b in zip(found, expected, strict=True))
 
 
+@pytest.mark.slow
 def test_wrong_paths_a_camera_without_videos_and_counters_as_floats(tmp_path: Path) -> None:
     """As GR00T's demo data (paths, camera) and fixtures of lerobot-studio (counters) have them."""
     roots = [write_v21(tmp_path / name) for name in ("whole", "d")]

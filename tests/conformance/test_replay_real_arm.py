@@ -74,6 +74,7 @@ def test_what_the_simulator_did_itself_is_tracked(dataset: Path, capsys: pytest.
     assert one == found[1]
 
 
+@pytest.mark.slow
 def test_an_imported_recording_says_its_units_itself(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -84,6 +85,7 @@ def test_an_imported_recording_says_its_units_itself(
     assert "recordings say their units" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_an_offset_and_a_lag_show_in_their_joints(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -127,6 +129,7 @@ def test_what_does_not_fit_is_refused_in_one_sentence(
     assert said in " ".join(capsys.readouterr().err.split())
 
 
+@pytest.mark.slow
 def test_other_robots_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     panda = simulate(tmp_path / "panda.mcap", seed=11)
     assert exit_code("replay", "--robot", "so101", panda) == 2

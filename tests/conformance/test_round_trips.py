@@ -117,6 +117,7 @@ def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pyte
             np.testing.assert_array_equal(a[name][()], b[name][()], err_msg=name)
 
 
+@pytest.mark.slow
 def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Colours and distances of two cameras, subtasks and outcome come back; scene, boxes and the rest are named."""
     made = make_run(tmp_path / "run", (4, 6), depth=True, segmentation=True)

@@ -18,6 +18,7 @@ pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 CONFIGS = sorted((ROOT / "examples").glob("*.json"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: str(path.stem))
 def test_lerobots_parser_takes_the_configs(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import draccus

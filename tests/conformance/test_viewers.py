@@ -36,6 +36,7 @@ def test_every_program_is_listed_here() -> None:
     assert {file.name for file in (VIEWERS / "rerun").glob("*.py")} == set(PROGRAMS)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_programs_run_and_are_short(name: str, run_folder: Path, tmp_path: Path) -> None:
     source, entity = PROGRAMS[name]
@@ -47,6 +48,7 @@ def test_programs_run_and_are_short(name: str, run_folder: Path, tmp_path: Path)
     assert entity in {chunk.entity_path for chunk in RrdReader(target).stream()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
 def test_programs_say_what_is_missing(name: str, tmp_path: Path) -> None:
     program = [sys.executable, str(VIEWERS / "rerun" / name)]

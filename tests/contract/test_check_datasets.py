@@ -186,6 +186,7 @@ def test_the_good_one_passes(is_ours: bool, dataset: Path) -> None:
     assert ("dataset_sidecar" in skipped) != is_ours
 
 
+@pytest.mark.slow
 def test_a_nan_spoils_its_rows_and_not_the_other_checks(dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
     value_of(STATE, 20, float("nan"))(dataset)

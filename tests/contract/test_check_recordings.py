@@ -49,11 +49,13 @@ def test_the_good_ones_pass(good: Path, filmed: Path) -> None:
     assert {result.level for result in checked(filmed, only=FILE_CHECKS.names()).results} == {"pass"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", QUICK_TASKS)
 def test_every_task_passes(task: str, tmp_path: Path) -> None:
     assert findings(simulate(tmp_path / "e.mcap", task=task, seed=22)) == []
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("robot", ROBOTS.names())
 @pytest.mark.parametrize("variation", ["none", "full"])
 def test_every_robot_and_variation_passes(robot: str, variation: str, tmp_path: Path) -> None:
@@ -76,6 +78,7 @@ def test_images_of_every_kind_pass(config: dict[str, Any], tmp_path: Path) -> No
     assert findings(simulate(tmp_path / "e.mcap", seed=24, cameras=("front", "wrist"), **config)) == []
 
 
+@pytest.mark.slow
 def test_an_attempt_of_one_frame_passes(tmp_path: Path) -> None:
     config: dict[str, Any] = {"task": "support.odd_tasks:FarAway", "fps": 10, "cameras": ("front",)}
     assert findings(simulate(tmp_path / "e.mcap", **config)) == []
@@ -239,6 +242,7 @@ def test_a_recovered_recording_is_a_warning(share: float, good: Path, tmp_path: 
 # ------------------------------------------------------------------------------------------------- images
 
 
+@pytest.mark.slow
 def test_a_frozen_camera(filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     front = [images["front"].color for images in spoilt.images]
@@ -246,6 +250,7 @@ def test_a_frozen_camera(filmed: Path, tmp_path: Path) -> None:
     assert findings(spoilt.write(tmp_path / "spoilt.mcap")) == [("frozen_images", "fail")]
 
 
+@pytest.mark.slow
 def test_a_black_camera(filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     spoilt.image("front", lambda t, p: p * 0)
@@ -270,6 +275,7 @@ def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
     assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "fail"
 
 
+@pytest.mark.slow
 def test_a_depth_image_that_is_cut_off(tmp_path: Path) -> None:
     path = simulate(tmp_path / "good.mcap", fps=10, cameras=("front",), width=32, height=32, depth=True)
     topic = channels.camera_topic("front", "depth")

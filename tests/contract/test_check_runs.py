@@ -79,6 +79,7 @@ def places_in(plain: Any, above: tuple[str | int, ...] = ()) -> Iterator[tuple[s
         yield from places_in(value, (*above, key))
 
 
+@pytest.mark.slow
 def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
     """One value after the other becomes null."""
     path = run / "run.json"
@@ -174,6 +175,7 @@ def test_a_dataset_that_differs_from_its_recordings(name: str, run: Path) -> Non
     assert level_of(run, "run_dataset", "run") == "fail"
 
 
+@pytest.mark.slow
 def test_a_dataset_of_another_run(good: Path, tmp_path: Path) -> None:
     other = simulate_run(tmp_path / "other", 2, seed=4, fps=10, cameras=("front",))
     copy(good / "dataset", other / "dataset")
@@ -183,6 +185,7 @@ def test_a_dataset_of_another_run(good: Path, tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------- several subjects
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("workers", [1, 2])
 def test_one_bad_recording_leaves_the_reports_of_the_others(workers: int, run: Path) -> None:
     bad = run / "episodes" / "episode_000000.mcap"

@@ -113,6 +113,7 @@ def _with_column(table: pa.Table, name: str, values: list[int]) -> pa.Table:
     return table.set_column(table.schema.get_field_index(name), name, pa.array(values, pa.int64()))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spoil", [without_table, wrong_files])
 @pytest.mark.parametrize("command", READERS)
 def test_what_the_table_lacks_is_found_by_the_rows(
@@ -193,6 +194,7 @@ def test_a_dataset_that_is_not_whole_is_refused(
     assert not written or (command in ("import", "split") and fault.startswith("rows exchanged"))
 
 
+@pytest.mark.slow
 def test_the_commands_succeed_on_the_whole_one(
     exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -115,6 +115,7 @@ def other(value: Any) -> Any:
     return value + 1
 
 
+@pytest.mark.slow
 def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     """One value of one message each, all in one file: every one is named with its frame, and nothing else is."""
     with Recording(filmed) as recording:
@@ -176,6 +177,7 @@ def test_one_bit_of_one_number(blind: Path, tmp_path: Path, simulators: Simulato
     assert "from frame 5 on (the EE pose)" in report.replay  # the commands and joint states are sound
 
 
+@pytest.mark.slow
 def test_a_topic_that_no_recording_has(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     spoilt = tmp_path / "spoilt.mcap"
     rewrite_messages(blind, spoilt, lambda m: (m, ("/mine", *m[1:])) if m[0] == "/wrench" else (m,))
@@ -241,6 +243,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     assert count > (300 if record == EPISODE else 20)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "line"),
     [
@@ -328,6 +331,7 @@ def test_images_that_differ_are_measured(filmed: Path, tmp_path: Path, simulator
 # ---------------------------------------------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 def test_the_command(blind: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     folder = tmp_path / "recordings"
     folder.mkdir()
@@ -382,6 +386,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     assert "made again" not in check_run(result, deep_every=0, progress=lambda done, total: None)[0]
 
 
+@pytest.mark.slow
 def test_a_recording_that_a_crash_cut_off_is_compared_as_far_as_it_goes(
     filmed: Path, tmp_path: Path, simulators: SimulatorCache
 ) -> None:

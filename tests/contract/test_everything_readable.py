@@ -336,6 +336,7 @@ def test_nothing_stays_where_reading_is_cut_off(
     assert not [path for path in scratch.iterdir() if path.is_dir()]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_a_signal_leaves_nothing_behind(number: int, tmp_path: Path) -> None:
     bag = bags.write_mcap(bags.in_order(bags.so101(12.0)), tmp_path / "bag.mcap")

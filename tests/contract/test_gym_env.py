@@ -49,6 +49,7 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
     return env
 
 
+@pytest.mark.slow
 def test_things_are_drawn_from_the_named_shelves_and_their_split() -> None:
     """The same as `generate-dataset` draws for these flags; by the flags of LeRobot's plug-in, too."""
     flags: dict[str, Any] = {"objects": ("blocks",), "object_split": "eval", "split": "all"}
@@ -101,6 +102,7 @@ def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_pa
     env.close()
 
 
+@pytest.mark.slow
 def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> None:
     """Every feature of `export --features`, row by row; the command is that of the step that leads to the next row."""
     path = simulate(tmp_path / "e.mcap", episode_index=3)
@@ -133,6 +135,7 @@ def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, Traje
         return recording.info, recording.trajectory()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ACTION_KINDS)
 def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Trajectory], kind: features.ActionKind) -> None:
     """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
@@ -155,6 +158,7 @@ def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Trajectory],
     env.close()
 
 
+@pytest.mark.slow
 def test_images_are_those_of_the_rollout() -> None:
     options: dict[str, Any] = {"cameras": ("front", "wrist"), "width": 64, "height": 48}
     prepared = episode(5, **options)
@@ -265,6 +269,7 @@ def test_vectors_of_environments_give_what_single_ones_give(vector: type) -> Non
     single.close()
 
 
+@pytest.mark.slow
 def test_the_example_of_the_docs_runs(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_examples("docs/training.md", "gymnasium.make", {}) == 1
     assert "(224, 224, 3) False" in capsys.readouterr().out

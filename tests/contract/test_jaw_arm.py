@@ -45,6 +45,7 @@ ARM = ArmKinematics(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("task", "index"),
     [
@@ -175,6 +176,7 @@ def test_nothing_lies_where_the_hand_rests_unless_it_rests_above(
         assert min(gaps) < 0, "the place below a high hand is used"
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("without_lerobot")
 def test_it_makes_and_checks_a_dataset_with_the_command(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -48,6 +48,7 @@ def module(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "code", "says"),
     [
@@ -72,6 +73,7 @@ def test_a_bug_in_a_task_is_named_by_its_line(
     assert re.search(rf"; it came up at left_tasks\.py:{line}: {re.escape(code)}[^\n]*\n$", told), told
 
 
+@pytest.mark.slow
 def test_the_line_may_be_in_a_module_beside_it(
     module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -104,6 +106,7 @@ def test_a_module_that_cannot_be_imported_is_named_by_its_line(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.slow
 def test_other_commands_name_the_line_too(
     module: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -117,6 +120,7 @@ def test_other_commands_name_the_line_too(
     assert re.search(r"; it came up at left_tasks\.py:\d+: return \(world\.pose\(\"no such body\"\),\)\n$", told)
 
 
+@pytest.mark.slow
 def test_a_layout_that_is_not_returned_is_said(
     module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -211,6 +211,7 @@ def test_fingers_that_move_along_x_of_the_tcp_are_refused(
     assert "the fingers move along x of tcp_link 'tcp'; turn it about its z by 90 degrees" in capfd.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_plug_in_of_gazebo_is_not_a_mesh_and_ros_names_lead_to_the_package(folder: Path, tmp_path: Path) -> None:
     """As a vendor lays it out: my_arm_description/urdf/arm.urdf beside my_arm_description/meshes."""
     from demorec.robots.assets import data_folder
@@ -241,6 +242,7 @@ def test_a_plug_in_of_gazebo_is_not_a_mesh_and_ros_names_lead_to_the_package(fol
     assert before != deciding_versions(config), "a mesh is part of the model"
 
 
+@pytest.mark.slow
 def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
     source = "from demorec.tasks.pick import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
     (folder / "my_tasks.py").write_text(source)

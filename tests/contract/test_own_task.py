@@ -16,6 +16,7 @@ from demorec.mcap import Recording
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
 
 
+@pytest.mark.slow
 def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = (EXAMPLE.parents[1] / "examples" / "own_script" / "my_tasks.py").read_text()
     (tmp_path / "my_pushing_tasks.py").write_text(source)

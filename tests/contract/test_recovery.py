@@ -141,6 +141,7 @@ def test_what_is_served_is_left_alone() -> None:
         np.testing.assert_allclose(world.pose(goal.object).vector(), before, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_bystander_in_the_hand_is_put_back() -> None:
     """Carried off by mistake: it goes back to where it lay, and then the goal is served."""
     prepared = episode(0, task="pick_from_clutter", variation="none")

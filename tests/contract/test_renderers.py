@@ -203,6 +203,7 @@ def test_what_lies_beyond_the_clipping_distances_is_not_drawn(stage: Stage) -> N
         assert not (images.segmentation == body).any()
 
 
+@pytest.mark.slow
 def test_links_have_their_numbers_and_follow_their_joints(stage: Stage) -> None:
     bodies = scenes.panda_scene(stage.client)
     front, wrist = scenes.panda_cameras(160, 120)
@@ -260,6 +261,7 @@ def test_impossible_cameras_are_named(stage: Stage, changes: dict[str, Any], wor
         _render(stage.renderer, stage.client, scenes.camera(**changes))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialias", [True, False])
 def test_raster_sees_what_tiny_sees(antialias: bool) -> None:
     client = scenes.connect()

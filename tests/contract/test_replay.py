@@ -40,6 +40,7 @@ def test_other_rates_replay_to_the_bit(fps: int, tmp_path: Path) -> None:
     assert _replay(simulate(tmp_path / "e.mcap", fps=fps, seed=5)).is_identical
 
 
+@pytest.mark.slow
 def test_the_first_different_step_is_found(recorded: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(recorded)
     targets = spoilt.columns.command_joint_target.copy()
@@ -70,6 +71,7 @@ def test_another_final_state_is_found(recorded: Path, tmp_path: Path) -> None:
     assert report.first_difference == (report.num_steps, "the final state")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "what"),
     [
@@ -94,6 +96,7 @@ def test_a_sensed_value_that_was_changed_is_found(recorded: Path, tmp_path: Path
     assert exit_code("replay", path) == 1
 
 
+@pytest.mark.slow
 def test_an_outcome_that_was_changed_is_found(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -110,6 +113,7 @@ def test_an_outcome_that_was_changed_is_found(
     assert report.first_difference == (report.num_steps, "the condition tilt")
 
 
+@pytest.mark.slow
 def test_an_expert_that_gave_up_is_a_failure_whatever_the_conditions_say(recorded: Path, tmp_path: Path) -> None:
     """As with a thing that was misplaced three times and comes to rest after that."""
     spoilt = Spoilt(recorded)
@@ -168,6 +172,7 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
     assert exit_code("replay", source, "--out", tmp_path, "--overwrite") == 2
 
 
+@pytest.mark.slow
 def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("replay", recorded) == 0
     said = capsys.readouterr().out

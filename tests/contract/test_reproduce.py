@@ -60,6 +60,7 @@ def test_what_is_no_longer_what_was_made(run: Path, tmp_path: Path, capsys: pyte
         assert str(name) in told.err
 
 
+@pytest.mark.slow
 def test_a_single_recording_is_made_again(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = run / "episodes" / "episode_000001.mcap"
     words = ("--out", tmp_path / "copy", "--workers", 1, "--no-check", "--no-export")
@@ -100,6 +101,7 @@ def test_another_digest_in_run_json(run: Path, tmp_path: Path) -> None:
     assert "is not the one that run.json lists" in fault
 
 
+@pytest.mark.slow
 def test_renderings_of_a_run_are_no_copy_of_it(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "renderings"
     assert exit_code("render", run, "--out", out, "--cameras", "front", "--width", 16, "--height", 16) == 0

@@ -74,6 +74,7 @@ def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
         assert level_of(small, check, "dataset") == "pass"
 
 
+@pytest.mark.slow
 def test_a_wrong_pose_in_the_state_is_found(small: Path) -> None:
     before = states(small)
     edit_column(small, STATE, lambda rows: rows[:, [*range(11), 14, 11, 12, 13]])  # scalar first
@@ -81,6 +82,7 @@ def test_a_wrong_pose_in_the_state_is_found(small: Path) -> None:
     assert level_of(small, "pose_mismatch", "dataset") == "fail"
 
 
+@pytest.mark.slow
 def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path) -> None:
     first, *_ = sorted((run / "episodes").glob("*.mcap"))
     export_lerobot([first], tmp_path / "one", SMALL)

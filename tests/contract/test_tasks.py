@@ -41,6 +41,7 @@ class TestEveryTask(TaskContract):
     test_an_episode_repeats_to_the_bit = None  # type: ignore[assignment]
 
 
+@pytest.mark.slow
 def test_instructions_come_in_several_wordings() -> None:
     for task in TASKS.names():
         words = {prepare(plan(task, index)).info.instruction for index in range(40)}

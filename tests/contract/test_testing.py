@@ -46,6 +46,7 @@ def test_each_fault_is_found(task: str, test: Callable[[TaskContract], None], wo
         test(Contract())
 
 
+@pytest.mark.slow
 def test_the_documented_three_lines_test_the_documented_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     blocks = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.DOTALL)
     (tmp_path / "my_tested_tasks.py").write_text(blocks[0])

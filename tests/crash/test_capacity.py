@@ -87,6 +87,7 @@ def run_on(executor: Executor, out: Path, monkeypatch: pytest.MonkeyPatch, heard
     return generate(GenerateConfig(cameras=()), options, progress=heard, inspect=inspect)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("moments", MOMENTS)
 @pytest.mark.parametrize("in_flight", ["lost", "stuck", "finished"])
 def test_workers_that_do_not_come_back_end_the_run_with_an_error(

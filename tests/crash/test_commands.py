@@ -150,6 +150,7 @@ def killed(case: Case) -> None:
     assert left_something
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", KILLED)
 def test_killed_at_eight_moments(name: str, sources: Path, tmp_path: Path) -> None:
     killed(Case(name, sources, tmp_path, replaces=False))
@@ -176,6 +177,7 @@ def check_full(case: Case, ended: Ended) -> None:
         assert case.everything() == case.all_before
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_full_disk(name: str, sources: Path, tmp_path: Path) -> None:
     """A limit on the size of a file fails the write that crosses it, as a full disk does."""
@@ -217,6 +219,7 @@ def test_a_full_file_system(name: str, sources: Path, tmp_path: Path) -> None:
     on_small_disk(tmp_path / "disk", work)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_target_that_appears_meanwhile_stays(name: str, sources: Path, tmp_path: Path) -> None:
     for replaces in {False, bool(ROWS[name].old)}:
@@ -241,6 +244,7 @@ def test_a_target_that_appears_meanwhile_stays(name: str, sources: Path, tmp_pat
             assert "is kept as" in ended.said[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_two_at_once(name: str, sources: Path, tmp_path: Path) -> None:
     """One of them wins, and the other one says why it does not."""
@@ -267,6 +271,7 @@ def test_two_at_once(name: str, sources: Path, tmp_path: Path) -> None:
         os.close(descriptor)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_a_second_interrupt_during_the_clean_up(name: str, sources: Path, tmp_path: Path) -> None:
     case = Case(name, sources, tmp_path, replaces=bool(ROWS[name].old))

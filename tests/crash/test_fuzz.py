@@ -11,7 +11,7 @@ from support.fuzz_bags import FuzzedBags
 from support.fuzz_data import FuzzedData
 
 KINDS: dict[str, Callable[[Path], Fuzzed]] = {"bags": FuzzedBags, "data": FuzzedData}
-COUNTS = {"bags": 220, "data": 100}
+COUNTS = {"bags": 110, "data": 50}
 """Kind -> cases of the quick test."""
 _MODULES = (
     "demorec.check.run", "demorec.extensions.imports.suggest", "demorec.extensions.imports.import_run",

@@ -137,6 +137,7 @@ class Fuzz:
         self.results["recovered"] += 1
 
 
+@pytest.mark.slow
 def test_damaged_files(tmp_path: Path) -> None:
     fuzz = Fuzz(tmp_path)
     for seed in range(360):
@@ -145,6 +146,7 @@ def test_damaged_files(tmp_path: Path) -> None:
     assert fuzz.results["refused in one sentence"] > 100
 
 
+@pytest.mark.slow
 def test_recovering_damaged_files(tmp_path: Path) -> None:
     fuzz = Fuzz(tmp_path)
     for seed in range(120):

@@ -63,6 +63,7 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
         return written + len(notes.read())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("codec", "kills"), [("h264", 8), pytest.param("av1", 20, marks=LONG)])
 def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)

@@ -87,6 +87,7 @@ def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path: Path) -
     assert content_of(tmp_path) == before
 
 
+@pytest.mark.slow
 def test_a_run_without_an_episode_claims_nothing(tmp_path: Path) -> None:
     out = tmp_path / "run"
     with pytest.raises(GenerationError):

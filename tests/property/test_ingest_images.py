@@ -10,6 +10,7 @@ from math import ceil, floor
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -89,6 +90,7 @@ seeds = st.integers(0, 2**32 - 1)
 roundings = st.sampled_from(sorted(ROUNDINGS))
 
 
+@pytest.mark.slow
 @settings(max_examples=80, **PATIENT)
 @given(rates, phases, jitters, seeds, roundings)
 def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
@@ -101,6 +103,7 @@ def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, se
         assert _kinds(lines, rows) == set()
 
 
+@pytest.mark.slow
 @settings(max_examples=80, **PATIENT)
 @given(st.integers(5, 200), phases, jitters, seeds, roundings)
 def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
@@ -118,6 +121,7 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
         assert sorted(rows.table.image_age_ns("front").tolist())[COUNT - 2] <= 3_000
 
 
+@pytest.mark.slow
 @settings(max_examples=80, **PATIENT)
 @given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
 def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:

@@ -46,6 +46,7 @@ def _suggestion(bag: Path) -> str:
     return out.getvalue()
 
 
+@pytest.mark.slow
 @settings(max_examples=60)
 @given(TEXTS, st.lists(TEXTS, min_size=2, max_size=4, unique=True), TEXTS)
 @example("odd" + "".join(ODD), ODD, "".join(ODD))
@@ -82,6 +83,7 @@ JSON = st.recursive(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=150)
 @given(st.lists(st.dictionaries(WORDS, JSON, max_size=5), min_size=1, max_size=4), st.sampled_from(["/state", "/cmd"]))
 @example([{"name": ["a"], "position": [1.0]}, {"name": [[1], {}], "position": [[1.0], [2.0, 3.0]]}], "/state")

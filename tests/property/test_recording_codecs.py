@@ -78,6 +78,7 @@ def test_too_many_bodies_for_labels() -> None:
 finite = st.floats(allow_nan=False, width=64)
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.lists(st.text(max_size=9).filter(lambda text: "\0" not in text), max_size=5), st.data())
 def test_layouts_give_what_another_decoder_reads(names: list[str], data: st.DataObject) -> None:

@@ -82,6 +82,7 @@ def test_a_dataset_that_lerobot_refuses_fails(tmp_path: Path, monkeypatch: pytes
     assert found.severity == "broken"
 
 
+@pytest.mark.slow
 def test_lerobot_opens_a_dataset_by_request(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

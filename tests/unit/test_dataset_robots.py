@@ -157,6 +157,7 @@ FAULTS: dict[str, Callable[[Path], object]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_description_that_changed_is_found(name: str, dataset: Path) -> None:
     assert level_of(dataset, "joint_limits", "dataset") == "pass"

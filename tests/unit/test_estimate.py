@@ -28,6 +28,7 @@ def made(file: Path, folder: Path) -> Made:
     return Made(plan=EpisodePlan(config=GenerateConfig(), episode_index=0), attempt=attempt, peak_bytes=0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("cameras", [(), ("front",)])
 @pytest.mark.parametrize("exports", [True, False])
 def test_the_size_is_about_that_of_the_run(

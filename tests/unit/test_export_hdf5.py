@@ -163,6 +163,7 @@ def test_a_file_with_a_note_or_a_link_of_somebody_is_not_replaced(run: Path, tmp
         assert target.read_bytes() == before
 
 
+@pytest.mark.slow
 def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
     """HDF5 knows whole seconds; where it keeps times, as in the last two files, a second later is another file."""
 

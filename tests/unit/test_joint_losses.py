@@ -107,6 +107,7 @@ def expert_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arm: str, fin
     return frames
 
 
+@pytest.mark.slow
 def test_motors_give_what_the_joints_lose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same motion costs damping times speed and friction more, and no force is made up."""
     plain = expert_frames(tmp_path, monkeypatch, "", "")

@@ -97,6 +97,7 @@ def test_the_exit_code_is_that_of_the_child(code: int, file: Path) -> None:
     assert run(f"print(os.getppid()); raise SystemExit({code})", "info", file).code == code
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("work", [FILL_AND_WAIT, FILL_SLOWLY])
 def test_too_much_memory_is_one_sentence(work: str, file: Path) -> None:
     ended = run(work, "info", file)
@@ -120,15 +121,18 @@ def test_memory_of_a_worker_counts(file: Path) -> None:
     assert "takes more than 508 MB of memory" in ended.errors
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [["generate"], ["render"], ["check", "--deep"], []])
 def test_what_draws_may_take_more(words: list[str], file: Path) -> None:
     assert run(FILL, *words, file).output == "filled\n"
 
 
+@pytest.mark.slow
 def test_the_limits_can_be_removed(file: Path) -> None:
     assert run(FILL, "info", file, environment={"DEMOREC_LIMITS": "off"}).output == "filled\n"
 
 
+@pytest.mark.slow
 def test_too_much_cpu_time_is_one_sentence(file: Path) -> None:
     ended = run(SPIN, "info", file, environment={"TEST_CPU_S": "1"})
     assert ended.code == 1
@@ -153,12 +157,14 @@ def test_a_signal_to_the_parent_is_passed_on(number: signal.Signals, file: Path)
     assert not child.is_running()
 
 
+@pytest.mark.slow
 def test_a_signal_to_both_reaches_the_child_once(file: Path) -> None:
     process, _ = started(COUNT, "info", file)
     os.killpg(process.pid, signal.SIGINT)
     assert process.wait(20) == 1
 
 
+@pytest.mark.slow
 def test_the_child_dies_with_its_parent(file: Path) -> None:
     process, child = started(WAIT, "info", file)
     process.kill()
@@ -167,6 +173,7 @@ def test_the_child_dies_with_its_parent(file: Path) -> None:
     assert not alive
 
 
+@pytest.mark.slow
 def test_a_stopped_child_goes_on(file: Path) -> None:
     process, child = started(COUNT, "info", file)
     child.suspend()

@@ -72,6 +72,7 @@ def test_no_frame_is_idle(ran: tuple[PreparedEpisode, list[Frame], Outcome]) -> 
     assert sum(outside_of_gripping) <= 0.06 * len(frames)
 
 
+@pytest.mark.slow
 def test_images_do_not_disturb_the_physics() -> None:
     _, without = run(episode(4, max_episode_seconds=1.0))
     frames, outcome = run(episode(4, max_episode_seconds=1.0, cameras=("front",), width=32, height=32, renderer="tiny"))

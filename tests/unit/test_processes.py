@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import psutil
+import pytest
 
 from demorec.core.processes import start_program
 
@@ -37,6 +38,7 @@ def told(*command: str, cwd: Path) -> list[str]:
     return done.stdout.splitlines()
 
 
+@pytest.mark.slow
 def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(SCRIPT)
     expected = ["[2.0, 3.0]", "child", "end", "script"]
@@ -110,6 +112,7 @@ except KeyboardInterrupt:
 """
 
 
+@pytest.mark.slow
 def test_a_second_ctrl_c_ends_what_the_first_waits_for(tmp_path: Path) -> None:
     """It is of the parent alone, so that nothing but the second one can end the workers."""
     (tmp_path / "work.py").write_text(SLEEPS)
@@ -134,6 +137,7 @@ process.wait()
 """
 
 
+@pytest.mark.slow
 def test_a_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None:
     parent = subprocess.Popen([sys.executable, "-c", STARTS], cwd=tmp_path, stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None

@@ -36,6 +36,7 @@ def same(one: Any, two: Any) -> bool:
     return all(np.array_equal(getattr(one, n), getattr(two, n)) for n in ("color", "depth", "segmentation"))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("antialias", [True, False])
 def test_keeping_what_stands_still_changes_no_bit(client: Any, antialias: bool) -> None:
     bodies = scenes.panda_scene(client)
@@ -139,6 +140,7 @@ def test_a_shadow_lies_where_the_light_puts_it(client: Any) -> None:
     assert images.color[free].std(0).max() < 2
 
 
+@pytest.mark.slow
 def test_exact_draws_all_triangles_and_levels_stay_close(client: Any) -> None:
     bodies = scenes.panda_scene(client)
     cameras = scenes.panda_cameras(224, 224)

@@ -247,6 +247,7 @@ os._exit(9)
 """
 
 
+@pytest.mark.slow
 def test_an_episode_that_was_opened_and_killed_leaves_no_gap(tmp_path: Path) -> None:
     for _ in range(2):
         assert subprocess.run([sys.executable, "-c", OPENED, str(tmp_path / "run")], check=False).returncode == 9
@@ -349,6 +350,7 @@ with Recorder(sys.argv[1], robot="arm", cameras={"top": (48, 64)}, fps=50, task=
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
 def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: signal.Signals) -> None:
     command = [sys.executable, "-c", KILLED, str(tmp_path / "run")]

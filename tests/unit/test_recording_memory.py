@@ -73,6 +73,7 @@ def test_memory_does_not_grow_with_length(
         assert long < 1.3 * short + 200_000, name
 
 
+@pytest.mark.slow
 def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_are(tmp_path: Path) -> None:
     short = make_external(cameras=(), num_frames=60)
     peaks, num_bytes = [], []

@@ -276,6 +276,7 @@ def test_what_cannot_be_read_is_told(run: Path, tmp_path: Path) -> None:
     assert len(found.articles) == 4
 
 
+@pytest.mark.slow
 def test_workers_find_the_same(run: Path) -> None:
     assert page(gathered(run, workers=2)) == page(gathered(run))
 

@@ -167,6 +167,7 @@ def test_several_objects_are_missed_once() -> None:
     assert len({event.message for frame in frames for event in frame.events if event.name == "place"}) >= 2
 
 
+@pytest.mark.slow
 def test_perception_error_shifts_the_grasp() -> None:
     clean, _ = run(behave(episode(5), action_noise=0.0))
     wrong, outcome = run(behave(episode(5), action_noise=0.0, perception_x=0.005))
@@ -191,6 +192,7 @@ def test_an_object_out_of_reach_gives_up_with_its_phase() -> None:
     assert [event.name for frame in frames for event in frame.events] == ["unreachable"]
 
 
+@pytest.mark.slow
 def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries() -> None:
     prepared = episode(0)
     slippery = dataclasses.replace(prepared.info.simulated.scene.body("red_cube"), lateral_friction=0.0, mass=2.0)

@@ -87,6 +87,7 @@ def test_full_varies_everything_within_its_ranges_and_records_it() -> None:
     assert all(np.argmax(scene.body("red_cube").rgba[:3]) == 0 for scene in scenes)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("task", ["place_in_tray", "sort_by_color"])
 def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
     """Points all over a distractor lie outside the rectangle of every tray."""
@@ -108,6 +109,7 @@ def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
     assert count > 60
 
 
+@pytest.mark.slow
 def test_looks_do_not_touch_the_physics() -> None:
     """Another preset of looks alone gives the same bits of state."""
     plain = run(episode(3))[1].final_state_digest
@@ -161,6 +163,7 @@ def held_out(point: Sequence[float]) -> bool:
     return all(low <= value <= high for value, (low, high) in zip(point, HELD_OUT, strict=True))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampling", ["random", "sobol"])
 def test_train_and_eval_layouts_never_overlap(sampling: str) -> None:
     train = cube_starts(300, split="train", sampling=sampling)

@@ -15,6 +15,7 @@ from demorec.core.errors import DemorecError
 from demorec.view.viewer import why_it_ended
 
 
+@pytest.mark.slow
 @pytest.mark.viewer
 def test_a_character_without_a_glyph_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     need_vulkan()

@@ -103,6 +103,7 @@ def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(w
     assert np.allclose(world.pose("duck").vector(), pose.vector(), atol=1e-9)
 
 
+@pytest.mark.slow
 def test_parameters_of_another_client_do_not_leak() -> None:
     prepared = episode(1)
     _, expected = run(prepared)
