@@ -1,1 +1,1 @@
-"""Robots as data, and the mathematics of arms: URDF, kinematics, grippers; a file for each arm that comes along."""
+"""Robots as data, and the mathematics of arms: URDF, kinematics, grippers; one file per included arm."""

@@ -1,8 +1,8 @@
-"""Where model files are: pybullet_data's, our own and those of the user's modules, found without the simulator.
+"""Lookup of model files, without the simulator: pybullet_data's, demorec's and those of the user's modules.
 
-A recording names its models by what is the same on every machine: a path below pybullet_data, "demorec:NAME", or
-"my_robots:PATH" for a file beside a module of the user's own. A name never leads out of these folders, and into that of
-a module only if the user has allowed it.
+A recording names its models independently of the machine: a path below pybullet_data, "demorec:NAME", or
+"my_robots:PATH" for a file next to a user's module. A name never leads out of these folders, and into a module's only
+if the user has allowed it.
 """
 
 from __future__ import annotations
@@ -25,23 +25,23 @@ from demorec.episode.scene import Shape
 OWN_PREFIX = "demorec:"
 
 _PACKAGE_SCHEMES = ("package", "model")
-"""Of ROS and of Gazebo: the first part of the path is the name of a package or model."""
+"""Schemes of ROS and of Gazebo: the first part of the path is the name of a package or model."""
 _MAX_FOLDERS_ABOVE = 6
-"""Folders above a URDF, its own included, that are looked through: PACKAGE/robots/ARM/urdf/arm.urdf is the deepest
-usual layout, and the workspace has one more."""
+"""Number of searched folders above a URDF, its own included: PACKAGE/robots/ARM/urdf/arm.urdf is the deepest usual
+layout, and a workspace adds one."""
 
 _modules_with_models: set[str] = set()
-"""Of this process, as `sys.path` is: models are looked up deep below whatever reads or draws a recording."""
+"""Global to the process, like `sys.path`: models are looked up deep inside the code that reads or draws recordings."""
 
 
 def allow_models(modules: Iterable[str]) -> None:
-    """From now on, model files beside these modules of the user's own are found."""
+    """Allow model files next to these user modules for the rest of the process."""
     _modules_with_models.update(modules)
 
 
 @functools.cache
 def data_folder() -> Path:
-    """The folder of pybullet_data; MissingDependencyError when it is not installed."""
+    """Return the folder of pybullet_data; MissingDependencyError if it is not installed."""
     spec = importlib.util.find_spec("pybullet_data")
     if spec is None or spec.origin is None:
         raise MissingDependencyError("Loading robot models", "pybullet", "pip install pybullet")
@@ -49,18 +49,18 @@ def data_folder() -> Path:
 
 
 def asset_path(name: str) -> Path:
-    """Absolute path of a path below pybullet_data, "demorec:NAME" (of `demorec/sim/assets`) or "module:PATH".
+    """Resolve a path below pybullet_data, "demorec:NAME" (of `demorec/sim/assets`) or "module:PATH".
 
     Raises:
-        SceneError: There is no such file, or the name leads out of its folder.
-        NotAllowedError: It is beside a module that the user has not allowed (`allow_models`).
+        SceneError: The file does not exist, or the name leads out of its folder.
+        NotAllowedError: It is next to a module that the user has not allowed (`allow_models`).
         ConfigError: That module cannot be found.
     """
     module, _, relative = name.rpartition(":")
     if modules_of_models([name]):
         if not is_allowed(module, _modules_with_models | extension_packages()):
             raise NotAllowedError(
-                f"The model {name!r} lies beside a module from outside of demorec: if you trust that module, add "
+                f"The model {name!r} is next to a module outside demorec: if you trust that module, add "
                 f"--allow {module}."
             )
         file = module_file(module)
@@ -72,54 +72,54 @@ def asset_path(name: str) -> Path:
         raise SceneError(f"The model file {name!r} is outside {limit}: move it there.")
     if not path.is_file():
         raise SceneError(
-            f"The model file {name!r} was not found: give a path below pybullet_data, demorec:NAME, or a file beside "
-            "your own module."
+            f"The model file {name!r} does not exist: give a path below pybullet_data, demorec:NAME, or a file next to "
+            "your module."
         )
     return path
 
 
 def surface_file(shape: Shape) -> Path:
-    """The file that a mesh is drawn from: its own, or one in the cache of what the recording holds.
+    """Return the file that a mesh is drawn from: its own, or a cached copy of the recorded mesh.
 
     Raises:
-        SceneError: There is no such file, or the recording's mesh is broken; others as `asset_path`.
+        SceneError: The file does not exist, or the recorded mesh is broken; others as `asset_path`.
     """
     return _written_mesh(shape.mesh)[0] if shape.mesh else asset_path(shape.file)
 
 
 def collision_file(shape: Shape) -> Path:
-    """The file that a mesh collides as, each of its objects as its convex hull; errors as `surface_file`."""
+    """Return the file for a mesh's collisions, with the convex hull of each object; raises as `surface_file`."""
     return _written_mesh(shape.mesh)[1] if shape.mesh else asset_path(shape.file)
 
 
 @functools.lru_cache(maxsize=1024)
 def _written_mesh(text: str) -> tuple[Path, Path]:
-    """The surface and the convex parts of a mesh of the scene, as files named after their content."""
+    """Write the surface and the convex parts of a mesh in the scene to files named after their content."""
     mesh = decode_mesh(text)
     folder, digest = cache_folder("objects"), hashlib.sha256(text.encode()).hexdigest()[:32]
     surface, parts = (folder / f"{digest}{suffix}.obj" for suffix in ("", "_parts"))
     for path, content in ((surface, mesh.surface_obj()), (parts, mesh.parts_obj())):
-        # What another process has left there may be cut off or edited, and would decide what is recorded.
+        # A file left by another process may be truncated or edited, and would affect the recording.
         if not path.is_file() or path.read_text() != content:
             write_whole(path, lambda temporary, content=content: temporary.write_text(content))  # type: ignore[misc]
     return surface, parts
 
 
 def modules_of_models(names: Iterable[str]) -> tuple[str, ...]:
-    """The modules of the user's own beside which these models lie, each once."""
+    """List the user modules that contain these models, each once."""
     modules = (name.rpartition(":")[0] for name in names)
     return tuple(dict.fromkeys(m for m in modules if f"{m}:" != OWN_PREFIX and is_module_name(m)))
 
 
 def model_name(file: str | Path, module: str) -> str:
-    """The name under which recordings keep a model that a module of the user's own gives.
+    """Build the recorded name of a model given by a user's module.
 
     Args:
         file: Absolute, relative to the module's file, below pybullet_data, or "demorec:NAME".
-        module: Which gives it.
+        module: The user's module.
 
     Raises:
-        ConfigError: An absolute path that lies neither beside the module (or in its package) nor in pybullet_data.
+        ConfigError: An absolute path that is neither next to the module (or in its package) nor in pybullet_data.
     """
     name = str(file)
     if ":" in name:
@@ -133,25 +133,25 @@ def model_name(file: str | Path, module: str) -> str:
     if path.is_relative_to(data_folder()):
         return path.relative_to(data_folder()).as_posix()
     raise ConfigError(
-        f"The module {module!r} names a model that is no file of its own folder nor of pybullet_data, so that no other "
-        f"machine would find what a recording says about it: put it beside the module, found {name}"
+        f"The module {module!r} names a model outside its own folder and pybullet_data, which other machines "
+        f"could not find: put it next to the module, found {name}"
     )
 
 
 def mesh_path(folder: Path | None, name: str) -> Path:
-    """Absolute path of a mesh that a URDF names.
+    """Resolve the path of a mesh named by a URDF.
 
-    A name is looked up beside the URDF and below pybullet_data. A ROS name ("package://PACKAGE/meshes/base.stl", or a
+    A name is looked up next to the URDF and below pybullet_data. A ROS name ("package://PACKAGE/meshes/base.stl", or a
     "file://" path into an installed package) is also looked up in the folders above the URDF, as in a workspace or a
     repository of that package, and in the packages of ROS_PACKAGE_PATH and AMENT_PREFIX_PATH.
 
     Args:
-        folder: Folder of the URDF; None for a URDF of unknown origin, whose names lead only into pybullet_data, the
-            current folder, the folders of modules that the user has allowed, and ROS's packages.
-        name: As the URDF has it.
+        folder: Folder of the URDF. None for a URDF of unknown origin: its names are resolved only in pybullet_data, the
+            current folder, the folders of allowed modules, and ROS packages.
+        name: Name in the URDF.
 
     Raises:
-        SceneError: There is no such file.
+        SceneError: The file does not exist.
     """
     scheme, separator, path = name.rpartition("://")
     relative = path if separator else name
@@ -159,13 +159,13 @@ def mesh_path(folder: Path | None, name: str) -> Path:
     for candidate in _mesh_candidates(folder, relative, parts):
         if candidate.is_file():
             return candidate
-    fix = f"put the package {parts[0]!r} beside it or on ROS_PACKAGE_PATH" if parts else "put it there"
+    fix = f"put the package {parts[0]!r} next to it or on ROS_PACKAGE_PATH" if parts else "put it there"
     where = "" if folder is None else f": {folder}"
-    raise SceneError(f"The mesh {name!r} is neither beside its URDF nor in pybullet_data, {fix}{where}")
+    raise SceneError(f"The mesh {name!r} is neither next to its URDF nor in pybullet_data, {fix}{where}")
 
 
 def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...]) -> Iterator[Path]:
-    """The places of a mesh, most likely first; `parts` as of `_package_path`."""
+    """Yield the candidate paths of a mesh, most likely first; `parts` as in `_package_path`."""
     if folder is not None:
         yield folder / relative
         yield folder.parent / relative
@@ -180,28 +180,28 @@ def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...])
     for start in folders:
         for above in [start, *start.parents][:_MAX_FOLDERS_ABOVE]:
             yield above.joinpath(*parts)
-            yield above.joinpath(*parts[1:])  # a repository that is not called as its package is
+            yield above.joinpath(*parts[1:])  # a repository named differently from its package
     yield from (package.joinpath(*parts[1:]) for package in _ros_packages(parts[0]))
 
 
 def _allowed_folders() -> Iterator[Path]:
-    """The folders of the modules that the user has allowed; one that does not exist here has no meshes to find."""
+    """Yield the folders of the allowed modules; one that does not exist here has no meshes."""
     for module in sorted(_modules_with_models):
         with contextlib.suppress(ConfigError):
             yield module_file(module).parent
 
 
 def _package_path(scheme: str, path: str) -> tuple[str, ...]:
-    """The package, then the parts of the path in it, of a ROS name; () for a name of another kind."""
+    """Split a ROS name into its package and the parts of the path in it; () for a name of another kind."""
     if scheme == "file":
         *_, path = path.rpartition("/share/")
-        scheme = "" if path.startswith("/") else "package"  # of a path that leads into no installed package
+        scheme = "" if path.startswith("/") else "package"  # of a path outside installed packages
     parts = Path(path).parts if scheme in _PACKAGE_SCHEMES else ()
     return parts if len(parts) > 1 else ()
 
 
 def _ros_packages(name: str) -> Iterator[Path]:
-    """The folders that ROS 1 and ROS 2 on this machine would take for a package."""
+    """Yield the folders that ROS 1 and ROS 2 on this machine would use for a package."""
     for entry in filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(os.pathsep)):
         yield Path(entry) / name
         if Path(entry).name == name:
@@ -211,7 +211,7 @@ def _ros_packages(name: str) -> Iterator[Path]:
 
 
 def _top_folder(module: str) -> Path:
-    """The folder of the outermost package that a module is in, or that of its file."""
+    """Find the folder of the outermost package that contains a module, or that of its file."""
     root = import_root(module)
     package = root / module.partition(".")[0]
     return package if module_file(module).is_relative_to(package) else root

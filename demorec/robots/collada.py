@@ -13,11 +13,11 @@ Floats = NDArray[np.float64]
 
 
 class ColladaTriangles(NamedTuple):
-    """Corners of the triangles of a file, three after three.
+    """Corners of the triangles of a file, three per triangle.
 
     Attributes:
         points: (3 n, 3) metres.
-        normals: (3 n, 3), or None where a part of the file has none.
+        normals: (3 n, 3), or None if a part of the file has none.
     """
 
     points: Floats
@@ -25,11 +25,11 @@ class ColladaTriangles(NamedTuple):
 
 
 def read_collada(path: Path) -> ColladaTriangles:
-    """The triangles and polygons of a file, placed by the nodes of its scene, in metres.
+    """Read the triangles and polygons of a file, placed by the nodes of its scene, in metres.
 
     Raises:
         OSError: The file cannot be read.
-        ValueError, LookupError, ElementTree.ParseError: It is not COLLADA, or holds no triangles.
+        ValueError, LookupError, ElementTree.ParseError: It is not COLLADA, or contains no triangles.
     """
     scene = _ColladaScene(ElementTree.parse(path).getroot())
     if not scene.points:
@@ -43,7 +43,7 @@ class _ColladaScene:
     """The triangles of the visual scenes of a COLLADA document.
 
     Attributes:
-        points, normals: (3 n, 3) of the corners of each part's triangles; no normals where the part has none.
+        points, normals: (3 n, 3) at the corners of each part's triangles; no normals if the part has none.
     """
 
     def __init__(self, root: ElementTree.Element) -> None:
@@ -54,7 +54,7 @@ class _ColladaScene:
         asset = root.find(f"{self._tag}asset")
         unit = None if asset is None else asset.find(f"{self._tag}unit")
         scale = 1.0 if unit is None else float(unit.attrib.get("meter", 1.0))
-        # PyBullet heeds the unit but not up_axis; shapes must lie as its physics has them.
+        # PyBullet applies the unit but not up_axis; shapes must match its physics.
         axes = np.diag([scale, scale, scale, 1.0])
         for scene in self._all_of(root, "visual_scene"):
             for node in scene.findall(f"{self._tag}node"):
@@ -64,7 +64,7 @@ class _ColladaScene:
         return node.findall(f".//{self._tag}{name}")
 
     def _visit(self, node: ElementTree.Element, matrix: Floats) -> None:
-        """Take in a node and all below it; (4, 4) is the transform of what the node hangs on."""
+        """Collect a node and its descendants; (4, 4) is the transform of its parent."""
         for child in node:
             name = child.tag.removeprefix(self._tag)
             if name in _TRANSFORMS:
@@ -90,7 +90,7 @@ class _ColladaScene:
             self.normals.append(np.zeros((0, 3)))
 
     def _fans(self, part: ElementTree.Element, kind: str, stride: int) -> NDArray[np.int64]:
-        """(3 n, stride) numbers of the inputs at the corners of a part's triangles, polygons being cut into fans."""
+        """Compute (3 n, stride) input indices at the corners of a part's triangles; polygons are split into fans."""
         rows: list[NDArray[np.int64]] = [
             np.array((p.text or "").split(), dtype=np.int64).reshape(-1, stride) for p in part.findall(f"{self._tag}p")
         ]
@@ -103,7 +103,7 @@ class _ColladaScene:
         return np.concatenate(fans) if fans else np.zeros((0, stride), dtype=np.int64)
 
     def _values(self, source: ElementTree.Element, index: NDArray[np.int64]) -> Floats:
-        """(3 n, 3) what an input has at the corners."""
+        """Look up an input's (3 n, 3) values at the corners."""
         return self._resolve(source.attrib["source"])[index[:, int(source.attrib.get("offset", 0))]]
 
     def _resolve(self, reference: str) -> Floats:
@@ -122,7 +122,7 @@ _TRANSFORMS = ("matrix", "translate", "scale", "rotate")
 
 
 def _transform(name: str, value: Floats) -> Floats:
-    """(4, 4) matrix of one COLLADA transform element."""
+    """Build the (4, 4) matrix of one COLLADA transform element."""
     if name == "matrix":
         return value.reshape(4, 4)
     m = np.eye(4)

@@ -1,7 +1,7 @@
-"""KUKA LBR iiwa 14 on a stand, with a parallel gripper of our own (`demorec/sim/assets/iiwa.urdf`).
+"""KUKA LBR iiwa 14 on a stand, with demorec's parallel gripper (`demorec/sim/assets/iiwa.urdf`).
 
 Position, velocity and torque limits are the manufacturer's (data sheet of the LBR iiwa 14 R820). KUKA publishes no
-acceleration limits: these are modest ones, of the size of the Panda's.
+acceleration limits: these are moderate ones, similar to the Panda's.
 """
 
 from __future__ import annotations

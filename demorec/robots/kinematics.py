@@ -1,6 +1,6 @@
-"""Forward and inverse kinematics of any serial arm, from its URDF, as far as a task fixes the pose.
+"""Forward and inverse kinematics of any serial arm, from its URDF, for fully or partly specified poses.
 
-One generic code (`demorec.robots.kinematics_kernels`) instead of a hand-written table per robot.
+One generic implementation (`demorec.robots.kinematics_kernels`) instead of a hand-written table per robot.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ MAX_ITERATIONS = 60
 
 @dataclass(frozen=True, kw_only=True)
 class Freedom:
-    """How far a pose may be off what is wanted of it; its position is always exact.
+    """Allowed deviation from a target pose in orientation; the position is always exact.
 
     Attributes:
-        cone: Between its approach (z of the TCP) and the wanted one, rad; pi: any approach will do.
-        roll: About the approach, rad; pi: any roll will do.
+        cone: Maximum angle between its approach (z of the TCP) and the target's, rad; pi: any approach.
+        roll: Maximum angle about the approach, rad; pi: any roll.
     """
 
     cone: float = 0.0
@@ -36,30 +36,29 @@ class Freedom:
 
 WHOLE_POSE = Freedom()
 FIVE_JOINTS = Freedom(cone=math.radians(15.0), roll=math.radians(2.0))
-"""What an arm of fewer than six joints needs where nothing else is said: it cannot tilt its hand to every side."""
+"""Default of an arm with fewer than six joints, which cannot tilt its hand in every direction."""
 
 
 class ArmKinematics:
     """A serial chain of n revolute joints from the base of a URDF to the tool centre point.
 
-    Fixed joints are merged, every other joint on the way must be one of `arm_joints`.
+    Fixed joints are merged; every other joint in the chain must be one of `arm_joints`.
 
     Args:
-        urdf: Whose arm it is.
-        arm_joints: Names of its joints, base to flange.
-        tcp_link: Link whose frame is the tool centre point.
-        lower, upper: (n,) position limits that the inverse kinematics keeps, rad.
+        urdf: URDF of the arm.
+        arm_joints: Names of the arm's joints, base to flange.
+        tcp_link: Link with its frame at the tool centre point.
+        lower, upper: (n,) position limits of the inverse kinematics, rad.
 
     Attributes:
         num_joints: n.
-        origins: (n, 3) position of each joint in the frame of the one before, metres.
-        lower, upper: As given.
-        freedom: What poses leave open unless a caller says otherwise.
-        tables: What the compiled loops know of the arm: `origins`, (n, 3, 3) the joints' rotations there, (n, 3) their
-            unit axes, (3,) the TCP in the last joint's frame, metres, (3, 3) its rotation there, and the limits.
-
+        origins: (n, 3) position of each joint in the frame of its predecessor, metres.
+        lower, upper: The arguments.
+        freedom: Default freedom of poses.
+        tables: Arm data for the compiled loops: `origins`, (n, 3, 3) the joints' rotations there, (n, 3) their unit
+            axes, (3,) the TCP in the last joint's frame, metres, (3, 3) its rotation there, and the limits.
     Raises:
-        ValueError: The joints on the way to `tcp_link` are not `arm_joints`, or one does not turn.
+        ValueError: The joints between base and `tcp_link` are not `arm_joints`, or one is not revolute.
     """
 
     def __init__(
@@ -70,7 +69,7 @@ class ArmKinematics:
         names = [joint.name for joint in moving]
         if not names or names != list(arm_joints) or any(j.kind == "prismatic" for j in moving):
             found = [f"{joint.name} ({joint.kind})" for joint in moving]
-            raise ValueError(f"the way to {tcp_link} has the joints {found}, expected turning {list(arm_joints)}")
+            raise ValueError(f"the joints to {tcp_link} are {found}, expected the revolute {list(arm_joints)}")
         origins, tool = [], Pose()
         for joint in joints:
             tool = tool @ joint.parent_from_joint
@@ -87,8 +86,10 @@ class ArmKinematics:
         self.tables = (self.origins, rotations, axes, np.array(tool.position), tool.rotation, self.lower, self.upper)
 
     def turned_towards(self, joint_position: Array, point: Array) -> Array:
-        """A configuration (n,) of an arm that stands upright, its first joint turned so that the hand is at the azimuth
-        of a point (3,), metres, of the base frame; azimuths are seen from that joint's axis."""
+        """Turn the first joint of an upright arm's configuration (n,) to bring the hand to the azimuth of a point.
+
+        The point (3,) is in the base frame, metres; azimuths are measured about that joint's axis.
+        """
         x, y = self.origins[0][:2]
         hand = self.forward(joint_position).position
         turn = wrap_angle(math.atan2(point[1] - y, point[0] - x) - math.atan2(hand[1] - y, hand[0] - x))
@@ -97,7 +98,7 @@ class ArmKinematics:
         return turned
 
     def forward(self, joint_position: Array) -> Pose:
-        """`base_from_tcp` at (n,) joint positions, rad."""
+        """Compute `base_from_tcp` at (n,) joint positions, rad."""
         q = np.ascontiguousarray(joint_position, dtype=np.float64)
         position, rotation, _ = forward(q, self.tables)
         return Pose(position=position, quat_xyzw=quat_from_rotation(rotation))
@@ -111,27 +112,28 @@ class ArmKinematics:
         null_gain: float = 0.1,
         freedom: Freedom | None = None,
     ) -> Array | None:
-        """Joint positions (n,) that reach a pose to 0.01 mm and 0.1 mrad, or as its freedom says; None for none found.
+        """Find joint positions (n,) that reach a pose to 0.01 mm and 0.1 mrad, or within its freedom; None if not
+        found.
 
         Args:
-            base_from_tcp: Wanted pose.
-            start: (n,) where the iteration starts, rad.
+            base_from_tcp: Target pose.
+            start: (n,) initial configuration, rad.
             rest: (n,) configuration towards which the null space is pulled; None for no pull.
             null_gain: Strength of the pull, 1 per iteration.
-            freedom: What of the pose is left open; None: the arm's own.
+            freedom: Freedom of the pose; None: the arm's own.
         """
         q, reached = self._seek(base_from_tcp, start, rest, null_gain, freedom or self.freedom)
         return q if reached else None
 
     def find(self, base_from_tcp: Pose, *, start: Array, rest: Array) -> Array | None:
-        """As `inverse`, and where it ends at a joint limit though the pose is within reach, from other starts.
+        """Search as `inverse`; if it ends at a joint limit though the pose is within reach, also from other starts.
 
         These are the rest configuration, with and without the pull to it, and with its last joint, about which a hand
-        that points down turns, a quarter turn to either side.
+        that points down turns, turned by 90 degrees in both directions.
 
         Args:
-            base_from_tcp: Wanted pose.
-            start: (n,) where the first try starts, rad.
+            base_from_tcp: Target pose.
+            start: (n,) first initial configuration, rad.
             rest: (n,) configuration towards which the null space is pulled.
         """
         q = self.inverse(base_from_tcp, start=start, rest=rest)
@@ -146,7 +148,7 @@ class ArmKinematics:
     def why_unreachable(
         self, base_from_tcp: Pose, *, start: Array, rest: Array | None = None, freedom: Freedom | None = None
     ) -> str:
-        """What of a pose cannot be had, in words; "" where `inverse` with the same arguments finds it."""
+        """Explain in words why a pose is unreachable; "" if `inverse` with the same arguments finds it."""
         freedom = freedom or self.freedom
         if self.inverse(base_from_tcp, start=start, rest=rest, freedom=freedom) is not None:
             return ""
@@ -170,7 +172,7 @@ class ArmKinematics:
     def _seek(
         self, base_from_tcp: Pose, start: Array, rest: Array | None, null_gain: float, freedom: Freedom
     ) -> tuple[Array, bool]:
-        """The joint positions (n,) at which the iteration ends, and whether they reach the pose."""
+        """Return the joint positions (n,) at which the iteration ends, and whether they reach the pose."""
         q, reached = inverse(
             np.array(base_from_tcp.position),
             base_from_tcp.rotation,
@@ -189,14 +191,14 @@ class ArmKinematics:
     def straight_path(
         self, *, start: Array, goal: Array, base_from_start: Pose, base_from_goal: Pose, fractions: Array
     ) -> Array | None:
-        """(T, n) joint positions along a straight line with slerp, or None where the arm cannot follow.
+        """Compute (T, n) joint positions along a straight line with slerp; None if the arm cannot follow it.
 
-        Each point starts from the joint-space blend between `start` and `goal`, so that the null space cannot jump.
+        Each point starts from the joint-space blend of `start` and `goal`, so that the null space cannot jump.
 
         Args:
             start, goal: (n,) configurations at both ends.
             base_from_start, base_from_goal: Their TCP poses.
-            fractions: (T,) of the way, 0..1.
+            fractions: (T,) fractions of the path, 0..1.
         """
         path, reached = straight_path(
             np.array(start, dtype=np.float64),
@@ -206,7 +208,7 @@ class ArmKinematics:
             np.array(base_from_goal.position),
             base_from_goal.rotation,
             np.array(fractions, dtype=np.float64),
-            # On its way an arm of few joints may lean farther than where it is going to.
+            # Along the path, an arm with few joints may tilt farther than at the target.
             min(math.pi, 2 * self.freedom.cone),
             min(math.pi, 5 * self.freedom.roll),
             self.tables,

@@ -1,11 +1,11 @@
 """The loops of an arm's kinematics, compiled by Numba.
 
-Without fast-math and without BLAS, every sum in a fixed order, so that the same targets come out on every CPU (an
-OpenBLAS kernel is chosen by CPU type and changes the last bits). Loops stand where NumPy would take whole arrays: they
-compile several times as fast. The methods are the textbook ones: product of homogeneous transforms, geometric Jacobian,
-damped least squares with weights and a projected null-space pull (Siciliano et al., Robotics, sections 2.8, 3.1, 3.7).
+Without fast-math and BLAS, and with every sum in a fixed order, the same targets result on every CPU (OpenBLAS selects
+kernels by CPU type, which changes the last bits). Explicit loops replace whole-array NumPy because they compile several
+times as fast. The methods are the textbook ones: product of homogeneous transforms, geometric Jacobian, damped least
+squares with weights and a projected null-space pull (Siciliano et al., Robotics, sections 2.8, 3.1, 3.7).
 
-An `arm` is the tuple that `demorec.robots.kinematics.ArmKinematics.tables` gives.
+An `arm` is the tuple `demorec.robots.kinematics.ArmKinematics.tables`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _njit = njit(cache=True, error_model="numpy")
 
 @_njit
 def _multiply(a, b):  # type: ignore[no-untyped-def]
-    """Product of two (3, 3) matrices, each sum in index order."""
+    """Multiply two (3, 3) matrices, each sum in index order."""
     out = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -31,7 +31,7 @@ def _multiply(a, b):  # type: ignore[no-untyped-def]
 
 @_njit
 def _apply(a, v):  # type: ignore[no-untyped-def]
-    """(3, 3) matrix times (3,) vector."""
+    """Multiply a (3, 3) matrix by a (3,) vector."""
     out = np.empty(3)
     for i in range(3):
         out[i] = a[i, 0] * v[0] + a[i, 1] * v[1] + a[i, 2] * v[2]
@@ -40,7 +40,7 @@ def _apply(a, v):  # type: ignore[no-untyped-def]
 
 @_njit
 def _scaled(v, factor):  # type: ignore[no-untyped-def]
-    """A vector times a number."""
+    """Multiply a vector by a number."""
     out = np.empty(len(v))
     for i in range(len(v)):
         out[i] = v[i] * factor
@@ -49,7 +49,7 @@ def _scaled(v, factor):  # type: ignore[no-untyped-def]
 
 @_njit
 def _blend(a, b, share):  # type: ignore[no-untyped-def]
-    """The vector that lies at a share of the way from one to another."""
+    """Interpolate linearly between two vectors."""
     out = np.empty(len(a))
     for i in range(len(a)):
         out[i] = a[i] + share * (b[i] - a[i])
@@ -58,7 +58,7 @@ def _blend(a, b, share):  # type: ignore[no-untyped-def]
 
 @_njit
 def _axis_rotation(axis, angle):  # type: ignore[no-untyped-def]
-    """Rodrigues' formula for a unit axis."""
+    """Compute Rodrigues' formula for a unit axis."""
     c, s = math.cos(angle), math.sin(angle)
     x, y, z = axis[0], axis[1], axis[2]
     t = 1.0 - c
@@ -71,7 +71,7 @@ def _axis_rotation(axis, angle):  # type: ignore[no-untyped-def]
 
 @_njit
 def _rotation_vector(wanted, found):  # type: ignore[no-untyped-def]
-    """Rotation vector (3,) in the base frame that turns `found` into `wanted`."""
+    """Compute the rotation vector (3,) in the base frame from `found` to `wanted`."""
     error = np.empty((3, 3))
     for i in range(3):
         for j in range(3):
@@ -97,7 +97,7 @@ def _rotation_vector(wanted, found):  # type: ignore[no-untyped-def]
 
 @_njit
 def forward(q, arm):  # type: ignore[no-untyped-def]
-    """TCP position (3,), rotation (3, 3) and geometric Jacobian (6, n)."""
+    """Compute TCP position (3,), rotation (3, 3) and geometric Jacobian (6, n)."""
     origins, rotations, axes, tool, tool_rotation, _, _ = arm
     n = len(q)
     position = np.zeros(3)
@@ -131,7 +131,7 @@ def forward(q, arm):  # type: ignore[no-untyped-def]
 
 @_njit
 def _damped_solve(jacobian, damping, rhs):  # type: ignore[no-untyped-def]
-    """(J J^T + damping^2 I)^-1 rhs for each column of rhs (6, m), by Cholesky's method."""
+    """Compute (J J^T + damping^2 I)^-1 rhs for each column of rhs (6, m), by Cholesky's method."""
     n, m = jacobian.shape[1], rhs.shape[1]
     lower = np.zeros((6, 6))
     for i in range(6):
@@ -157,7 +157,7 @@ def _damped_solve(jacobian, damping, rhs):  # type: ignore[no-untyped-def]
 
 @_njit
 def tilt_and_roll(wanted, found):  # type: ignore[no-untyped-def]
-    """Rotation (3,), along the axes of `found`, that takes its approach (z) to the wanted one, then its roll there."""
+    """Compute the rotation (3,), in the axes of `found`, that aligns its approach (z), then its roll there."""
     x, y, z = 0.0, 0.0, 0.0
     for i in range(3):
         x += found[i, 0] * wanted[i, 2]
@@ -180,11 +180,11 @@ def tilt_and_roll(wanted, found):  # type: ignore[no-untyped-def]
 
 @_njit
 def _ease(jacobian, error, turn, rotation, cone, roll):  # type: ignore[no-untyped-def]
-    """Weigh the rows of a task that leaves the approach within a cone and the roll within an angle.
+    """Weight the rows of a task that leaves the approach within a cone and the roll within an angle.
 
-    The rows of rotation are turned into the TCP's axes, so that the roll is one of them. An arm of five joints cannot
-    serve all six rows: the position counts so much more than the roll, and the roll than the approach, that what is
-    missed is missed in the approach. A cone or a roll of half a turn leaves its rows out.
+    The rotation rows are transformed to the TCP's axes, so that the roll is one of them. An arm of five joints cannot
+    satisfy all six rows: position is weighted far above roll, and roll far above approach, to leave the residual error
+    in the approach. A cone or a roll of pi removes its rows.
     """
     turned = np.empty((3, jacobian.shape[1]))
     for k in range(jacobian.shape[1]):
@@ -203,9 +203,9 @@ def _ease(jacobian, error, turn, rotation, cone, roll):  # type: ignore[no-untyp
 
 @_njit
 def _step(jacobian, error, gain, rest, q, low, high, is_whole):  # type: ignore[no-untyped-def]
-    """J# e + (I - J# J) gain (rest - q); where less than the whole pose is wanted, without the joints at their limits.
+    """Compute J# e + (I - J# J) gain (rest - q); for partly specified poses without the joints at their limits.
 
-    A joint that the step would take beyond its limit is left out, and the others do without it.
+    A joint that the step would move beyond its limit is excluded, and the others compensate.
     """
     n = len(q)
     wanted = np.empty((6, 1))
@@ -247,10 +247,11 @@ def inverse(  # type: ignore[no-untyped-def]
     roll,
     arm,
 ):
-    """Damped least squares: dq = J# e + (I - J# J) gain (rest - q), clipped to 0.35 rad a step and to the limits.
+    """Iterate damped least squares: dq = J# e + (I - J# J) gain (rest - q), clipped to 0.35 rad a step and to the
+    limits.
 
-    With a cone and a roll of 0 the whole pose is wanted. Otherwise the nearest to it is sought, which is reached once
-    nothing moves any more and position, approach and roll are within what is allowed.
+    A cone and a roll of 0 require the full pose. Otherwise the nearest pose is sought: it is reached once the motion
+    stops with position, approach and roll within the allowed deviation.
     """
     low, high = arm[5], arm[6]
     n = len(start)
@@ -269,7 +270,7 @@ def inverse(  # type: ignore[no-untyped-def]
             error[3 + i, 0] = turn[i]
             worst_position = max(worst_position, abs(error[i, 0]))
             worst_rotation = max(worst_rotation, abs(error[3 + i, 0]))
-        # A pull needs at least one step, or a start that already reaches the pose would never be improved.
+        # A pull needs at least one step; otherwise a start that already reaches the pose would never be improved.
         may_stop = iteration > 0 or null_gain == 0.0
         if may_stop and worst_position < position_tolerance and worst_rotation < rotation_tolerance:
             return q, True
@@ -296,7 +297,7 @@ def inverse(  # type: ignore[no-untyped-def]
 def straight_path(  # type: ignore[no-untyped-def]
     start, goal, start_position, start_rotation, goal_position, goal_rotation, fractions, cone, roll, arm
 ):
-    """(N, n) joint positions on a straight line of the tool, turning evenly; whether all were reached."""
+    """Compute (N, n) joint positions on a straight tool line with uniform rotation, and whether all were reached."""
     turn = _rotation_vector(goal_rotation, start_rotation)
     angle = math.sqrt(turn[0] * turn[0] + turn[1] * turn[1] + turn[2] * turn[2])
     axis = np.array([0.0, 0.0, 1.0])
@@ -305,7 +306,7 @@ def straight_path(  # type: ignore[no-untyped-def]
             axis[k] = turn[k] / angle
     out = np.empty((len(fractions), len(start)))
     all_reached = True
-    max_iterations = np.int64(40)  # no literal, for which Numba would compile `_inverse` once more
+    max_iterations = np.int64(40)  # not a literal, for which Numba would compile `_inverse` once more
     for t in range(len(fractions)):
         u = fractions[t]
         position = _blend(start_position, goal_position, u)

@@ -1,7 +1,7 @@
-"""Where on this machine the URDFs are whose text recordings hold.
+"""Local paths of the URDFs stored as text in recordings.
 
-A recording has no paths. So that its robot can be drawn with its meshes on the machine on which it was recorded or
-imported, the cache folder keeps, for each text, the file that it came from.
+A recording has no paths. To draw its robot with meshes on the machine where it was recorded or imported, the cache
+folder stores the source file of each text.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from demorec.core.files import cache_folder, write_whole
 
 
 def remember_model(description: str, urdf: Path) -> None:
-    """Keep that a recorded description comes from this file; a cache that cannot be written only costs the meshes."""
+    """Store the file that a recorded description comes from; an unwritable cache only loses the meshes."""
     text = str(urdf.resolve())
     with suppress(OSError, UnicodeError):
         write_whole(_place(description), lambda temporary: temporary.write_text(text))
 
 
 def known_model(description: str) -> Path | None:
-    """The file that a recorded description comes from; None if it is not known or has gone."""
+    """Return the file that a recorded description comes from; None if unknown or deleted."""
     with suppress(OSError, ValueError):
         path = Path(_place(description).read_text())
         return path if path.is_file() else None

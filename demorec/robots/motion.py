@@ -1,7 +1,7 @@
-"""Timed motions within the joint limits: straight lines of the tool centre point, or of all joints at once.
+"""Timed motions within the joint limits: straight lines of the tool centre point, or all joints at once.
 
 A quintic time law (zero velocity and acceleration at both ends) along a straight line with slerp, or from one
-configuration to the other, slowed down until every joint keeps to its velocity and acceleration limits.
+configuration to another, slowed down until every joint respects its velocity and acceleration limits.
 """
 
 from __future__ import annotations
@@ -19,32 +19,32 @@ PEAK_VELOCITY = 1.875
 PEAK_ACCELERATION = 5.774
 
 LINEAR_ACCELERATION = 1.5
-"""Maximum of the TCP, m/s^2."""
+"""Maximum linear acceleration of the TCP, m/s^2."""
 ANGULAR_VELOCITY = 1.5
-"""Maximum of the TCP, rad/s."""
+"""Maximum angular velocity of the TCP, rad/s."""
 ANGULAR_ACCELERATION = 6.0
-"""Maximum of the TCP, rad/s^2."""
+"""Maximum angular acceleration of the TCP, rad/s^2."""
 MIN_SECONDS = 0.2
-"""Of the shortest motion."""
+"""Minimum duration of a motion, s."""
 _ROUNDS = 5
 """Maximum number of times that a motion is slowed down."""
 _ROUNDS_WITH_FREEDOM = 20
-"""The same of an arm of few joints: where a joint meets its limit, the others take over from one step to the next, and
-at half the speed the acceleration of such a kink is half, not a quarter."""
+"""The same for an arm with few joints: where a joint reaches its limit, the others take over within one step, and at
+half the speed the acceleration of such a kink is half, not a quarter."""
 _LONGEST_S = 60.0
-"""Of a motion; a longer one leads through a jump of the joints, which is none the smaller for it, round by round."""
+"""Maximum duration of a motion, s; a longer one contains a jump of the joints, which slowing down does not reduce."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class MotionLimits:
-    """What the joints keep to in a motion: (n,) rad/s, rad/s^2, already reduced by a margin."""
+    """Joint limits of a motion: (n,) rad/s, rad/s^2, already reduced by a margin."""
 
     joint_velocity: Array
     joint_acceleration: Array
 
 
 def quintic(u: Array) -> Array:
-    """Fraction of the way at fraction `u` of the time, both 0..1."""
+    """Compute the fraction of the path at fraction `u` of the time, both 0..1."""
     return np.asarray(u * u * u * (10.0 + u * (6.0 * u - 15.0)), dtype=np.float64)
 
 
@@ -59,12 +59,12 @@ def plan_straight(
     limits: MotionLimits,
     dt: float,
 ) -> Array | None:
-    """Joint targets (T, n) of a straight motion, one per control step, the start left out; None if unreachable.
+    """Plan joint targets (T, n) of a straight motion, one per control step, start excluded; None if unreachable.
 
     Args:
         arm: Kinematics.
-        start: (n,) commanded configuration now, rad: the path starts from its forward kinematics, not from an
-            idealised pose, since the first step would exceed the limits.
+        start: (n,) current commanded configuration, rad. The path starts from its forward kinematics instead of an
+            idealised pose, from which the first step would exceed the limits.
         goal: base_from_tcp at the end.
         rest: (n,) configuration towards which the goal configuration is pulled in the null space.
         speed: Peak speed of the TCP, m/s.
@@ -108,11 +108,11 @@ def plan_straight(
 
 
 def plan_joints(*, start: Array, goal: Array, speed: float, limits: MotionLimits, dt: float) -> Array:
-    """Joint targets (T, n) of a motion of all joints at once, one per control step, the start left out.
+    """Plan joint targets (T, n) of a motion of all joints at once, one per control step, start excluded.
 
     Args:
         start, goal: (n,) configurations, rad.
-        speed: Peak speed of the joint that turns farthest, rad/s.
+        speed: Peak speed of the joint with the largest motion, rad/s.
         limits: Joint limits.
         dt: Control step, s.
     """
@@ -127,7 +127,7 @@ def plan_joints(*, start: Array, goal: Array, speed: float, limits: MotionLimits
 
 
 def slowdown(path: Array, *, start: Array, limits: MotionLimits, dt: float) -> float:
-    """By which factor a path (T, n) that starts and ends at rest must be stretched in time to keep the limits."""
+    """Compute the time stretch factor with which a path (T, n), at rest at both ends, respects the limits."""
     padded = np.vstack([start, start, path, path[-1:]])
     velocity = np.abs(np.diff(padded, axis=0)) / dt
     acceleration = np.abs(np.diff(padded, 2, axis=0)) / (dt * dt)

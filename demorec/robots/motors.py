@@ -1,7 +1,7 @@
-"""What the servos of a real arm say: their calibration, and from positions of joints to the values that LeRobot gives.
+"""Servos of a real arm: their calibration, and the conversion of joint positions to LeRobot's values.
 
-LeRobot reads counts of a servo's encoder and makes degrees of them, centred on the servo's calibrated range, or a share
-of that range: from -100 to 100, of grippers from 0 to 100 (`MotorsBus._normalize`, `MotorNormMode`).
+LeRobot converts encoder counts of a servo to degrees, centred on its calibrated range, or to a ratio of that range:
+-100 to 100, for grippers 0 to 100 (`MotorsBus._normalize`, `MotorNormMode`).
 """
 
 from __future__ import annotations
@@ -20,22 +20,22 @@ from demorec.core.geometry import Array
 from demorec.core.plain import from_plain, listed, parse_json
 
 COUNTS = 4096
-"""Of the encoder in a turn."""
+"""Encoder counts per turn."""
 MotorUnits = Literal["degrees", "range_m100_100"]
-"""Of an arm's joints, as LeRobot calls them: with `use_degrees` (its default) and without."""
+"""LeRobot's units of an arm's joints: with `use_degrees` (its default) and without."""
 CALIBRATIONS = Path(__file__).with_name("calibration")
-"""Where the calibrations are that come with the robots."""
+"""Folder of the calibrations that ship with the robots."""
 _MAX_BYTES = 1 << 16
 
 
 @dataclass(frozen=True, kw_only=True)
 class MotorCalibration:
-    """What `lerobot-calibrate` finds of a servo: its entry in the file that LeRobot saves.
+    """Calibration of a servo by `lerobot-calibrate`: its entry in the file that LeRobot saves.
 
     Attributes:
-        id: On the bus.
-        drive_mode: 1 where shares of the range run against the encoder, else 0.
-        homing_offset: What the servo itself takes off its counts.
+        id: ID on the bus.
+        drive_mode: 1 if ratios of the range run against the encoder, else 0.
+        homing_offset: Offset that the servo subtracts from its counts.
         range_min, range_max: Calibrated range, counts.
     """
 
@@ -51,10 +51,10 @@ class Motor:
     """A servo in a real arm.
 
     Attributes:
-        joint: Of the URDF; also the servo's name.
-        middle: Position of the joint in the middle of the calibrated range, rad; counts grow with the position.
-        units: How LeRobot gives its position.
-        calibration: Of it.
+        joint: Joint of the URDF; also the servo's name.
+        middle: Position of the joint in the middle of the calibrated range, rad; counts increase with the position.
+        units: LeRobot's unit of its position.
+        calibration: Its calibration.
     """
 
     joint: str
@@ -64,13 +64,13 @@ class Motor:
 
     @property
     def to_position(self) -> tuple[float, float]:
-        """Factor and offset: factor times what LeRobot says, plus the offset, is the joint's position, rad."""
+        """Factor and offset: factor times LeRobot's value plus offset is the joint's position, rad."""
         zero, unit = self._scale
         step = 2 * math.pi / COUNTS
         return step / unit, step * (zero - self._count_at_zero)
 
     def value(self, position: Array) -> Array:
-        """What LeRobot says of positions (...), rad, before the encoder rounds them."""
+        """Convert positions (...), rad, to LeRobot's values, before rounding to encoder counts."""
         zero, unit = self._scale
         value = (self._count_at_zero + position * (COUNTS / (2 * math.pi)) - zero) * unit
         if self.units == "degrees":
@@ -79,15 +79,15 @@ class Motor:
 
     @property
     def _count_at_zero(self) -> int:
-        """Count at the joint's zero."""
+        """Encoder count at the joint's zero."""
         return (self.calibration.range_min + self.calibration.range_max) // 2 - round(self.middle / math.tau * COUNTS)
 
     @property
     def _scale(self) -> tuple[float, float]:
-        """At which count LeRobot says 0, and how much each count adds."""
+        """Encoder count at LeRobot's 0, and LeRobot's units per count."""
         low, high = self.calibration.range_min, self.calibration.range_max
         if self.units == "degrees":
-            # A turn has one step less here than it has counts: so LeRobot has it.
+            # LeRobot counts one step less in a turn.
             return (low + high) / 2, 360 / (COUNTS - 1)
         sign = -1 if self.calibration.drive_mode else 1
         if self.units == "range_m100_100":
@@ -100,8 +100,8 @@ class Motors:
     """The calibrated servos of an arm.
 
     Attributes:
-        robot_type: What LeRobot calls the arm in datasets.
-        motors: In LeRobot's order: those of the arm's joints, then that of the gripper's.
+        robot_type: LeRobot's name of the arm in datasets.
+        motors: In LeRobot's order: arm joints first, then the gripper.
     """
 
     robot_type: str
@@ -109,39 +109,39 @@ class Motors:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Of the elements of state and action."""
+        """Names of the elements of state and action."""
         return tuple(f"{motor.joint}.pos" for motor in self.motors)
 
     @property
     def joints(self) -> tuple[str, ...]:
-        """Of the URDF, in the same order."""
+        """Joints of the URDF, in the same order."""
         return tuple(motor.joint for motor in self.motors)
 
     @property
     def units(self) -> tuple[str, ...]:
-        """Of the elements: "deg", or "%" of the calibrated range or of its half."""
+        """Units of the elements: "deg", or "%" of the calibrated range or of its half."""
         return tuple("deg" if motor.units == "degrees" else "%" for motor in self.motors)
 
     @property
     def to_positions(self) -> tuple[tuple[float, float], ...]:
-        """Factor and offset of each, as `Motor.to_position`."""
+        """Factor and offset of each motor, as `Motor.to_position`."""
         return tuple(motor.to_position for motor in self.motors)
 
     def values(self, joint_position: Array) -> Array:
-        """(T, D) values of LeRobot of (T, D) positions, rad, in the order of the motors."""
+        """Convert (T, D) positions, rad, in the order of the motors, to LeRobot's values (T, D)."""
         columns = zip(self.motors, joint_position.T, strict=True)
         return np.stack([motor.value(position) for motor, position in columns], axis=1)
 
 
 @dataclass(frozen=True, kw_only=True)
 class RealArm:
-    """An arm as LeRobot drives it.
+    """An arm driven by LeRobot.
 
     Attributes:
-        robot_type: What LeRobot calls it in datasets.
-        middles: Joint of the URDF, in LeRobot's order, the gripper's last -> its position, rad, in the middle of the
-            range that `lerobot-calibrate` finds.
-        calibration: Name of the file in `CALIBRATIONS` of an arm that is built as its URDF says.
+        robot_type: LeRobot's name in datasets.
+        middles: Joint of the URDF, in LeRobot's order, gripper last -> its position, rad, in the middle of the range
+            that `lerobot-calibrate` finds.
+        calibration: Name of the file in `CALIBRATIONS` for an arm built exactly as its URDF.
     """
 
     robot_type: str
@@ -149,10 +149,10 @@ class RealArm:
     calibration: str
 
     def motors(self, units: MotorUnits = "degrees", calibration: Path | None = None) -> Motors:
-        """The servos, by a calibration that LeRobot saved, or by that of an arm that is built as its URDF says.
+        """Build the servos from a calibration saved by LeRobot, or from that of an arm built exactly as its URDF.
 
         Raises:
-            ConfigError: The file is no calibration of such an arm.
+            ConfigError: The file is not a calibration of such an arm.
         """
         path = calibration or CALIBRATIONS / self.calibration
         found, (*_, gripper) = read_calibration(path, tuple(self.middles)), self.middles
@@ -169,7 +169,7 @@ class RealArm:
 
 
 def read_calibration(path: Path, names: tuple[str, ...]) -> dict[str, MotorCalibration]:
-    """Motor -> its entry in a file that LeRobot saved; ConfigError for what is no calibration of motors so called."""
+    """Read motor -> its entry in a file saved by LeRobot; ConfigError if it is not a calibration of these motors."""
     try:
         entries = parse_json(read_text_limited(path, _MAX_BYTES))
         if not isinstance(entries, dict) or set(entries) != set(names):
@@ -186,7 +186,7 @@ def read_calibration(path: Path, names: tuple[str, ...]) -> dict[str, MotorCalib
                 raise ValueError(f"the drive_mode of {name} is {motor.drive_mode}, allowed are 0 and 1")
     except (OSError, ValueError) as error:
         raise ConfigError(
-            f"This is no calibration that LeRobot saved ({describe_error(error)}): {path}; lerobot-calibrate writes "
+            f"This is not a calibration saved by LeRobot ({describe_error(error)}): {path}; lerobot-calibrate writes "
             "one, below ~/.cache/huggingface/lerobot/calibration/robots."
         ) from error
     return found

@@ -1,4 +1,4 @@
-"""Wavefront OBJ files, read once for all who need a mesh: those who draw it and those who describe it."""
+"""Reader of Wavefront OBJ files, shared by drawing and description."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from demorec.core.geometry import Array
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ObjMaterial:
-    """What colours a face.
+    """Colour of a face.
 
     Attributes:
         color: (3,) diffuse RGB, 0..1.
-        texture: Image, if it is there.
+        texture: Image, if it exists.
     """
 
     color: Array
@@ -32,11 +32,11 @@ class ObjFile:
     Attributes:
         points: (V, 3) in the file's unit.
         uvs: (U, 2) texture coordinates.
-        normals: (N, 3) as the file has them, of any length.
-        corners: (F, 3, 3) of each corner of each triangle: the numbers of its point, texture coordinate and normal,
-            counted from 1; 0 for none. The points are there, the others are as the file has them.
+        normals: (N, 3) unnormalised, as in the file.
+        corners: (F, 3, 3) for each corner of each triangle: the numbers of its point, texture coordinate and normal,
+            counted from 1; 0 if missing. Point numbers are validated, the others are not.
         face_materials: (F,) name of each triangle's material, "" without one.
-        materials: Name -> material, of the MTL files that it names and that are there.
+        materials: Name -> material, from the existing MTL files that it names.
     """
 
     points: Array
@@ -57,7 +57,7 @@ def read_obj(path: Path) -> ObjFile:
 
     Raises:
         OSError: It cannot be read.
-        ValueError, IndexError: It is no OBJ file, or a face names a point that the file does not have.
+        ValueError, IndexError: It is not an OBJ file, or a face refers to a missing point.
     """
     points: list[list[float]] = []
     uvs: list[list[float]] = []
@@ -72,7 +72,7 @@ def read_obj(path: Path) -> ObjFile:
         if "-" not in corner and len(parts) == 3 and "" not in parts:
             return int(parts[0]), int(parts[1]), int(parts[2])
         parts = [*parts, "", ""][:3]
-        # Negative numbers count back from the latest; 0 stands for "none".
+        # Negative numbers count back from the latest; 0 means "none".
         counts = (len(points), len(uvs), len(normals))
         a, b, c = (
             0 if not part else int(part) + (count + 1 if part[0] == "-" else 0)
@@ -111,12 +111,12 @@ def read_obj(path: Path) -> ObjFile:
 
 
 def _lines(path: Path) -> Iterator[list[str]]:
-    """The words of each line that has any."""
+    """Yield the words of each non-empty line."""
     return filter(None, map(str.split, path.read_text(errors="replace").splitlines()))
 
 
 def _materials(path: Path) -> dict[str, ObjMaterial]:
-    """ObjMaterial name -> material, of an MTL file; a missing file means no materials."""
+    """Read name -> material of an MTL file; a missing file means no materials."""
     found: dict[str, ObjMaterial] = {}
     name = None
     if not path.is_file():
@@ -129,7 +129,7 @@ def _materials(path: Path) -> dict[str, ObjMaterial]:
             color = np.array([float(word) for word in words[:3]])
             found[name] = ObjMaterial(color=color, texture=found[name].texture)
         elif name is not None and key == "map_Kd" and words:
-            # Options (-s 1 1 1, ...) stand before the name.
+            # Options (-s 1 1 1, ...) precede the name.
             texture = path.parent / words[-1]
             found[name] = ObjMaterial(color=found[name].color, texture=texture if texture.is_file() else None)
     return found

@@ -1,4 +1,4 @@
-"""A robot as data: what its URDF does not say."""
+"""Robots as data, beyond their URDFs."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from demorec.core.geometry import Array
 
 @dataclass(frozen=True, kw_only=True)
 class ParallelGripper:
-    """Two fingers that slide along one line, each by half the opening; the TCP lies midway between them.
+    """Two fingers that slide along one line, each by half the opening; the TCP is midway between them.
 
-    What an opening means is known here alone: the rest of the program handles joint vectors and openings, and asks. A
-    gripper of another kind has the same attributes and methods, as `JawGripper` has.
+    Only this class interprets an opening: the rest of the program handles joint vectors and openings, and calls it. A
+    gripper of another kind has the same attributes and methods, like `JawGripper`.
 
     Attributes:
         joints: Names of the finger joints; the first one leads.
         finger_links: The link of each finger that touches the object.
         max_width: Full opening, metres.
-        force: Of the motor of each joint, N.
-        finger_depth: How far the finger tips reach beyond the TCP, metres.
-        palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
+        force: Motor force of each joint, N.
+        finger_depth: Distance of the finger tips beyond the TCP, metres.
+        palm_clearance: Distance from the TCP back to the palm, metres, available for an object above the grasp.
     """
 
     joints: tuple[str, ...]
@@ -35,47 +35,47 @@ class ParallelGripper:
     palm_clearance: float
 
     joint_kind: ClassVar[str] = "prismatic"
-    """Of the joints in the URDF."""
+    """Kind of the joints in the URDF."""
     joint_speed: ClassVar[float] = 0.1
-    """With which the motor of each joint moves it, m/s."""
+    """Motor speed of each joint, m/s."""
     gear_ratios: ClassVar[tuple[float, ...]] = (1.0,)
-    """How far each joint after the first one moves for each unit of the first."""
+    """Motion of each joint after the first, relative to the first."""
     min_width: ClassVar[float] = 0.0
     """Opening, metres, when closed on nothing."""
     rotor_inertia: ClassVar[float] = 0.0
 
     @property
     def open_width(self) -> float:
-        """How far tasks open it, metres."""
+        """Opening used by tasks, metres."""
         return self.max_width
 
     def joint_position(self, width: Array | float) -> Array:
-        """Positions (..., n_joints), m, of the finger joints at openings (...), metres."""
+        """Compute positions (..., n_joints), m, of the finger joints at openings (...), metres."""
         return np.asarray(np.multiply.outer(width, np.full(len(self.joints), 0.5)))
 
     def stroke_seconds(self) -> float:
-        """How long the fingers take from closed to open, s."""
+        """Compute the time of the fingers from closed to open, s."""
         return self.max_width / (len(self.joints) * self.joint_speed)
 
     def width(self, joint_position: Array) -> Array:
-        """Openings (...), metres, at positions (..., n_joints), m, of the finger joints."""
+        """Compute openings (...), metres, at positions (..., n_joints), m, of the finger joints."""
         return np.asarray(joint_position.sum(axis=-1))
 
     def width_velocity(self, joint_position: Array, joint_velocity: Array) -> Array:
-        """Speeds (...), m/s, with which the opening grows; positions and velocities (..., n_joints), m and m/s."""
+        """Compute speeds (...), m/s, of the opening from positions and velocities (..., n_joints), m and m/s."""
         return np.asarray(joint_velocity.sum(axis=-1))
 
     def contact_force(self, width: Array) -> Array:
-        """Sum (...), N, of the forces of all fingers on what keeps them at openings (...), metres, apart."""
+        """Compute the sum (...), N, of all finger forces on an object that holds them at openings (...), metres."""
         return np.full(np.shape(width), len(self.joints) * self.force)
 
     def object_offset(self, object_width: float) -> float:
-        """From the TCP along its y to the middle of an object of this width, metres, before the fingers close on it."""
+        """Offset along the TCP's y to the middle of an object of this width, metres, before the fingers close on it."""
         del object_width
         return 0.0
 
     def scaled(self, scale: float) -> ParallelGripper:
-        """The same gripper with its lengths multiplied."""
+        """Multiply the gripper's lengths by a factor."""
         return replace(
             self,
             max_width=self.max_width * scale,
@@ -86,23 +86,23 @@ class ParallelGripper:
 
 @dataclass(frozen=True, kw_only=True)
 class JawGripper:
-    """One finger that is fixed to the hand, and a jaw that one joint turns.
+    """One finger fixed to the hand, and a jaw turned by one joint.
 
-    The TCP lies on the inner face of the fixed finger, its y axis points to the jaw. Between the rows of `opening` the
-    opening is interpolated linearly; of what lies beyond them, it is that of the nearest row.
+    The TCP is on the inner face of the fixed finger, its y axis points to the jaw. The opening is interpolated linearly
+    between the rows of `opening`; beyond them it is constant.
 
     Attributes:
         joints: Name of the jaw's joint.
         finger_links: The link of the fixed finger (which may be the hand itself), and that of the jaw.
-        opening: Position of the joint, rad, and the opening there, metres, measured at the tips; from closed (what the
-            expert closes to) to open (as far as it opens).
-        open_width: How far tasks open it, metres: a jaw that turns on may rise above what it shall grasp; 0: fully.
+        opening: Position of the joint, rad, and the opening there, metres, measured at the tips; from closed (as far as
+            the expert closes) to open (as far as it opens).
+        open_width: Opening used by tasks, metres: a jaw that turns farther may rise above the object to grasp; 0: full.
         force: Torque of the joint's motor, N m.
-        finger_depth: How far a finger reaches beyond the TCP, the jaw wherever it turns, metres.
-        palm_clearance: From the TCP back to the palm, metres: what fits between the fingers above the grasp.
-        play: Air between the fixed finger and an object before the jaw pushes it there, metres.
-        rotor_inertia: Of the motor, seen through its gears, kg m^2: a bare jaw is so light that the simulator's solver
-            gets neither its force nor its contacts right.
+        finger_depth: Maximum distance of a finger beyond the TCP, at any jaw angle, metres.
+        palm_clearance: Distance from the TCP back to the palm, metres, available for an object above the grasp.
+        play: Gap between the fixed finger and an object before the jaw pushes it there, metres.
+        rotor_inertia: Inertia of the motor after its gears, kg m^2: a bare jaw is so light that the simulator's solver
+            computes wrong forces and contacts.
     """
 
     joints: tuple[str, ...]
@@ -117,7 +117,7 @@ class JawGripper:
 
     joint_kind: ClassVar[str] = "revolute"
     joint_speed: ClassVar[float] = 1.0
-    """rad/s."""
+    """Motor speed of the joint, rad/s."""
     gear_ratios: ClassVar[tuple[float, ...]] = ()
 
     def __post_init__(self) -> None:
@@ -142,34 +142,34 @@ class JawGripper:
         return self.opening[-1][1]
 
     def joint_position(self, width: Array | float) -> Array:
-        """Positions (..., 1), rad, at openings (...), metres."""
+        """Compute positions (..., 1), rad, at openings (...), metres."""
         position, opening = np.array(self.opening).T
         return np.asarray(np.interp(width, opening, position)[..., np.newaxis])
 
     def stroke_seconds(self) -> float:
-        """How long the jaw takes from closed to where tasks open it, s."""
+        """Compute the time of the jaw from closed to the opening used by tasks, s."""
         return float(abs(self.joint_position(self.open_width)[0] - self.opening[0][0])) / self.joint_speed
 
     def width(self, joint_position: Array) -> Array:
-        """Openings (...), metres, at positions (..., 1), rad."""
+        """Compute openings (...), metres, at positions (..., 1), rad."""
         position, opening = self._rising()
         return np.asarray(np.interp(joint_position[..., 0], position, opening))
 
     def width_velocity(self, joint_position: Array, joint_velocity: Array) -> Array:
-        """Speeds (...), m/s, with which the opening grows; positions and velocities (..., 1), rad and rad/s."""
+        """Compute speeds (...), m/s, of the opening from positions and velocities (..., 1), rad and rad/s."""
         return np.asarray(self._slope(joint_position[..., 0]) * joint_velocity[..., 0])
 
     def contact_force(self, width: Array) -> Array:
-        """As of `ParallelGripper`: the jaw's force is its torque over d opening / d angle, the fixed finger's equal."""
+        """See `ParallelGripper`; the jaw's force is its torque over d opening / d angle, the fixed finger's equal."""
         slope = np.abs(self._slope(self.joint_position(width)[..., 0]))
         return np.asarray(2 * self.force / np.maximum(slope, 1e-6))
 
     def object_offset(self, object_width: float) -> float:
-        """As of `ParallelGripper`: the object begins a little beside the fixed finger, against which it is pushed."""
+        """See `ParallelGripper`; the object starts slightly away from the fixed finger, and is pushed against it."""
         return object_width / 2 + self.play
 
     def scaled(self, scale: float) -> JawGripper:
-        """The same gripper with its lengths multiplied."""
+        """Multiply the gripper's lengths by a factor."""
         return replace(
             self,
             opening=tuple((position, width * scale) for position, width in self.opening),
@@ -180,19 +180,19 @@ class JawGripper:
         )
 
     def _rising(self) -> tuple[Array, Array]:
-        """Positions, rising, and the openings there."""
+        """Positions in increasing order, and the openings there."""
         position, opening = np.array(sorted(self.opening)).T
         return position, opening
 
     def _slope(self, position: Array) -> Array:
-        """d opening / d position, m/rad; beyond the rows that of the nearest two."""
+        """Compute d opening / d position, m/rad; beyond the rows that of the nearest two."""
         at, opening = self._rising()
         piece = np.clip(np.searchsorted(at, position, side="right") - 1, 0, len(at) - 2)
         return np.asarray((np.diff(opening) / np.diff(at))[piece])
 
 
 Gripper = ParallelGripper | JawGripper
-"""What opens and closes: each kind answers the same questions."""
+"""A gripper of any kind; all have the same methods."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -201,22 +201,22 @@ class RobotSpec:
 
     Attributes:
         name: Row of the robots' table.
-        urdf: Path below pybullet_data, "demorec:NAME" for a file of `demorec/sim/assets`, or "MODULE:NAME" for one
-            beside a module of one's own.
+        urdf: Path below pybullet_data, "demorec:NAME" for a file of `demorec/sim/assets`, or "MODULE:NAME" for one next
+            to a user's module.
         base_link: Root link of the URDF.
         arm_joints: Names of the arm's joints, base to flange.
-        tcp_link: Link whose frame is the tool centre point: z out of the hand, y along the fingers' motion.
+        tcp_link: Link with its frame at the tool centre point: z out of the hand, y along the fingers' motion.
         hand_link: Link that carries the wrist camera and the fingers; the force-torque sensor is where it is mounted.
-        home_q: (n_arm,) rest configuration, rad. Layouts of a small arm leave free what its fingers hang over too low.
+        home_q: (n_arm,) rest configuration, rad. Layouts of a small arm keep the area below its low fingers free.
         position_lower, position_upper: (n_arm,) rad.
         velocity_limit: (n_arm,) rad/s.
         acceleration_limit: (n_arm,) rad/s^2.
         torque_limit: (n_arm,) N m.
-        gripper: What opens and closes.
+        gripper: The gripper.
         task_scale: Factor on the lengths of the tasks' layouts and of the expert's heights: 1 for an arm that reaches
             0.3 to 0.7 m from its base with the hand down, less for a small one.
-        wrist_camera: Eye, target and up of a camera on the hand where the arm has a usual mount, in the TCP's frame,
-            metres; (): as the camera's preset has them.
+        wrist_camera: Eye, target and up of the usual camera on the hand, in the TCP's frame, metres; (): those of the
+            camera's preset.
     """
 
     name: str
@@ -241,5 +241,5 @@ class RobotSpec:
         return self.arm_joints + self.gripper.joints
 
     def scaled(self, scale: float) -> RobotSpec:
-        """The same robot with its lengths multiplied, as `RobotPlacement.scale` does to the URDF."""
+        """Multiply the robot's lengths by a factor, as `RobotPlacement.scale` does in the URDF."""
         return replace(self, gripper=self.gripper.scaled(scale))

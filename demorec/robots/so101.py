@@ -1,9 +1,9 @@
 """SO-101 follower arm of The Robot Studio and Hugging Face (`demorec/sim/assets/so101.urdf`): five joints and a jaw.
 
-Position limits are the URDF's. Every joint is driven by a servo STS3215 with gears of 1:345; at 7.4 V its data sheet
-has a stall torque of 19.5 kg cm and 52 turns a minute without load. Nobody publishes acceleration limits. The jaw
-closes with a tenth of that torque: 2.7 N at its tip hold whatever fits. Of its motor's inertia (0.028 kg m^2 in MuJoCo
-Menagerie's model) it has as much as its contacts need.
+Position limits are the URDF's. Every joint is driven by an STS3215 servo with 1:345 gears; at 7.4 V its data sheet
+specifies a stall torque of 19.5 kg cm and 52 rpm without load. Acceleration limits are not published. The jaw closes
+with a tenth of that torque: 2.7 N at its tip hold any object that fits. Its motor's inertia (0.028 kg m^2 in MuJoCo
+Menagerie's model) is reduced to the value that its contacts need.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from demorec.robots.motors import RealArm
 from demorec.robots.robot import JawGripper, RobotSpec
 
 STALL_TORQUE = 19.5e-2 * 9.80665
-"""N m."""
+"""Stall torque of the servo, N m."""
 NO_LOAD_SPEED = 52.0 * 2.0 * math.pi / 60.0
-"""rad/s."""
+"""Speed of the servo without load, rad/s."""
 
 SO101 = RobotSpec(
     name="so101",
@@ -34,7 +34,8 @@ SO101 = RobotSpec(
     gripper=JawGripper(
         joints=("gripper",),
         finger_links=("gripper_link", "moving_jaw_so101_v1_link"),
-        # Measured on the meshes: the jaw's nearest point to the plane of the fixed finger, below 12 mm above the TCP.
+        # Measured on the meshes: the jaw's nearest point to the plane of the fixed finger, less than 12 mm above the
+        # TCP.
         opening=(
             (-0.17, 0.0022),
             (-0.1, 0.0078),
@@ -42,7 +43,7 @@ SO101 = RobotSpec(
             (0.1, 0.0230),
             (0.2, 0.0303),
             (0.25, 0.0340),
-            # A point of its tip there, followed as it turns on and up to its stop.
+            # A point of its tip, tracked as it turns farther to its stop.
             (0.6, 0.0552),
             (1.0, 0.0753),
             (1.4, 0.0881),
@@ -55,7 +56,7 @@ SO101 = RobotSpec(
         rotor_inertia=1e-4,
     ),
     task_scale=0.38,
-    # The mount of LeRobot's users: beside the gripper's motor, looking at the finger tips.
+    # The usual mount in the LeRobot community: next to the gripper's motor, looking at the finger tips.
     wrist_camera=((0.0552, 0.0079, -0.0531), (0.0, 0.0079, 0.033), (1.0, 0.0, 0.0)),
 )
 
@@ -71,7 +72,7 @@ SO101_FOLLOWER = RealArm(
     },
     calibration="so101_urdf.json",
 )
-"""`lerobot-record --robot.type=so101_follower` (0.6.1) writes this robot type, that of SO-100 and SO-101 alike. The
-URDF's zeros lie in the middle of what its joints can turn, between the stops that `lerobot-calibrate` finds; the roll
-turns all around, and is set to its zero by hand. LeRobot's own kinematics take such degrees for angles of this URDF. Of
-an arm that is built so, the servos are set to 2047 there, and their ranges are the URDF's limits."""
+"""`lerobot-record --robot.type=so101_follower` (0.6.1) writes this robot type for SO-100 and SO-101. The URDF's zeros
+are in the middle of the joints' ranges, between the stops that `lerobot-calibrate` finds; the roll has no stops, and
+its zero is set by hand. LeRobot's own kinematics interpret such degrees as angles of this URDF. On an arm built this
+way, the servos are set to 2047 there, and their ranges are the URDF's limits."""

@@ -1,4 +1,4 @@
-"""Whether a robot's spec fits its URDF, judged from both texts before a simulator is started."""
+"""Consistency check of a robot's spec and its URDF, from both texts before a simulator is started."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from demorec.robots.robot import JawGripper, RobotSpec
 from demorec.robots.urdf import JointDynamics, Urdf, UrdfJoint, read_dynamics
 
 LIMIT_TOLERANCE = 1e-4
-"""How far a spec's position limit may be beyond the URDF's, rad or m: both are rounded."""
+"""Maximum excess of a spec's position limit over the URDF's, rad or m: both are rounded."""
 _PER_ARM_JOINT = ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
 _MAX_NAMES = 30
 _LINKAGES = 'docs/robots.md, "Grippers with linkages", says what to do'
 
 
 def checked_urdf(spec: RobotSpec, *, scale: float = 1.0) -> Urdf:
-    """Read the URDF of a robot, and check that the spec fits it.
+    """Read a robot's URDF, and check that the spec fits it.
 
     Args:
-        spec: The robot; its gripper's lengths are scaled already.
+        spec: The robot, with its gripper's lengths already scaled.
         scale: Uniform scale of the URDF.
 
     Raises:
-        SceneError: There is no such URDF, it cannot be read, or a robot like this cannot be simulated; says the first
-            reason and what to change.
+        SceneError: The URDF does not exist, cannot be read, or describes a robot that cannot be simulated; the message
+            states the first reason and the fix.
     """
     path = asset_path(spec.urdf)
     try:
@@ -41,7 +41,7 @@ def checked_urdf(spec: RobotSpec, *, scale: float = 1.0) -> Urdf:
 
 
 def spec_problems(spec: RobotSpec, urdf: Urdf, dynamics: Mapping[str, JointDynamics]) -> Iterator[str]:
-    """What is wrong with a spec and what to change; each problem assumes that there were none before."""
+    """Yield problems of a spec with their fixes; each assumes that the previous ones are solved."""
     yield from _unknown_names(spec, urdf)
     yield from _wrong_counts(spec)
     by_name = {joint.name: joint for joint in urdf.joints}
@@ -88,7 +88,7 @@ def _wrong_counts(spec: RobotSpec) -> Iterator[str]:
 
 
 def _wrong_chain(spec: RobotSpec, urdf: Urdf) -> Iterator[str]:
-    """The joints on the way to the TCP; then those on the way to the hand and to the fingers."""
+    """Check the joints in the chain to the TCP; then those to the hand and to the fingers."""
     chain = [joint.name for joint in urdf.path_to(spec.tcp_link) if joint.kind != "fixed"]
     if chain != list(spec.arm_joints):
         yield (
@@ -103,7 +103,7 @@ def _arm_limits(spec: RobotSpec, joints: list[UrdfJoint]) -> Iterator[str]:
     rows = zip(joints, spec.position_lower, spec.position_upper, spec.home_q, strict=True)
     for joint, low, high, home in rows:
         if joint.kind not in ("revolute", "continuous"):
-            yield f"the arm joint {joint.name!r} is {joint.kind}; only joints that turn can be in arm_joints"
+            yield f"the arm joint {joint.name!r} is {joint.kind}; only revolute joints can be in arm_joints"
         elif not joint.lower - LIMIT_TOLERANCE <= low < high <= joint.upper + LIMIT_TOLERANCE:
             yield (
                 f"the limits of {joint.name} are {low:g} to {high:g} rad; give two that rise, within the URDF's "
@@ -130,7 +130,7 @@ def _gripper_joints(spec: RobotSpec, joints: list[UrdfJoint]) -> Iterator[str]:
         if low < joint.lower - LIMIT_TOLERANCE or high > joint.upper + LIMIT_TOLERANCE:
             fix = "shorten the table" if is_jaw else "set max_width to twice its stroke, and turn an axis that closes"
             yield (
-                f"the opening of the gripper moves {joint.name} from {low:g} to {high:g}, the URDF allows "
+                f"the opening of the gripper moves {joint.name} from {low:g} to {high:g}, but the URDF allows "
                 f"{joint.lower:g} to {joint.upper:g}; {fix}"
             )
 

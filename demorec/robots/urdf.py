@@ -1,7 +1,6 @@
-"""The one reader of URDFs, without the simulator: the tree of their joints, and the shapes and masses of their links.
+"""The only reader of URDFs, without the simulator: the joint tree, and the shapes and masses of the links.
 
-Kinematics, playback, the recorded description and images that are drawn without a simulator read URDFs through this
-module; what they make of them is their own.
+Kinematics, playback, the recorded description and images drawn without a simulator all read URDFs through this module.
 """
 
 from __future__ import annotations
@@ -20,29 +19,29 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Rgba
 
 MAX_BYTES = 4 << 20
-"""Of a URDF: the largest of pybullet_data has 32 kB."""
+"""Maximum size of a URDF: the largest in pybullet_data has 32 kB."""
 _MAX_JOINTS = 500
 _MAX_SHAPES = 5000
 _PRIMITIVES = ("box", "sphere", "cylinder")
 
 
 def parse_xml(text: str) -> ET.Element:
-    """The root of an XML text of unknown origin; ValueError for what is none, is very large or defines entities.
+    """Parse XML of unknown origin; ValueError if it is invalid, very large or defines entities.
 
-    Entities can expand a small file without end; no URDF needs a document type.
+    Entities can expand a small file without limit; no URDF needs a document type.
     """
     if len(text) > MAX_BYTES:
         raise ValueError(f"the URDF has {len(text):,} characters, allowed are {MAX_BYTES:,}")
     if "<!DOCTYPE" in text or "<!ENTITY" in text:
-        raise ValueError("the URDF has a document type, which none needs")
+        raise ValueError("the URDF has a document type, which is not allowed")
     try:
         return ET.fromstring(text)
     except ET.ParseError as error:
-        raise ValueError(f"the URDF is no XML ({error})") from error
+        raise ValueError(f"the URDF is not valid XML ({error})") from error
 
 
 def read_numbers(text: str, count: int) -> list[float]:
-    """The first so many finite numbers of a text, as PyBullet reads them; ValueError where there are none."""
+    """Read the first `count` finite numbers of a text, as PyBullet does; ValueError if there are fewer."""
     try:
         values = [float(word) for word in text.split()]
     except ValueError:
@@ -62,7 +61,7 @@ class UrdfJoint:
         kind: "revolute", "continuous", "prismatic" or "fixed".
         parent_from_joint: Pose of the joint frame (= child link frame at position 0).
         axis: Unit vector in the joint frame.
-        lower, upper: Position limits, rad or m; infinite where the URDF has none.
+        lower, upper: Position limits, rad or m; infinite if the URDF has none.
     """
 
     name: str
@@ -77,7 +76,7 @@ class UrdfJoint:
 
 @dataclass(frozen=True, kw_only=True)
 class Urdf:
-    """The joint tree of a URDF, lengths multiplied by `scale`; ValueError when the joints make no tree."""
+    """The joint tree of a URDF, lengths multiplied by `scale`; ValueError if the joints are not a tree."""
 
     joints: tuple[UrdfJoint, ...]
     root: str
@@ -96,17 +95,17 @@ class Urdf:
         strays += [joint for joints in below.values() for joint in joints]
         if strays:
             names = ", ".join(joint.name for joint in strays)
-            raise ValueError(f"the joints of a URDF make one tree, but these do not belong to it: {names}")
+            raise ValueError(f"the joints of a URDF must be one tree, but these do not belong to it: {names}")
 
     @classmethod
     def load(cls, path: Path, *, scale: float = 1.0) -> Urdf:
-        """Read the joints of a URDF file; ValueError when they are no tree with one root link."""
+        """Read the joints of a URDF file; ValueError if they are not a tree with one root link."""
         return cls.parse(path.read_text(), scale=scale)
 
     @classmethod
     @lru_cache(maxsize=8)
     def parse(cls, text: str, *, scale: float = 1.0) -> Urdf:
-        """The same from its text; ValueError also when that is no XML, or its joints are no tree."""
+        """Read the joints from a URDF's text; ValueError if it is not XML, or the joints are not a tree."""
         robot = parse_xml(text)
         elements = robot.findall("joint")
         if len(elements) > _MAX_JOINTS:
@@ -115,9 +114,9 @@ class Urdf:
             joints = tuple(_joint(element, scale) for element in elements)
             links = [link.attrib["name"] for link in robot.findall("link")]
         except KeyError as error:
-            raise ValueError(f"a joint or link of the URDF lacks something, its {error}") from error
+            raise ValueError(f"a joint or link of the URDF lacks its {error}") from error
         except AttributeError as error:
-            raise ValueError("a joint of the URDF lacks something, its parent or its child") from error
+            raise ValueError("a joint of the URDF lacks its parent or its child") from error
         children = {joint.child for joint in joints}
         roots = [link for link in links if link not in children]
         if not links and "xacro" in text:
@@ -127,7 +126,7 @@ class Urdf:
         return cls(joints=joints, root=roots[0])
 
     def link_poses(self, joint_position: Mapping[str, float]) -> dict[str, Pose]:
-        """Link name -> base_from_link for the given joint positions (rad, m); joints left out are at 0."""
+        """Compute link name -> base_from_link for the given joint positions (rad, m); missing joints are at 0."""
         poses = {self.root: Pose()}
         for joint in self.depth_first():
             moved = joint_motion(joint, joint_position.get(joint.name, 0.0))
@@ -135,7 +134,7 @@ class Urdf:
         return poses
 
     def depth_first(self) -> tuple[UrdfJoint, ...]:
-        """Every joint below the root, in the order in which PyBullet numbers the links that hang on them."""
+        """List every joint below the root, in the order in which PyBullet numbers their child links."""
 
         def below(link: str) -> Iterator[UrdfJoint]:
             for joint in self.joints:
@@ -146,7 +145,7 @@ class Urdf:
         return tuple(below(self.root))
 
     def path_to(self, link: str) -> tuple[UrdfJoint, ...]:
-        """The joints from the root to `link`; KeyError when there is no such link."""
+        """List the joints from the root to `link`; KeyError if the link does not exist."""
         by_child = {joint.child: joint for joint in self.joints}
         path: list[UrdfJoint] = []
         while link != self.root:
@@ -156,7 +155,7 @@ class Urdf:
 
 
 def joint_motion(joint: UrdfJoint, position: float) -> Pose:
-    """The transform of a joint at `position` (rad or m), about or along its axis."""
+    """Compute the transform of a joint at `position` (rad or m), about or along its axis."""
     if joint.kind == "prismatic":
         return Pose(position=np.array(joint.axis) * position)
     if joint.kind == "fixed":
@@ -187,7 +186,7 @@ def _joint(element: ET.Element, scale: float) -> UrdfJoint:
 
 
 class JointDynamics(NamedTuple):
-    """What a joint loses.
+    """Losses of a joint.
 
     Attributes:
         damping: Viscous, N m s/rad or N s/m.
@@ -199,7 +198,7 @@ class JointDynamics(NamedTuple):
 
 
 def read_dynamics(text: str) -> dict[str, JointDynamics]:
-    """Joint -> its <dynamics>, of the joints of a URDF that have one; ValueError for values below 0."""
+    """Read joint -> its <dynamics>, for joints that have one; ValueError if a value is below 0."""
     found = {}
     for joint in parse_xml(text).findall("joint"):
         element = joint.find("dynamics")
@@ -214,7 +213,7 @@ def read_dynamics(text: str) -> dict[str, JointDynamics]:
 
 
 def quat_from_rpy(rpy: Sequence[float]) -> Array:
-    """URDF's roll, pitch, yaw about fixed axes (rad) as a unit quaternion (x, y, z, w)."""
+    """Convert URDF's roll, pitch, yaw about fixed axes (rad) to a unit quaternion (x, y, z, w)."""
     (sr, sp, sy), (cr, cp, cy) = [math.sin(a / 2) for a in rpy], [math.cos(a / 2) for a in rpy]
     return np.array(
         [
@@ -234,12 +233,12 @@ class UrdfShape:
     """One <visual> or <collision>, lengths multiplied by the scale.
 
     Attributes:
-        kind: Which geometry; decides what `size` means.
+        kind: Geometry; decides the meaning of `size`.
         size: box: (x, y, z) full extents, metres; sphere: (radius,); cylinder and capsule: (radius, length) along z;
-            mesh: (x, y, z) factors by which the file is scaled; plane: ().
-        file: mesh: as the URDF names it (`demorec.robots.assets.mesh_path` finds it); otherwise "".
-        link_from_shape: Pose in the link's frame.
-        rgba: Colour of its material, 0..1; None without a material that has one.
+            mesh: (x, y, z) scale factors of the file; plane: ().
+            file: mesh: name in the URDF (`demorec.robots.assets.mesh_path` finds it); otherwise "".
+            link_from_shape: Pose in the link's frame.
+            rgba: Colour of its material, 0..1; None if the material has no colour.
     """
 
     kind: UrdfShapeKind
@@ -255,7 +254,7 @@ class UrdfLink:
 
     Attributes:
         name: Unique in the URDF.
-        visuals, collisions: Its shapes, in the order of the file; those of an unknown geometry are left out.
+        visuals, collisions: Its shapes, in the order of the file, without unknown geometries.
     """
 
     name: str
@@ -264,15 +263,14 @@ class UrdfLink:
 
 
 def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
-    """The links of a URDF, in the order of the file.
+    """Read the links of a URDF, in the order of the file.
 
     Args:
         text: The URDF.
         scale: Uniform scale.
 
     Raises:
-        ValueError: The text is no XML that may be read (`parse_xml`), or a shape lacks a size or has one that is no
-            finite number.
+        ValueError: The text is not acceptable XML (`parse_xml`), or a shape lacks a size or has one that is not finite.
     """
     robot = parse_xml(text)
     colors = {
@@ -292,15 +290,15 @@ def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
 
 
 def mesh_names(text: str) -> tuple[str, ...]:
-    """The mesh files that the shapes of a URDF name, sorted; ValueError for what is not XML.
+    """List the mesh files named by a URDF's shapes, sorted; ValueError if it is not XML.
 
-    Other files that it names, such as plug-ins of Gazebo, belong to other programs.
+    Other files named in it, such as Gazebo plug-ins, belong to other programs.
     """
     return tuple(sorted({mesh.attrib["filename"] for mesh in mesh_elements(parse_xml(text))}))
 
 
 def mesh_elements(robot: ET.Element) -> list[ET.Element]:
-    """The <mesh> elements of the shapes of all links."""
+    """List the <mesh> elements of the shapes of all links."""
     shapes = [*robot.iterfind("link/visual"), *robot.iterfind("link/collision")]
     return [mesh for shape in shapes for mesh in shape.iterfind("geometry/mesh") if mesh.get("filename")]
 
@@ -336,7 +334,7 @@ def _shape(element: ET.Element, geometry: ET.Element, scale: float, colors: dict
 
 
 def _origin(element: ET.Element | None, scale: float) -> Pose:
-    """The <origin> of an element; where there is none, no displacement."""
+    """Read the <origin> of an element; the identity if it is missing."""
     origin = None if element is None else element.find("origin")
     if origin is None:
         return Pose()
@@ -354,9 +352,9 @@ def _rgba(material: ET.Element) -> Rgba | None:
     return (r, g, b, a)
 
 
-@lru_cache(maxsize=8)  # all recordings of a robot have the same
+@lru_cache(maxsize=8)  # all recordings of a robot have the same text
 def check_primitives(text: str) -> None:
-    """ValueError unless a URDF can be used, and drawn without any other file: boxes, balls and cylinders alone."""
+    """Raise ValueError unless a URDF is valid and self-contained: only boxes, spheres and cylinders."""
     Urdf.parse(text)
     robot = parse_xml(text)
     shapes = robot.findall("link/visual/geometry/*")

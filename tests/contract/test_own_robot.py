@@ -103,7 +103,7 @@ def test_a_link_without_a_mass_is_refused_before_anything_is_made(
     told = capfd.readouterr()
     assert told.out == ""
     assert re.fullmatch(
-        r"generate-dataset: The robot cannot be simulated, since its URDF does not say what these links weigh: 'link6' "
+        r"generate-dataset: The robot cannot be simulated, since its URDF lacks the masses of these links: 'link6' "
         r"\(moves and has a shape, but no <inertial>\).*: my_robots:xarm6.urdf\n",
         told.err,
     )
@@ -147,7 +147,7 @@ def edited(path: Path, *changes: tuple[str, str]) -> None:
             [('"prismatic"', '"revolute"')],
             r"'gripper_left_joint' is revolute, a ParallelGripper has two prismatic joints; docs/robots.md",
         ),
-        ("xarm6.urdf", [('name="joint2" type="revolute"', 'name="joint2" type="prismatic"')], "joints that turn"),
+        ("xarm6.urdf", [('name="joint2" type="revolute"', 'name="joint2" type="prismatic"')], "revolute joints"),
         (
             "xarm6.urdf",
             [('type="revolute">', 'type="revolute"><dynamics friction="90"/>')],
@@ -329,7 +329,7 @@ def test_a_model_from_elsewhere_cannot_be_recorded(folder: Path, tmp_path: Path)
     from demorec.robots.assets import allow_models, model_name
 
     shutil.copy(folder / "xarm6.urdf", tmp_path / "xarm6.urdf")
-    with pytest.raises(ConfigError, match="put it beside the module, found "):
+    with pytest.raises(ConfigError, match="put it next to the module, found "):
         model_name(str(tmp_path / "xarm6.urdf"), "my_robots")
     allow_models(["my_robots"])
     with pytest.raises(SceneError, match="is outside"):

@@ -170,12 +170,12 @@ def test_a_missing_lerobot_is_no_fault_of_a_dataset(
     [
         ('<!DOCTYPE r [<!ENTITY a "b">]><robot/>', "has a document type"),
         ("<robot>" + " " * (5 << 20) + "</robot>", "characters, allowed are"),
-        ('<robot><link name="a"/><joint name="j" type="fixed"/></robot>', "lacks something"),
+        ('<robot><link name="a"/><joint name="j" type="fixed"/></robot>', "lacks its parent"),
         (
             """<robot><link name="r"/><link name="a"/><link name="b"/>
             <joint name="j" type="fixed"><parent link="a"/><child link="b"/></joint>
             <joint name="k" type="fixed"><parent link="b"/><child link="a"/></joint></robot>""",
-            "make one tree",
+            "must be one tree",
         ),
         (
             '<robot><link name="r"><visual><geometry><box size="1 nan 1"/></geometry></visual></link></robot>',

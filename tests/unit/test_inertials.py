@@ -63,8 +63,8 @@ def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
     ("text", "sentence"),
     [
         (arm(arm=BOX), r"'arm' \(moves and has a shape, but no <inertial>\)"),
-        (arm(arm=""), r"'arm' \(moves, but weighs nothing\)"),
-        (arm(arm=inertial(mass="0")), r"'arm' \(moves, but weighs nothing\)"),
+        (arm(arm=""), r"'arm' \(moves, but has no mass\)"),
+        (arm(arm=inertial(mass="0")), r"'arm' \(moves, but has no mass\)"),
         (arm(tool=BOX), r"'tool' \(moves and has a shape, but no <inertial>\)"),
         (arm(arm=inertial(mass="-1")), r"'arm' \(a mass of -1 kg\)"),
         (arm(base=inertial(mass="-1")), r"'base' \(a mass of -1 kg\)"),
@@ -74,21 +74,21 @@ def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
         (arm(arm=inertial(mass="20000")), r"'arm' \(a mass of 20000 kg\)"),
         (arm(arm="<inertial/>"), "without mass or inertia"),
         (arm(arm='<inertial><mass value="1"/></inertial>'), "without mass or inertia"),
-        (arm(arm=inertial(moments=("0", "0", "0"))), "smallest principal value is 0 kg"),
-        (arm(arm=inertial(moments=("0.01", "-0.01", "0.01"))), "smallest principal value is -0.01 kg"),
-        (arm(arm=inertial(xy="0.02")), "smallest principal value is -0.01 kg"),
+        (arm(arm=inertial(moments=("0", "0", "0"))), "smallest principal value of 0 kg"),
+        (arm(arm=inertial(moments=("0.01", "-0.01", "0.01"))), "smallest principal value of -0.01 kg"),
+        (arm(arm=inertial(xy="0.02")), "smallest principal value of -0.01 kg"),
         (arm(arm=inertial(moments=("0.01", "nan", "0.01"))), "a finite number"),
         (
             arm(arm=inertial(moments=("5000", "5000", "5000"))),
             r"principal inertias of 5e\+03 to 5e\+03 kg m\^2 for 2 kg",
         ),
         (arm(arm=BOX, tool=BOX), "'arm' .*, 'tool' "),
-        (arm(arm="", tool=BOX + inertial(moments=("0", "0", "0"))), "'tool' .*smallest principal value is 0 kg"),
-        (arm(tool=BOX + inertial(moments=("0.01", "-0.01", "0.01"))), "'tool' .*smallest principal value is -0.01"),
+        (arm(arm="", tool=BOX + inertial(moments=("0", "0", "0"))), "'tool' .*smallest principal value of 0 kg"),
+        (arm(tool=BOX + inertial(moments=("0.01", "-0.01", "0.01"))), "'tool' .*smallest principal value of -0.01"),
     ],
 )
 def test_a_link_that_no_body_can_be_is_named(tmp_path: Path, text: str, sentence: str) -> None:
-    with pytest.raises(ValueError, match=r"does not say what these links weigh: .*" + sentence):
+    with pytest.raises(ValueError, match=r"lacks the masses of these links: .*" + sentence):
         require_masses(text)
 
 
@@ -109,7 +109,7 @@ def test_a_frame_weighs_nothing_and_the_engine_is_not_heard(
     assert [client.getDynamicsInfo(body, link)[0] for link in range(-1, 3)] == [0, 0, 2, 0]
     assert abs(client.getJointState(body, 1)[3]) == pytest.approx(2 * 9.81 * 0.5, rel=1e-3)
     file.write_text(arm(arm=BOX))
-    with pytest.raises(ConfigError, match="The robot cannot be simulated, since its URDF does not say"):
+    with pytest.raises(ConfigError, match="The robot cannot be simulated, since its URDF lacks the masses"):
         load_urdf(client, "arm.urdf", Pose(), scale=1.0, is_fixed=True, what="robot", is_robot=True)
     load_urdf(client, "arm.urdf", Pose(), scale=1.0, is_fixed=True, what="body")
     client.disconnect()

@@ -95,7 +95,7 @@ def test_a_mesh_is_found_where_ros_would_find_it(
     elsewhere = tmp_path / "a" / "b" / "c" / "d" / "e" / "f" / "g"
     elsewhere.mkdir(parents=True)
     monkeypatch.chdir(elsewhere)
-    with pytest.raises(SceneError, match="put the package 'vendor_description' beside it or on ROS_PACKAGE_PATH"):
+    with pytest.raises(SceneError, match="put the package 'vendor_description' next to it or on ROS_PACKAGE_PATH"):
         mesh_path(elsewhere, name)
     file = package / "meshes" / "visual" / name.rpartition("/")[2]
     for entry in (package.parent, package):
@@ -120,7 +120,7 @@ def test_a_text_of_unknown_origin_leads_to_no_other_file(
     monkeypatch.chdir(package)
     assert mesh_path(None, mesh_name(package)).is_file()
     for name in (str(secret), f"file://{secret}", "../../secret.stl", "package://vendor_description/../../secret.stl"):
-        with pytest.raises(SceneError, match="neither beside its URDF"):
+        with pytest.raises(SceneError, match="neither next to its URDF"):
             mesh_path(None, name)
 
 
