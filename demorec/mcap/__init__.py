@@ -1,4 +1,4 @@
-"""Recordings: one MCAP file an episode, readable by ROS 2, Rerun and Foxglove, and the source of everything after.
+"""Recordings: one MCAP file per episode, readable by ROS 2, Rerun and Foxglove, from which all outputs are made.
 
 with open_recording(path) as recording:
     recording.table()              # all features

@@ -1,12 +1,11 @@
 """CDR, the wire format of ROS 2 messages (OMG DDS-XTypes, plain XCDR1, little endian).
 
-Messages are written and read by the definitions of their types (`demorec.mcap.ros2`, or that of a bag). A value to be
-written is one for each field, in order: a tuple of a struct, a sequence of an array, the bytes of uint8[].
+Messages are written and read by the definitions of their types (`demorec.mcap.ros2`, or a bag's). The values to write
+are one per field, in order: a tuple for a struct, a sequence for an array, bytes for uint8[].
 
-A recording consists of many messages with the same names and lengths and other numbers. So a message is laid out
-once, as a `Layout`: constant bytes with slots for time stamps and float64 (or int64) values. Writing or reading a
-batch is then a copy into or out of the slots of all its messages at once, instead of a walk through every field of
-each.
+A recording consists of many messages with the same names and lengths but different numbers. So a message is laid out
+once, as a `Layout`: constant bytes with slots for timestamps and float64 (or int64) values. Writing or reading a batch
+is then a copy into or out of the slots of all its messages at once, instead of a walk through every field of each.
 """
 
 from __future__ import annotations
@@ -32,23 +31,23 @@ _CODES = {
 
 
 class Slot(Enum):
-    """What `Layout.encode` fills in: the message's time, in place of a builtin_interfaces/Time, or the next value."""
+    """Placeholder filled by `Layout.encode`: the message's time, as builtin_interfaces/Time, or the next value."""
 
     TIME = 4
     VALUE = 8
 
 
 def encode(schema: str, *values: Any) -> bytes:
-    """A message of a type, or its beginning, where there are fewer values than fields."""
+    """Encode a message of a type, or its beginning if there are fewer values than fields."""
     writer = _Writer(types_of(schema))
     writer.struct("", values)
     return bytes(writer.data)
 
 
-# The recordings of a run have the same few layouts, and an export opens many.
+# The recordings of a run share a few layouts, and an export opens many recordings.
 @lru_cache(maxsize=128)
 def layout(schema: str, *values: Any) -> Layout:
-    """Messages of a type that differ in what a `Slot` stands for alone; tuples for all that is in order."""
+    """Lay out messages of a type that differ only in their `Slot` values; tuples for all sequences."""
     writer = _Writer(types_of(schema))
     writer.struct("", values)
     return Layout(
@@ -60,7 +59,7 @@ def layout(schema: str, *values: Any) -> Layout:
 
 
 class _Writer:
-    """Appends fields to one message; alignment counts from the end of the four header bytes."""
+    """Appends fields to one message; alignment is relative to the end of the four header bytes."""
 
     def __init__(self, types: Types) -> None:
         self._types = types
@@ -106,13 +105,13 @@ class _Writer:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
-    """A message of constant length whose stamps and values change.
+    """A message of constant length with variable timestamps and values.
 
     Attributes:
-        dtype: Of the values: float64 or int64.
+        dtype: Type of the values: float64 or int64.
         constant: (L,) uint8, the message with zeros in the slots.
-        time_slots: (S,) where the time stamps begin, which are all set to the message's time.
-        value_slots: (K,) where the values begin, which have eight bytes as the stamps do.
+        time_slots: (S,) offsets of the timestamps, which are all set to the message's time.
+        value_slots: (K,) offsets of the values, of eight bytes each like the timestamps.
     """
 
     dtype: Literal["<f8", "<i8"] = "<f8"
@@ -122,7 +121,7 @@ class Layout:
 
     @cached_property
     def _value_runs(self) -> list[tuple[int, int]]:
-        """(first, last + 1) of the stretches of bytes that values fill without a gap."""
+        """List (first, last + 1) of the byte runs that are filled by values without a gap."""
         runs: list[tuple[int, int]] = []
         for slot in self.value_slots.tolist():
             first = runs.pop()[0] if runs and runs[-1][1] == slot else slot
@@ -130,9 +129,9 @@ class Layout:
         return runs
 
     def encode(self, time_ns: NDArray[np.int64], values: NDArray[Any]) -> list[bytes]:
-        """One message for each row of `values` (N, K), stamped with `time_ns` (N,)."""
+        """Encode one message per row of `values` (N, K), stamped with `time_ns` (N,)."""
         count, length = len(time_ns), len(self.constant)
-        # Four bytes in front of each message put its float64 values on multiples of eight.
+        # Four bytes in front of each message align its float64 values to multiples of eight.
         width = 4 + length + -(4 + length) % 8
         rows = np.zeros((count, width), dtype=np.uint8)
         rows[:, 4 : 4 + length] = self.constant
@@ -145,14 +144,14 @@ class Layout:
         return [data[start : start + length] for start in range(4, count * width, width)]
 
     def decode(self, messages: Sequence[bytes]) -> NDArray[Any]:
-        """(N, K) values; ValueError unless every message has this layout in all its constant bytes."""
+        """Decode (N, K) values; ValueError unless every message matches this layout in all its constant bytes."""
         length = len(self.constant)
         if found := [len(message) for message in messages if len(message) != length]:
             raise ValueError(f"a message of {found[0]} bytes where {length} were expected")
         return self.decode_rows(np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), length))
 
     def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
-        """(N, K) values of messages of the right length, given as (N, L) bytes; ValueError as `decode`."""
+        """Decode (N, K) values of messages of the right length, given as (N, L) bytes; raises as `decode`."""
         values = np.empty((len(rows), len(self.value_slots)), dtype=self.dtype)
         rest = rows.copy()
         column = 0
@@ -163,7 +162,7 @@ class Layout:
             column += count
         for slot in self.time_slots.tolist():
             rest[:, slot : slot + 8] = 0
-        # The slots of the constant are zero, so what is left must be the constant.
+        # The slots of the constant are zero, so the remainder must equal the constant.
         if not (rest == self.constant).all():
             raise ValueError("a message with other names or lengths than the episode's metadata")
         return values
@@ -172,31 +171,31 @@ class Layout:
 Values = dict[str, Any]
 """Field -> number, text, NumPy array (numbers), list (texts, messages) or Values."""
 Reader = Callable[[memoryview, int], tuple[Any, int]]
-"""Of bytes and a place in them: what stands there, and the place behind it."""
+"""Function of bytes and an offset; returns the value there and the offset after it."""
 
 _MAX_DEPTH = 32
 
 
 def strict_text(raw: bytes) -> str:
-    """A string as it is in a message; ValueError for none."""
+    """Decode a string exactly as in a message; ValueError if it is invalid."""
     if not raw.endswith(b"\x00"):
         raise ValueError("a string without its closing NUL")
     return raw[:-1].decode()
 
 
 def lenient_text(raw: bytes) -> str:
-    """A string as whoever sent it has it, whatever cannot be decoded in it."""
+    """Decode a string as its sender wrote it, replacing undecodable bytes."""
     return raw[:-1].decode(errors="replace")
 
 
 class Readers:
-    """Readers of the types of a definition, which is data: one for each type, however often it occurs.
+    """Readers of the types in a definition, which is data: one per type, however often it occurs.
 
     Args:
         types: The definition.
-        order: "<" or ">", of the bytes of numbers.
-        is_aligned: Whether they are aligned, as CDR has them; those of ROS 1 are not.
-        text: What becomes of the bytes of a string.
+        order: Byte order of numbers, "<" or ">".
+        is_aligned: Whether numbers are aligned, as in CDR; those of ROS 1 are not.
+        text: Function that decodes the bytes of a string.
     """
 
     def __init__(
@@ -211,11 +210,11 @@ class Readers:
         self._made: dict[str, tuple[Reader, int]] = {}
 
     def of(self, kind: str) -> Reader:
-        """That of a type; ValueError when it refers to one that is not defined, or to itself."""
+        """Return the reader of a type; ValueError if it refers to an undefined type, or to itself."""
         return self._message(kind, 0)[0]
 
     def _message(self, kind: str, depth: int) -> tuple[Reader, int]:
-        """The reader of a type that is so deep within others, and how deep others are within it."""
+        """Return the reader of a type at a nesting depth, and the depth of the types nested in it."""
         found = self._made.get(kind)
         if depth + (found[1] if found else 0) > _MAX_DEPTH:
             raise ValueError("its definition is nested too deeply")
@@ -253,7 +252,7 @@ class Readers:
         if kind == "string":
             return self._text()
         if kind not in _CODES:
-            raise ValueError(f"it has a field of the type {kind}, which is not read")
+            raise ValueError(f"it has a field of the unsupported type {kind}")
         number = struct.Struct(self._order + _CODES[kind])
         size, unpack = number.size, number.unpack_from
         if not self._is_aligned or size == 1:
@@ -273,14 +272,14 @@ class Readers:
             length, position = length_of(data, position)
             end = position + length
             if end > len(data):
-                raise ValueError("a text reaches beyond its end")
+                raise ValueError("a text extends beyond the message's end")
             raw = bytes(data[position:end])
             return decode(raw if has_nul else raw + b"\0"), end
 
         return read
 
     def _count(self, count: int | None) -> Reader:
-        """Of an array: how many elements it has, which the message says where the type does not."""
+        """Return the reader of an array's length: fixed by the type, or stored in the message."""
         return self._scalar("uint32") if count is None else lambda data, position: (count, position)
 
     def _numbers(self, kind: str, count: int | None) -> Reader:
@@ -295,7 +294,7 @@ class Readers:
             position = (position + mask) & ~mask
             end = position + number * size
             if end > len(data):
-                raise ValueError("an array reaches beyond its end")
+                raise ValueError("an array extends beyond the message's end")
             return np.frombuffer(data, dtype, number, position), end
 
         return read
@@ -305,8 +304,8 @@ class Readers:
 
         def read(data: memoryview, position: int) -> tuple[list[Any], int]:
             number, position = count_of(data, position)
-            if number > len(data) - position:  # each element takes a byte at least
-                raise ValueError("a list reaches beyond its end")
+            if number > len(data) - position:  # each element takes at least a byte
+                raise ValueError("a list extends beyond the message's end")
             values = []
             for _ in range(number):
                 value, position = read_element(data, position)
@@ -317,7 +316,7 @@ class Readers:
 
 
 def read_whole(read: Reader, data: memoryview) -> tuple[Values, int]:
-    """A message, and how many bytes are left behind it; ValueError when it is cut off."""
+    """Read a message, and the number of bytes left after it; ValueError if it is truncated."""
     try:
         values, position = read(data, 0)
     except struct.error:
@@ -331,11 +330,11 @@ def _reader_of(schema: str, text: Callable[[bytes], str]) -> Reader:
 
 
 def decode(schema: str, data: bytes, *, text: Callable[[bytes], str] = strict_text) -> tuple[Values, int]:
-    """A message of a type that recordings use, and how many bytes are left behind it.
+    """Decode a message of a recorded type; also returns the number of bytes left after it.
 
     Raises:
         ValueError: It is too short or of another encoding.
     """
     if data[:4] != HEADER:
-        raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, expected 00010000")
+        raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, not 00010000")
     return read_whole(_reader_of(schema, text), memoryview(data)[4:])

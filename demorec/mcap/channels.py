@@ -12,7 +12,7 @@ EVENTS = "/events"
 DELIBERATE_MISS = "/deliberate_miss"
 FRAMES = "/frames"
 SUBTASK = "/language/subtask"
-"""What the robot begins to do at a frame, where its source states it: std_msgs/String."""
+"""Task of the robot from a frame on, if its source provides it: std_msgs/String."""
 LABELS = "/labels"
 TF = "/tf"
 TF_STATIC = "/tf_static"
@@ -21,21 +21,21 @@ Message = tuple[str, str, bytes]
 """Topic, type, bytes."""
 
 PHASE_EVENT = "phase"
-"""Name of the events that the writer adds at each change of phase, so that a log shows them too."""
+"""Name of the events that the writer adds at each phase change, so that a log shows them."""
 
 
 def object_topic(name: str) -> str:
-    """Pose of a movable body."""
+    """Topic of a movable body's pose."""
     return f"/object/{name}/pose"
 
 
 def description_topic(body: str = "") -> str:
-    """URDF of a body, or of the robot."""
+    """Topic of a URDF, of a body or of the robot."""
     return f"/object/{body}/robot_description" if body else "/robot_description"
 
 
 def camera_topic(camera: str, stream: str) -> str:
-    """A stream of a camera: pose, camera_info, h264, video, image/compressed, depth, segmentation, histogram."""
+    """Topic of a camera's stream: pose, camera_info, h264, video, image/compressed, depth, segmentation, histogram."""
     return f"/camera/{camera}/{stream}"
 
 
@@ -50,5 +50,5 @@ _VIDEO_STREAMS = {
 
 
 def video_topic(camera: str, codec: str) -> str:
-    """Where the encoded images of a camera, in colour or of distances, are read from."""
+    """Topic to read the encoded images of a camera from, colour or distances."""
     return camera_topic(camera, _VIDEO_STREAMS[codec])

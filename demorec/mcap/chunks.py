@@ -1,7 +1,7 @@
-"""Chunks of an MCAP file: what is in them, and all messages of a topic as one table of bytes.
+"""Chunks of an MCAP file: their records, and all messages of a topic as one table of bytes.
 
-An export reads every message of every recording. So nothing is made per message here: one walk over a chunk finds
-where its records begin, and NumPy takes their heads and their contents apart, a whole topic at a time.
+An export reads every message of every recording. So no object is created per message: one walk over a chunk finds the
+offsets of its records, and NumPy splits their headers and contents, a whole topic at a time.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ import zstandard
 from numpy.typing import NDArray
 
 RECORD_HEAD = struct.Struct("<BQ")
-"""Opcode and length of what follows (MCAP specification, Records)."""
+"""Opcode and content length (MCAP specification, Records)."""
 
 _MESSAGE = 5
 _MESSAGE_HEAD = np.dtype(
@@ -32,15 +32,15 @@ _MESSAGE_HEAD = np.dtype(
     ]
 )
 _GATHERED_ROWS = 4096
-"""Messages that are taken out of a chunk at once: the places of their bytes take eight times as much as the bytes."""
+"""Messages copied from a chunk at once: the indices of their bytes take eight times as much memory as the bytes."""
 _CHUNK_HEAD = struct.Struct("<QQQII")
 
 
 def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, int, int]]:
-    """(opcode, start, end) of the contents of the records in a chunk, or in what `where` says; nothing is copied.
+    """Yield (opcode, start, end) of the contents of the records in a chunk, or in `where`, without copying.
 
     Raises:
-        ValueError, struct.error: They do not fill it.
+        ValueError, struct.error: The records do not fill it.
     """
     position, end = 0, len(content)
     while position < end:
@@ -48,15 +48,15 @@ def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, 
         start = position + RECORD_HEAD.size
         position = start + length
         if position > end:
-            raise ValueError(f"a record that reaches beyond {where}")
+            raise ValueError(f"a record that extends beyond {where}")
         yield opcode, start, position
 
 
 def chunk_content(record: bytes | memoryview, expected_size: int | None = None) -> bytes:
-    """The records in a chunk, given the content of its record; a checksum of 0 stands for none.
+    """Unpack the records of a chunk, given the content of its record; a checksum of 0 means none.
 
     Raises:
-        ValueError, struct.error, zstandard.ZstdError: It is damaged, or not of the expected size.
+        ValueError, struct.error, zstandard.ZstdError: It is damaged, or has an unexpected size.
     """
     _, _, size, stored_crc, name_bytes = _CHUNK_HEAD.unpack_from(record)
     position = _CHUNK_HEAD.size
@@ -66,19 +66,19 @@ def chunk_content(record: bytes | memoryview, expected_size: int | None = None) 
     if expected_size is not None and size != expected_size:
         raise ValueError("a chunk differs from its index")
     if start + num_bytes > len(record):
-        raise ValueError("a chunk that is cut off")
+        raise ValueError("a truncated chunk")
     stored = memoryview(record)[start : start + num_bytes]
     if compression == b"zstd":
-        # Where the compressed data state their size, that much is reserved, whatever is said here to be the most.
+        # If the compressed data state their size, zstandard allocates that much, regardless of the limit given here.
         if zstandard.frame_content_size(stored) not in (size, -1):
-            raise ValueError("a chunk of another size than its compressed data")
+            raise ValueError("a chunk with a different size from its compressed data")
         content = zstandard.ZstdDecompressor().decompress(stored, max_output_size=size)
-    elif compression == b"lz4":  # not ours; the writers of other people's bags know it
+    elif compression == b"lz4":  # not used here, but by writers of third-party bags
         content = _lz4_content(stored, size)
     elif compression == b"":
         content = bytes(stored)
     else:
-        raise ValueError(f"a chunk compressed with {compression!r}, expected zstd or lz4")
+        raise ValueError(f"a chunk compressed with {compression!r}, not zstd or lz4")
     if len(content) != size or (stored_crc and zlib.crc32(content) != stored_crc):
         raise ValueError("a chunk fails its checksum")
     return content
@@ -89,7 +89,7 @@ def _lz4_content(stored: memoryview, size: int) -> bytes:
 
     try:
         content: bytes = lz4.frame.LZ4FrameDecompressor().decompress(stored, max_length=size)
-    except RuntimeError as error:  # all that lz4 raises
+    except RuntimeError as error:  # the only error of lz4
         raise ValueError("a chunk that lz4 cannot unpack") from error
     return content
 
@@ -99,9 +99,9 @@ class Block:
     """All messages of one topic, in the order of the file.
 
     Attributes:
-        content: The bytes in which they lie, shared by the topics that were read together.
+        content: The bytes that contain them, shared by topics that were read together.
         time_ns: (N,) int64.
-        starts, lengths: (N,) int64, where each message lies in `content`.
+        starts, lengths: (N,) int64, position of each message in `content`.
     """
 
     content: bytes
@@ -113,18 +113,18 @@ class Block:
         return len(self.starts)
 
     def messages(self) -> Iterator[bytes]:
-        """The messages one by one."""
+        """Yield the messages one by one."""
         ends = self.starts + self.lengths
         for start, end in zip(self.starts.tolist(), ends.tolist(), strict=True):
             yield self.content[start:end]
 
     def joined(self) -> bytes:
-        """The messages back to back."""
+        """Concatenate the messages."""
         content, ends = memoryview(self.content), self.starts + self.lengths
         return b"".join([content[a:b] for a, b in zip(self.starts.tolist(), ends.tolist(), strict=True)])
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Block:
-        """Some of the messages."""
+        """Select some of the messages."""
         return Block(
             content=self.content,
             time_ns=self.time_ns[chosen],
@@ -133,13 +133,13 @@ class Block:
         )
 
     def heads(self, length: int) -> NDArray[np.uint8]:
-        """(N, length): the first bytes of every message; ValueError when one is shorter."""
+        """Return (N, length) first bytes of every message; ValueError if one is shorter."""
         if len(self) and int(self.lengths.min()) < length:
             raise ValueError(f"a message of {int(self.lengths.min())} bytes where at least {length} were expected")
         return _gathered(np.frombuffer(self.content, dtype=np.uint8), self.starts, length)
 
     def rows(self, length: int) -> NDArray[np.uint8]:
-        """(N, length): the messages, if all have that length; else ValueError."""
+        """Return the messages as (N, length); ValueError unless all have that length."""
         wrong = self.lengths[self.lengths != length]
         if len(wrong):
             raise ValueError(f"a message of {wrong[0]} bytes where {length} were expected")
@@ -147,7 +147,7 @@ class Block:
 
 
 def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int]) -> dict[str, Block]:
-    """topic -> its messages in the contents of chunks, given topic -> channel.
+    """Collect topic -> its messages from the contents of chunks, given topic -> channel.
 
     Raises:
         ValueError, struct.error: The records do not fill their chunk.
@@ -162,11 +162,11 @@ def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int]) -> dict[str,
     starts = np.frombuffer(found, dtype=np.int64)
     starts = starts[values[starts] == _MESSAGE]
     if len(starts) and int(starts[-1]) + _MESSAGE_HEAD.itemsize > len(values):
-        raise ValueError("a message that ends within its head")
+        raise ValueError("a message that ends within its header")
     heads = _gathered(values, starts, _MESSAGE_HEAD.itemsize).view(_MESSAGE_HEAD).reshape(-1)
     lengths = heads["length"].astype(np.int64) - (_MESSAGE_HEAD.itemsize - RECORD_HEAD.size)
     if len(lengths) and int(lengths.min()) < 0:
-        raise ValueError("a message that ends within its head")
+        raise ValueError("a message that ends within its header")
     starts = starts + _MESSAGE_HEAD.itemsize
     times = heads["log_time"].astype(np.int64)
     blocks = {}
@@ -177,7 +177,7 @@ def blocks_of(contents: Iterable[bytes], topics: Mapping[str, int]) -> dict[str,
 
 
 def _gathered(values: NDArray[np.uint8], starts: NDArray[np.int64], length: int) -> NDArray[np.uint8]:
-    """(N, length): as many bytes from each start on."""
+    """Gather (N, length) bytes after each start."""
     rows = np.empty((len(starts), length), dtype=np.uint8)
     places = np.arange(length)
     for first in range(0, len(starts), _GATHERED_ROWS):
@@ -187,11 +187,11 @@ def _gathered(values: NDArray[np.uint8], starts: NDArray[np.int64], length: int)
 
 
 def _find_records(content: bytes, offset: int, found: Callable[[int], None]) -> None:
-    """Tell where each record of a chunk begins, counted from `offset`."""
+    """Report the offset of each record of a chunk, counted from `offset`."""
     unpack, head_bytes = RECORD_HEAD.unpack_from, RECORD_HEAD.size
     position, end = 0, len(content)
     while position < end:
         found(offset + position)
         position += unpack(content, position)[1] + head_bytes
     if position != end:
-        raise ValueError("a record that reaches beyond its chunk")
+        raise ValueError("a record that extends beyond its chunk")

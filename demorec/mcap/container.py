@@ -1,8 +1,8 @@
-"""Random access to an MCAP file that trusts nothing: every byte that is used was covered by a checksum, where its
-writer left one (0 stands for none).
+"""Random access to an MCAP file that trusts nothing: all data used are covered by a checksum, if the writer stored one
+(0 means none).
 
-The summary at the end states where each chunk is and which topics it holds, so one topic is read without touching the
-others, one chunk at a time. The mcap library parses the records; what this adds is the checking, and one error.
+The summary at the end lists each chunk's position and topics, so one topic is read without touching the others, one
+chunk at a time. The mcap library parses the records; this module adds the verification, and a single error type.
 """
 
 from __future__ import annotations
@@ -30,12 +30,12 @@ from demorec.mcap.scan import (
 _FOOTER_BYTES = RECORD_HEAD.size + 20
 _DAMAGE = (OSError, MemoryError, ValueError, KeyError, IndexError, OverflowError, EOFError)
 _PARSERS = ("builtins", "mcap", "struct", "zstandard", "zstd")
-"""Modules whose errors damaged bytes lead to, too; they share no base class but Exception."""
+"""Modules that raise errors on damaged bytes; these share no base class but Exception."""
 
 
 @contextmanager
 def damage_as_recording_error(path: Path) -> Iterator[None]:
-    """Turn whatever a parser of damaged bytes raises into RecordingError, and a lack of memory into ResourceError."""
+    """Convert any error of a parser of damaged bytes to RecordingError, and a lack of memory to ResourceError."""
     try:
         yield
     except (RecordingError, ResourceError):
@@ -43,7 +43,7 @@ def damage_as_recording_error(path: Path) -> Iterator[None]:
     except Exception as error:
         if not isinstance(error, _DAMAGE) and type(error).__module__.split(".")[0] not in _PARSERS:
             raise
-        # zstandard has no error of its own for a lack of memory
+        # zstandard has no separate error for a lack of memory
         lacking = MemoryError() if "not enough memory" in str(error) else error
         damaged = RecordingError(f"The recording is damaged ({describe_error(error)}): {path}")
         raise resource_error(lacking, path) or damaged from error
@@ -57,7 +57,7 @@ class Container:
         counts: topic -> number of messages.
 
     Raises:
-        RecordingError: No such file, no MCAP, cut off, or a checksum that does not match.
+        RecordingError: The file does not exist, is not MCAP, is truncated, or has a wrong checksum.
     """
 
     def __init__(self, path: Path) -> None:
@@ -75,19 +75,20 @@ class Container:
             raise
 
     def close(self) -> None:
-        """Close the file; harmless when called twice."""
+        """Close the file; safe to call twice."""
         self._file.close()
 
     def _read_summary(self) -> None:
         self._size = size = self._file.seek(0, 2)
         if size == 0:
-            raise RecordingError(f"The file is empty, so no recording: {self.path}")
+            raise RecordingError(f"The file is empty, so it is not a recording: {self.path}")
         if self._read_at(0, min(size, len(MCAP_MAGIC))) != MCAP_MAGIC:
             raise RecordingError(f"This is not an MCAP file, so not a recording: {self.path}")
         tail_bytes = _FOOTER_BYTES + len(MCAP_MAGIC)
         if size < tail_bytes + len(MCAP_MAGIC) or self._read_at(size - len(MCAP_MAGIC), len(MCAP_MAGIC)) != MCAP_MAGIC:
             raise RecordingError(
-                f"The recording is cut off, its index is missing; demorec recover keeps what is whole: {self.path}"
+                "The recording is cut off (missing index); recover its complete frames with demorec recover: "
+                f"{self.path}"
             )
         footer_start = size - tail_bytes
         footer = read_record(self._content_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER), Footer)
@@ -157,7 +158,7 @@ class Container:
         return tuple(self._metadata)
 
     def metadata(self, name: str) -> dict[str, str] | None:
-        """A metadata record, or None; the caller checks its seal."""
+        """Return a metadata record, or None; the caller checks its seal."""
         index = self._metadata.get(name)
         if index is None:
             return None
@@ -171,7 +172,7 @@ class Container:
         return tuple(self._attachments)
 
     def attachment(self, name: str) -> bytes:
-        """The bytes of an attachment; KeyError when there is none of that name."""
+        """Read the bytes of an attachment; KeyError if it does not exist."""
         index = self._attachments[name]
         with damage_as_recording_error(self.path):
             content = self._content_at(index.offset, index.length, Opcode.ATTACHMENT)
@@ -183,7 +184,7 @@ class Container:
             return bytes(read_record(content, Attachment).data)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        """(topic, time in ns, bytes) of the messages of some topics in the order of the file."""
+        """Yield (topic, time in ns, bytes) of the messages of some topics in the order of the file."""
         wanted = {channel: topic for topic, channel in self._ids(topics).items()}
         with damage_as_recording_error(self.path):
             for content in self._unpacked(self._chunks_of(wanted)):
@@ -194,15 +195,15 @@ class Container:
                             yield wanted[channel], time_ns, content[start + MESSAGE_HEAD.size : end]
 
     def blocks(self, topics: Collection[str]) -> dict[str, Block]:
-        """topic -> all its messages; the chunks that hold any of them are in memory together."""
+        """Read topic -> all its messages; their chunks are in memory together."""
         wanted = self._ids(topics)
         with damage_as_recording_error(self.path):
             return blocks_of(self._unpacked(self._chunks_of(wanted.values())), wanted)
 
     def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
-        """As `blocks`, one chunk after the other, or a few of them: no more than have that many bytes unpacked.
+        """Read as `blocks`, but one or a few chunks at a time, up to `num_bytes` unpacked.
 
-        Where no chunk holds any, there is one without messages.
+        If no chunk has any, one result without messages is yielded.
         """
         wanted = self._ids(topics)
         group: list[ChunkIndex] = []
@@ -217,11 +218,11 @@ class Container:
             yield blocks_of(self._unpacked(group), wanted)
 
     def _ids(self, topics: Collection[str]) -> dict[str, int]:
-        """topic -> number of its channel, -1 where there is none."""
+        """Return topic -> number of its channel, -1 if missing."""
         return {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
 
     def _chunks_of(self, channels: Collection[int]) -> list[ChunkIndex]:
-        """The chunks that hold messages of any of these channels; the others are not read."""
+        """List the chunks with messages of any of these channels; the others are not read."""
         return [chunk for chunk in self._chunks if not chunk.message_index_offsets.keys().isdisjoint(channels)]
 
     def _unpacked(self, chunks: Iterable[ChunkIndex]) -> Iterator[bytes]:

@@ -1,7 +1,7 @@
-"""URDF text of the robot and of each body that needs no other file to be drawn, with a bounding box for each mesh.
+"""Self-contained URDF text of the robot and of each body, with a bounding box for each mesh.
 
-Rerun draws the robot of a bare recording from its URDF, but draws nothing of it if one mesh file is missing. So the
-recorded description has boxes, cylinders and spheres only.
+Rerun draws the robot of a bare recording from its URDF, but draws nothing if one mesh file is missing. So the recorded
+description has only boxes, cylinders and spheres.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from demorec.robots.obj import read_obj
 from demorec.robots.urdf import UrdfShape, parse_xml, read_links
 
 _MIN_SIDE_M = 1e-4
-"""Shortest side of the box around a flat mesh."""
+"""Minimum side of the box around a flat mesh, metres."""
 _WHITE: Rgba = (1.0, 1.0, 1.0, 1.0)
 _KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {
     "box": "box",
@@ -41,7 +41,7 @@ class Primitive:
     """A box, a cylinder along z, or a sphere.
 
     Attributes:
-        kind: Which.
+        kind: Kind of primitive.
         size: box: full extents; cylinder: (radius, length); sphere: (radius,).
         center: (x, y, z) in the frame of the shape.
     """
@@ -53,7 +53,7 @@ class Primitive:
 
 @functools.lru_cache(maxsize=8)
 def robot_description(urdf: str, scale: float) -> str:
-    """The robot with every mesh replaced by its bounding box, without masses and collision shapes.
+    """Replace every mesh of a robot by its bounding box, and remove masses and collision shapes.
 
     Raises:
         SceneError: The URDF or one of its meshes cannot be read.
@@ -73,7 +73,7 @@ def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
     robot = ET.Element("robot", name=source.get("name", "robot"))
     for link in read_links(text, scale=scale):
         target = ET.SubElement(robot, "link", name=link.name)
-        # Collision shapes are simpler to begin with; their pose may differ from the image's.
+        # Collision shapes are simpler from the start; their pose may differ from the visual's.
         is_fitted = bool(link.visuals and link.collisions) and all(shape.kind in _KINDS for shape in link.collisions)
         shapes = link.collisions if is_fitted or len(link.collisions) == len(link.visuals) else link.visuals
         for index, shape in enumerate(shapes):
@@ -86,7 +86,7 @@ def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
 
 
 def body_description(body: Body) -> str:
-    """A URDF of one link, named like the body."""
+    """Make a URDF of one link, named like the body."""
     robot = ET.Element("robot", name=body.name)
     link = ET.SubElement(robot, "link", name=body.name)
     for primitive, pose in _body_primitives(body):
@@ -113,7 +113,7 @@ def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
 
 
 def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
-    """A shape of a URDF as primitives in its own frame."""
+    """Convert a shape of a URDF to primitives in the link's frame."""
     if shape.kind == "mesh":
         yield _bounding_box(mesh_path(folder, shape.file), shape.size)
     elif shape.kind in _KINDS:
@@ -122,7 +122,7 @@ def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
 
 @functools.lru_cache(maxsize=256)
 def _bounding_box(path: Path, scale: tuple[float, ...]) -> Primitive:
-    """The box around a mesh, along the axes of its file."""
+    """Compute the box around a mesh, along the axes of its file."""
     try:
         if path.suffix.lower() == ".obj":
             found = read_obj(path)
@@ -132,7 +132,7 @@ def _bounding_box(path: Path, scale: tuple[float, ...]) -> Primitive:
         elif path.suffix.lower() == ".dae":  # trimesh needs another package for it
             vertices = read_collada(path).points
         else:
-            import trimesh  # takes a second to load, and the usual robot needs it for nothing
+            import trimesh  # slow import (1 s), not needed for the usual robot
 
             vertices = np.asarray(trimesh.load(path, force="mesh", process=False).vertices, dtype=np.float64)
         low, high = vertices.min(axis=0), vertices.max(axis=0)
@@ -160,7 +160,7 @@ def _add_visual(link: ET.Element, primitive: Primitive, frame: Pose, rgba: Seque
 
 
 def _rpy(pose: Pose) -> tuple[float, float, float]:
-    """Roll, pitch, yaw about fixed axes (rad), as URDF has them."""
+    """Compute roll, pitch, yaw about fixed axes (rad), as in URDF."""
     r = pose.rotation
     pitch = math.asin(min(1.0, max(-1.0, -float(r[2, 0]))))
     if abs(r[2, 0]) > 1 - 1e-9:  # roll and yaw turn about the same axis
@@ -184,7 +184,7 @@ def _joint(source: ET.Element, scale: float) -> ET.Element:
 
 
 def _numbers(values: Sequence[float]) -> str:
-    # Tenths of a millimetre and of a milliradian: more would only differ between CPUs.
+    # Tenths of a millimetre and of a milliradian: more digits would only differ between CPUs.
     return " ".join(f"{round(value, 4) + 0.0:g}" for value in values)
 
 

@@ -1,4 +1,4 @@
-"""The file of an episode: its description, its topics and its images, decoded or as they are."""
+"""The file of an episode: its description, topics and images, encoded or decoded."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from demorec.mcap.streams import FrameStream
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 
 _READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
-"""Codec -> what takes a packet out of its message, where that is no CompressedImage."""
+"""Codec -> function that extracts a packet from its message, if that is not a CompressedImage."""
 
 
 class EpisodeFile(Closing):
@@ -47,7 +47,9 @@ class EpisodeFile(Closing):
         self._container = Container(self.path)
         try:
             if (found := self._container.metadata(metadata.EPISODE)) is None:
-                raise RecordingError(f"The MCAP file is no demorec recording, it has no episode metadata: {self.path}")
+                raise RecordingError(
+                    f"The MCAP file is not a demorec recording, since it lacks episode metadata: {self.path}"
+                )
             try:
                 self._read_metadata(found)
             except RecordingError as error:
@@ -57,21 +59,21 @@ class EpisodeFile(Closing):
             raise
 
     def close(self) -> None:
-        """Close the file; harmless when called twice."""
+        """Close the file; safe to call twice."""
         self._container.close()
 
     def _read_metadata(self, found: Mapping[str, str]) -> None:
-        """Read what is known without reading the numbers."""
+        """Read everything that is known without reading the numbers."""
         self.info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(found)
         self._layout = EpisodeLayout(self.info)
         self._read_end()
         if self.num_frames and len(self._cameras) != len(self.info.cameras):
-            raise RecordingError("The recording has frames, but none of its scene's cameras was recorded")
+            raise RecordingError("The recording has frames, but no camera of its scene was recorded")
         if urdf_sha256:
             self.info = self._with_urdf(urdf_sha256)
 
     def _read_end(self) -> None:
-        """Read how it ended; RecordingError unless the outcome has as many frames as there are messages."""
+        """Read the outcome; RecordingError unless its number of frames equals the number of messages."""
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
         self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
         self.num_frames, self.is_recovered = (
@@ -81,23 +83,23 @@ class EpisodeFile(Closing):
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
         if self.outcome is None and not self.is_recovered:
-            raise RecordingError("The recording was never finished; demorec recover keeps what is whole")
+            raise RecordingError("The recording was never finished; recover its complete frames with demorec recover")
         if self.outcome is not None and self.outcome.num_frames != self.num_frames:
             raise RecordingError(
-                f"The recording has {self.num_frames} frames, but its outcome says {self.outcome.num_frames}"
+                f"The recording has {self.num_frames} frames, but its outcome states {self.outcome.num_frames}"
             )
 
     @property
     def streams(self) -> tuple[FrameStream, ...]:
-        """Streams with one message at each frame."""
+        """Streams with one message per frame."""
         return self._layout.streams
 
     def _with_urdf(self, sha256: str) -> EpisodeInfo:
         urdf = ""
         for _, text in self._read(description_topic(), messages.read_string):
-            urdf = text  # the last one holds
+            urdf = text  # the last one applies
         if metadata.urdf_sha256(urdf) != sha256:
-            raise RecordingError("The URDF of the recording is not the one that its metadata tells of")
+            raise RecordingError("The URDF of the recording is not the one in its metadata")
         described = replace(self.info, urdf=urdf)
         if wrong := find_problems(described):
             raise RecordingError(f"The URDF of the recording does not fit its metadata ({wrong[0]})")
@@ -105,12 +107,12 @@ class EpisodeFile(Closing):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the recorded cameras that see colours."""
+        """Names of the recorded colour cameras."""
         return tuple(name for name, streams in self._cameras_in_order if streams.video.codec not in DEPTH_UNITS)
 
     @property
     def depth_cameras(self) -> tuple[str, ...]:
-        """Names of the recorded cameras that measure distances, beside colours or in place of them."""
+        """Names of the recorded cameras that measure distances, with or without colour."""
         return tuple(name for name, streams in self._cameras_in_order if streams.depth)
 
     @property
@@ -121,21 +123,21 @@ class EpisodeFile(Closing):
     def _camera(self, name: str) -> CameraStreams:
         if name not in self._cameras:
             raise RecordingError(
-                f"The recording has no camera {name!r}, its cameras are {', '.join(self._cameras) or 'none'}: "
+                f"The recording has no camera {name!r}; its cameras are {', '.join(self._cameras) or 'none'}: "
                 f"{self.path}"
             )
         return self._cameras[name]
 
     def video_settings(self, camera: str) -> VideoSettings:
-        """How the images of a camera were encoded."""
+        """Return the encoding settings of a camera's images."""
         return self._camera(camera).video
 
     def has_depth(self, camera: str) -> bool:
-        """Whether distances were recorded of a camera, beside its colours or in place of them."""
+        """Check whether distances were recorded for a camera, with or without colour."""
         return self._camera(camera).depth
 
     def has_segmentation(self, camera: str) -> bool:
-        """Whether segmentation images of a camera were recorded."""
+        """Check whether segmentation images were recorded for a camera."""
         return self._camera(camera).segmentation
 
     def _size(self, camera: str) -> tuple[int, int]:
@@ -143,19 +145,19 @@ class EpisodeFile(Closing):
         return settings.height, settings.width
 
     def _digest_of_description(self) -> hashlib._Hash:
-        """That of the metadata, to go on with: not of the versions and the CPU that made them."""
+        """Digest of the metadata, to be continued; excludes the versions and the CPU that made them."""
         result = hashlib.sha256(json.dumps(description_of(self.info), sort_keys=True).encode())
         result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
         return result
 
     @property
     def has_failed(self) -> bool:
-        """Whether somebody said so, or a crash cut off an episode that demorec simulated."""
+        """Whether the outcome is a failure, or a crash cut off a simulated episode."""
         return has_failed(self.info, self.outcome)
 
     @property
     def success(self) -> bool | None:
-        """How its attempt ended; None where nobody said."""
+        """Success of its attempt; None if unknown."""
         return False if self.has_failed else None if self.outcome is None else self.outcome.success
 
     @property
@@ -168,20 +170,20 @@ class EpisodeFile(Closing):
         }
 
     def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
-        """(time_ns, what was read) of the messages of a topic, in order."""
+        """Yield (time_ns, value) of the messages of a topic, in order."""
         with damage_as_recording_error(self.path):
             for _, time_ns, data in self._container.messages((topic,)):
                 yield time_ns, read(data)
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
-        """The encoded images of a camera, in order; `frame_index` is their number, by which frames hold them."""
+        """Yield the encoded images of a camera, in order; `frame_index` is the image number that frames refer to."""
         codec = self.video_settings(camera).codec
         read = _READERS.get(codec, messages.read_compressed_image)
         for number, (time_ns, data) in enumerate(self._read_images(video_topic(camera, codec), read)):
             yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
-        """As `_read`, of a topic of images; RecordingError unless they are at the times at which they are due."""
+        """Read as `_read`, for a topic of images; RecordingError unless they are at their due times."""
         due_ns, count = self._layout.due_ns(self.num_frames), 0
         for time_ns, image in self._read(topic, read):
             if due_ns is not None and (count >= len(due_ns) or time_ns != due_ns[count]):
@@ -192,16 +194,16 @@ class EpisodeFile(Closing):
             raise self._wrong_times(topic)
 
     def _wrong_times(self, topic: str) -> RecordingError:
-        return RecordingError(f"The recording's images on {topic} are not one at the time of each frame: {self.path}")
+        return RecordingError(f"The recording's images on {topic} do not match the times of the frames: {self.path}")
 
     def images(self, camera: str) -> Iterator[Rgb]:
-        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
+        """Yield the decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
         if self.video_settings(camera).codec in DEPTH_UNITS:
-            raise RecordingError(f"The camera {camera!r} measures distances and sees no colours: {self.path}")
+            raise RecordingError(f"The camera {camera!r} measures distances, not colours: {self.path}")
         return decode(self.video_settings(camera), self.packets(camera))
 
     def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
-        """Distances in order, as they were recorded: (H, W) uint16 millimetres or float32 metres."""
+        """Yield distances in order, as recorded: (H, W) uint16 millimetres or float32 metres."""
         codec, size = self._distance_codec(camera), self._size(camera)
         read = _READERS.get(codec, messages.read_compressed_image)
         topic = video_topic(camera, codec)
@@ -209,7 +211,7 @@ class EpisodeFile(Closing):
             yield distances
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """The same in metres, (H, W) float32; in a simulation in steps of a millimetre, 0 where nothing was hit."""
+        """Yield distances in metres, (H, W) float32; in simulations in steps of a millimetre, 0 for the background."""
         unit = np.float32(DEPTH_UNITS[self._distance_codec(camera)])
         for values in self.distances(camera):
             yield values.astype(np.float32) / unit
@@ -221,13 +223,13 @@ class EpisodeFile(Closing):
         return codec if codec in DEPTH_UNITS else "16UC1"
 
     def numbered_image(self, camera: str, number: int) -> Rgb:
-        """One decoded image of a camera, (H, W, 3) uint8 RGB, by its own number."""
+        """Decode one image of a camera, (H, W, 3) uint8 RGB, by its number."""
         return next(self._images(camera, [number]))
 
     def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
-        """Some decoded images, in rising order, each decoded from the keyframe before it on.
+        """Yield some decoded images, in increasing order, each decoded from the preceding keyframe on.
 
-        They are read in one pass, with no more in memory than the packets since the last keyframe.
+        They are read in one pass; only the packets since the last keyframe are in memory.
         """
         waiting, group = list(numbers), list[VideoPacket]()
         for number, packet in enumerate(self.packets(camera)):
@@ -243,7 +245,7 @@ class EpisodeFile(Closing):
                     waiting.pop(0)
 
     def pixel_statistics(self, camera: str) -> PixelStatistics:
-        """Histograms of a camera's images: as written, or counted now where none were written."""
+        """Return histograms of a camera's images: the recorded ones, or counted now."""
         self.video_settings(camera)
         for _, statistics in self._read(camera_topic(camera, "histogram"), read_pixel_statistics):
             return statistics

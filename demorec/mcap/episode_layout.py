@@ -48,7 +48,7 @@ class EpisodeLayout:
         return tuple(simulated_streams(self._info) if self._is_on_time else sampled_streams(self._info))
 
     def due_ns(self, num_frames: int) -> NDArray[np.int64] | None:
-        """(T,) times at which all images are due; None if the cameras decide."""
+        """Compute (T,) due times of all images; None if the cameras decide."""
         return frame_times(num_frames, self._info.fps) if self._is_on_time else None
 
     def read(
@@ -62,7 +62,8 @@ class EpisodeLayout:
             image_topics: Recorded camera -> topic of its images, in the order of the description.
 
         Raises:
-            RecordingError: A stream is damaged or not at the times of the frames, or a frame shows an unknown image.
+            RecordingError: A stream is damaged or does not match the times of the frames, or a frame shows an unknown
+                image.
         """
         due, changes = self.due_ns(num_frames), (PHASE, DELIBERATE_MISS) if self._is_on_time else ()
         columns, others = read_columns(
@@ -91,16 +92,17 @@ class EpisodeLayout:
     def whole_frames(
         self, counts: Counter[str], cameras: Mapping[str, CameraStreams]
     ) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
-        """Find the frames that are whole after a crash: those that all streams have, images included.
+        """Find the complete frames after a crash: those present in all streams, images included.
 
-        Images of an episode that was not simulated are in front of their frames.
+        In an episode that was not simulated, images precede their frames.
 
         Args:
             counts: Topic -> number of its messages.
             cameras: Recorded cameras.
 
         Returns:
-            Number of frames; and whether a message belongs to them, given which one of its topic it is, from 1.
+            Number of frames; and a function that checks whether a message belongs to them, given its number in its
+            topic, from 1.
         """
         topics = {stream.topic for stream in self.streams if not stream.is_dense}
         if not self._is_on_time:
@@ -116,7 +118,7 @@ class EpisodeLayout:
 
 
 def _lasting[V](found: TimedMessages, read: Callable[[bytes], V], times: NDArray[np.int64], first: V) -> list[V]:
-    """Value at each time, given the messages that report its changes."""
+    """Compute the value at each time, given the messages that report its changes."""
     values = [first, *(read(data) for _, data in found)]
     changes = np.array([time_ns for time_ns, _ in found], dtype=np.int64)
     numbers = np.searchsorted(np.maximum.accumulate(changes), times, side="right")
@@ -124,7 +126,7 @@ def _lasting[V](found: TimedMessages, read: Callable[[bytes], V], times: NDArray
 
 
 def _image_stamps(container: Container, topics: Mapping[str, str]) -> dict[str, NDArray[np.int64]]:
-    """Camera -> (P,) stamps of its images. One chunk of images is in memory at a time: all may take gigabytes."""
+    """Read camera -> (P,) timestamps of its images, one chunk at a time: all images may take gigabytes."""
     found = defaultdict[str, list[NDArray[np.int64]]](list)
     for blocks in container.blocks_by_chunk(topics.values()):
         for name, topic in topics.items():
@@ -139,5 +141,5 @@ def _check_images(
         count = len(stamps[name])
         if len(numbers) and not NO_IMAGE <= int(numbers.min()) <= int(numbers.max()) < count:
             raise RecordingError(
-                f"A frame holds an image of the camera {name!r} that is none of its {count}: {container.path}"
+                f"A frame refers to an image of the camera {name!r} outside its {count}: {container.path}"
             )

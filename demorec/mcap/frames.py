@@ -1,4 +1,4 @@
-"""Frames out of a trajectory."""
+"""Conversion of a trajectory to frames."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from demorec.episode.episode import Action, Event, Frame, JointSample, Observati
 
 
 def pose_of(row: Array) -> Pose:
-    """The pose of a row (7,): position, quaternion xyzw."""
+    """Convert a row (7,), position and quaternion xyzw, to a pose."""
     return Pose(position=row[:3], quat_xyzw=row[3:])
 
 
 def observation_at(trajectory: Trajectory, frame: int) -> Observation:
-    """The observation of a frame, bit-exact."""
+    """Build the observation of a frame, bit-exact."""
     return Observation(
         joint_position=trajectory.joint_position[frame].copy(),
         joint_velocity=trajectory.joint_velocity[frame].copy(),
@@ -31,7 +31,7 @@ def observation_at(trajectory: Trajectory, frame: int) -> Observation:
 
 
 def action_at(trajectory: Trajectory, frame: int, kind: Literal["action", "command"]) -> Action:
-    """What the expert wanted at a frame, or the command that was sent to the motors."""
+    """Build the expert's action at a frame, or the command that was sent to the motors."""
     return Action(
         joint_target=getattr(trajectory, f"{kind}_joint_target")[frame].copy(),
         gripper_target=float(getattr(trajectory, f"{kind}_gripper")[frame]),
@@ -42,12 +42,12 @@ def action_at(trajectory: Trajectory, frame: int, kind: Literal["action", "comma
 def frames_of(
     trajectory: Trajectory, events: Iterable[tuple[int, Event]], joint_samples: Iterable[JointSample]
 ) -> Iterator[Frame]:
-    """Every frame without its images, bit-exact: numbers, phase, events, and the joint samples before it.
+    """Yield every frame without its images, bit-exact: numbers, phase, events, and the joint samples before it.
 
     Args:
-        trajectory: Of a recording.
+        trajectory: Numbers of a recording.
         events: Its events, each with its time_ns.
-        joint_samples: Its joint states, those of the frames too.
+        joint_samples: Its joint states, including those of the frames.
     """
     times = trajectory.time_ns.tolist()
     found: dict[int, list[Event]] = {}

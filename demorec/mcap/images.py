@@ -1,4 +1,4 @@
-"""The encoded images of one camera on their way into a file, and the statistics of their pixels.
+"""Encoding of the images of one camera for a file, and statistics of their pixels.
 
 Pixels are counted while recording, so that the export of a dataset decodes nothing.
 """
@@ -23,7 +23,7 @@ from demorec.mcap.transforms import camera_frame
 from demorec.mcap.video import make_encoder, settings_of_coded
 
 _MOST_PIXELS = 1 << 50
-"""Of one value in a histogram: sums of them stay exact in float64."""
+"""Maximum count of one value in a histogram: sums of counts stay exact in float64."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -31,8 +31,8 @@ class PixelStatistics:
     """Histograms of a camera's images.
 
     Attributes:
-        counts: (3, 256) int64: for red, green, blue, how many pixels have each value.
-        num_images: How many images were counted.
+        counts: (3, 256) int64: number of pixels with each value, for red, green and blue.
+        num_images: Number of images counted.
     """
 
     counts: NDArray[np.int64]
@@ -40,10 +40,11 @@ class PixelStatistics:
 
 
 class PixelCounter:
-    """Counts every other image (of 180 frames 90, where LeRobot's writer takes 100) and thins large ones as it does.
+    """Counts every other image (90 of 180 frames, where LeRobot's writer uses 100) and subsamples large ones as it
+    does.
 
-    LeRobot (`compute_stats.py`) spreads its sample evenly over an episode of known length; here the length is not
-    known yet. Of an image only every fourth row is counted, a different quarter in turn.
+    LeRobot (`compute_stats.py`) spreads its sample evenly over an episode of known length; here the length is not known
+    yet. Only every fourth row of an image is counted, a different quarter each time.
     """
 
     def __init__(self) -> None:
@@ -52,7 +53,7 @@ class PixelCounter:
         self._num_images = 0
 
     def add(self, image: NDArray[np.uint8]) -> None:
-        """Take the next image, (H, W, 3) uint8."""
+        """Count the next image, (H, W, 3) uint8."""
         if self._num_seen % 2 == 0:
             longer_side = max(image.shape[:2])
             step = longer_side // 150 if longer_side >= 300 else 1
@@ -63,20 +64,20 @@ class PixelCounter:
         self._num_seen += 1
 
     def statistics(self) -> PixelStatistics:
-        """The counts so far."""
+        """Return the current counts."""
         return PixelStatistics(counts=self._counts.copy(), num_images=self._num_images)
 
 
 def pixel_statistics(statistics: PixelStatistics) -> bytes:
-    """std_msgs/Int64MultiArray, a table of 3 x 256 counts after one number: how many images were counted."""
+    """Encode as std_msgs/Int64MultiArray: the number of counted images, then a table of 3 x 256 counts."""
     dimensions = (("red, green, blue", 3, 3 * 256), ("value", 256, 256))
-    data_offset = 1  # what comes in front of the table
+    data_offset = 1  # values in front of the table
     values = np.concatenate(([statistics.num_images], statistics.counts.reshape(-1)))
     return encode(messages.INT64_ARRAY, (dimensions, data_offset), values)
 
 
 def read_pixel_statistics(data: bytes) -> PixelStatistics:
-    """Inverse of `pixel_statistics`."""
+    """Decode the message of `pixel_statistics`."""
     values = decode(messages.INT64_ARRAY, data)[0]["data"]
     if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
         raise ValueError("a histogram of other numbers than counts")
@@ -87,7 +88,7 @@ _BESIDE: Mapping[str, tuple[str, Callable[[Any], bytes]]] = {
     "depth": (DEPTH_FORMAT, encode_depth),
     "segmentation": (LABELS_FORMAT, encode_labels),
 }
-"""Images beside colour: stream -> its format, and how one is encoded."""
+"""Non-colour images: stream -> its format and encoder."""
 
 
 class CameraWriter:
@@ -95,15 +96,15 @@ class CameraWriter:
 
     Args:
         camera: The camera.
-        video: How colours are encoded, where they do not come so.
-        fps: Of the episode.
-        beside: Streams of images that come with each one of colours: "depth", "segmentation".
+        video: Encoding of colour images, unless they arrive encoded.
+        fps: Frames per second of the episode.
+        beside: Streams of images that accompany each colour image: "depth", "segmentation".
 
     Attributes:
-        camera: As given.
-        streams: What is recorded, and how the images are encoded.
-        num_ready: Images that have left the encoder, so far.
-        last_ns: Stamp of the last image.
+        camera: The camera.
+        streams: Recorded streams and their encoding.
+        num_ready: Number of images that have left the encoder.
+        last_ns: Timestamp of the last image.
     """
 
     def __init__(self, camera: Camera, video: VideoConfig, fps: int, *, beside: Sequence[str] = ()) -> None:
@@ -123,7 +124,7 @@ class CameraWriter:
         self._num_images = self.num_ready = self.last_ns = 0
 
     def add(self, stamp_ns: int, data: NDArray[Any] | bytes, **beside: NDArray[Any] | None) -> int:
-        """Take the next image: pixels, distances, or the packet of one that came encoded; return its number."""
+        """Add the next image: pixels, distances, or an encoded packet; return its number."""
         if self._encoder is None:
             self._keep([data if isinstance(data, bytes) else encode_distances(data)])
         else:
@@ -146,12 +147,12 @@ class CameraWriter:
         self.num_ready += len(packets)
 
     def end(self) -> None:
-        """Take what the encoder held back."""
+        """Collect the images still in the encoder."""
         if self._encoder is not None:
             self._keep(self._encoder.finish())
 
     def take(self, until: int) -> list[tuple[int, list[Message]]]:
-        """Stamp and messages of the images before that number that have left the encoder, each once."""
+        """Return timestamp and messages of the encoded images before a number, each once."""
         count = max(0, until - (self.num_ready - len(self._packets)))
         pairs = zip(self._waiting, self._packets[:count], strict=False)
         taken = [(stamp, self._messages(stamp, packet) + others) for (stamp, others), packet in pairs]
@@ -159,7 +160,7 @@ class CameraWriter:
         return taken
 
     def _messages(self, time_ns: int, packet: bytes) -> list[Message]:
-        """Those of one image, be it of colours or of distances."""
+        """Build the messages of one image, colour or distances."""
         camera, codec, frame_id = self.camera, self.streams.video.codec, self._frame_id
         topic = video_topic(camera.name, codec)
         if codec == "av1":
@@ -171,13 +172,13 @@ class CameraWriter:
         data = messages.compressed_image(time_ns, frame_id, image_format, packet)
         result = [(topic, messages.COMPRESSED_IMAGE, data)]
         if codec in ("h264", "h265"):
-            # The same bytes once more, as Foxglove wants them; next to the first, compression folds them.
+            # The same bytes again in Foxglove's type; next to the first, compression removes the duplicate.
             again = messages.compressed_video(time_ns, frame_id, codec, packet)
             result.append((camera_topic(camera.name, "video"), messages.COMPRESSED_VIDEO, again))
         return result
 
     def statistics(self) -> Message | None:
-        """What was counted of all images; None where nothing was."""
+        """Return the statistics of all images as a message; None if nothing was counted."""
         if self._encoder is None or not self.num_ready:
             return None
         data = pixel_statistics(self._pixels.statistics())

@@ -1,4 +1,4 @@
-"""The loops over pixels, compiled by Numba; imported when first used, since Numba takes a second to start."""
+"""Pixel loops compiled by Numba; imported at first use, since Numba takes a second to start."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _put(words: NDArray[np.uint32], groups: int, value: Any) -> Any:
 
 @_njit  # type: ignore[untyped-decorator]
 def rvl_encode(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
-    """Code pixels (see `depth`) into zeroed words; return how many words were used."""
+    """Encode pixels (see `depth`) into zeroed words; return the number of words used."""
     position, groups, previous = 0, 0, np.int64(0)
     while position < len(pixels):
         start = position
@@ -49,7 +49,7 @@ def rvl_encode(pixels: NDArray[np.uint16], words: NDArray[np.uint32]) -> int:
 
 @_njit  # type: ignore[untyped-decorator]
 def _get(words: NDArray[np.uint32], groups: int) -> tuple[Any, Any]:
-    """The number at position `groups` and the next position; position -1 at the end of the data."""
+    """Return the number at position `groups` and the next position; position -1 at the end of the data."""
     value, shift = np.int64(0), 0
     while groups >> 3 < len(words) and shift < 60:
         group = np.int64(words[groups >> 3] >> (28 - 4 * (groups & 7))) & 15
@@ -63,7 +63,7 @@ def _get(words: NDArray[np.uint32], groups: int) -> tuple[Any, Any]:
 
 @_njit  # type: ignore[untyped-decorator]
 def rvl_decode(words: NDArray[np.uint32], pixels: NDArray[np.uint16]) -> bool:
-    """Decode words into zeroed pixels; False when they do not fit."""
+    """Decode words into zeroed pixels; False if they do not fit."""
     position, groups, previous = 0, 0, 0
     while position < len(pixels):
         zeros, groups = _get(words, groups)

@@ -1,13 +1,13 @@
-"""Depth and segmentation images as bytes, without loss.
+"""Lossless encoding of depth and segmentation images.
 
 Depth: 16 bits a pixel in millimetres, encoded by RVL (A. D. Wilson, Fast Lossless Depth Image Compression, ISS 2017):
-alternating run lengths of empty and of measured pixels, the measured ones as differences to the one before (zigzag),
-every number in groups of three bits with a continuation bit, eight groups to a 32-bit word. In the frame of ROS's
-compressed_depth_image_transport it is what Rerun draws as depth and RViz shows; PNG in that frame Rerun takes for a
-broken image.
+alternating run lengths of empty and of measured pixels, the measured ones as differences to the previous one (zigzag),
+every number in groups of three bits with a continuation bit, eight groups per 32-bit word. In the frame of ROS's
+compressed_depth_image_transport, Rerun draws it as depth and RViz shows it; Rerun treats PNG in that frame as a broken
+image.
 
-Segmentation: which body and link each pixel shows, as 16-bit PNG files with a table of names. Uncompressed images of
-one channel Rerun takes for depth, and stands them in the scene.
+Segmentation: body and link of each pixel, as 16-bit PNG files with a table of names. Rerun would interpret uncompressed
+single-channel images as depth, and place them in the scene.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from demorec.robots.urdf import Urdf
 DEPTH_FORMAT = "16UC1; compressedDepth rvl"
 MAX_METRES = 65.535
 DEPTH_TYPES: dict[str, type[np.uint16] | type[np.float32]] = {"16UC1": np.uint16, "32FC1": np.float32}
-"""Encodings of external episodes, which keep distances bit-exact: millimetres as RVL, or metres as they are."""
+"""Encodings of external episodes, which keep distances bit-exact: millimetres as RVL, or raw metres."""
 _RVL_HEAD = struct.Struct("<iffii")
 """ConfigHeader (format, two parameters of inverse depth, both unused here), then width and height."""
 
 
 def encode_depth(metres: NDArray[np.float32]) -> bytes:
-    """Depth (H, W) in metres, 0 (or not finite) where nothing was hit; farther than 65.535 m counts as nothing."""
+    """Encode depth (H, W) in metres; 0, not finite or farther than 65.535 m becomes empty."""
     with np.errstate(invalid="ignore"):
         known = (metres > 0) & (metres <= MAX_METRES)
     return encode_millimetres(np.where(known, np.rint(np.where(known, metres, 0) * 1000), 0).astype(np.uint16))
 
 
 def encode_millimetres(millimetres: NDArray[np.uint16]) -> bytes:
-    """Depth (H, W) in whole millimetres, 0 where nothing was measured."""
+    """Encode depth (H, W) in whole millimetres, 0 where nothing was measured."""
     from demorec.mcap import kernels
 
     height, width = millimetres.shape
@@ -54,33 +54,33 @@ def encode_millimetres(millimetres: NDArray[np.uint16]) -> bytes:
 
 
 def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Inverse of `encode_depth`, to half a millimetre; ValueError for no RVL image of that (height, width)."""
+    """Decode `encode_depth`, to half a millimetre; ValueError unless it is an RVL image of that (height, width)."""
     return np.asarray(decode_millimetres(data, size) / np.float32(1000), dtype=np.float32)
 
 
 def decode_millimetres(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
-    """Inverse of `encode_millimetres`; ValueError for no RVL image of that (height, width)."""
+    """Decode `encode_millimetres`; ValueError unless it is an RVL image of that (height, width)."""
     from demorec.mcap import kernels
 
     if len(data) < _RVL_HEAD.size or (len(data) - _RVL_HEAD.size) % 4:
         raise ValueError(f"a depth image of {len(data)} bytes")
     _, _, _, width, height = _RVL_HEAD.unpack_from(data)
     if (height, width) != size:
-        raise ValueError(f"a depth image of {width}x{height} pixels, expected {size[1]}x{size[0]}")
+        raise ValueError(f"a depth image of {width}x{height} pixels, not {size[1]}x{size[0]}")
     words = np.frombuffer(data, dtype="<u4", offset=_RVL_HEAD.size).astype(np.uint32)
     flat = np.zeros(width * height, dtype=np.uint16)
     if not kernels.rvl_decode(words, flat):
-        raise ValueError("a depth image whose runs do not fit its size")
+        raise ValueError("a depth image with runs that do not fit its size")
     return flat.reshape(height, width)
 
 
 def encode_distances(values: NDArray[Any]) -> bytes:
-    """The packet of distances (H, W) uint16 or float32."""
+    """Encode distances (H, W) uint16 or float32 as a packet."""
     return encode_millimetres(values) if values.dtype == np.uint16 else values.astype("<f4").tobytes()
 
 
 def decode_distances(encoding: str, data: bytes, size: tuple[int, int]) -> NDArray[np.uint16] | NDArray[np.float32]:
-    """(H, W) of a packet, uint16 or float32; ValueError when it is none of that (height, width)."""
+    """Decode a packet to (H, W) uint16 or float32; ValueError if it does not have that (height, width)."""
     if encoding == "16UC1":
         return decode_millimetres(data, size)
     if len(data) != 4 * size[0] * size[1]:
@@ -90,56 +90,56 @@ def decode_distances(encoding: str, data: bytes, size: tuple[int, int]) -> NDArr
 
 BACKGROUND = -1
 LABELS_FORMAT = "mono16; png compressed "
-"""In the words of ROS's compressed_image_transport, blank included."""
+"""In the notation of ROS's compressed_image_transport, including the blank."""
 _PNG_HEAD = struct.Struct(">16sIIBB")
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR"
 _GREY_16 = (16, 0)
-"""Bits of a channel, and the colour type of one that is grey."""
+"""Bits of a channel, and the colour type of a grey image."""
 _LINK_SHIFT = 24
 _BODY_MASK = (1 << _LINK_SHIFT) - 1
 
 
 def to_labels(segmentation: NDArray[np.int32]) -> NDArray[np.uint16]:
-    """(H, W) body + ((link + 1) << 24), background -1, as 256 (body + 1) + link + 1, background 0.
+    """Convert (H, W) body + ((link + 1) << 24), background -1, to 256 (body + 1) + link + 1, background 0.
 
     Raises:
-        RecordingError: More than 255 bodies, or links of a body.
+        RecordingError: There are more than 255 bodies, or links of a body.
     """
     values = segmentation.astype(np.int64)
     body, link = values & _BODY_MASK, values >> _LINK_SHIFT
     known = values >= 0
     if bool(((body > 254) & known).any()) or bool(((link > 255) & known).any()):
-        raise RecordingError("Segmentation can be recorded of at most 255 bodies with 255 links each.")
+        raise RecordingError("Segmentation is limited to 255 bodies with 255 links each: use a smaller scene.")
     return np.where(known, ((body + 1) << 8) + link, 0).astype(np.uint16)
 
 
 def from_labels(labels: NDArray[np.uint16]) -> NDArray[np.int32]:
-    """Inverse of `to_labels`."""
+    """Convert labels back; the inverse of `to_labels`."""
     values = labels.astype(np.int32)
     links = values & 255
     links <<= _LINK_SHIFT
     values >>= 8
     values -= 1  # the background, 0, becomes -1 by itself
-    values += links  # all in place: memory for each step would cost more than the step
+    values += links  # all in place: allocation would cost more than the step itself
     return values
 
 
 def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
-    """A PNG file of `to_labels`."""
+    """Encode `to_labels` as a PNG file."""
     buffer = io.BytesIO()
     Image.fromarray(to_labels(segmentation)).save(buffer, format="PNG", compress_level=3)
     return buffer.getvalue()
 
 
 def decode_labels(data: bytes, size: tuple[int, int]) -> NDArray[np.int32]:
-    """Inverse of `encode_labels`; ValueError when the bytes are no such file of that (height, width)."""
+    """Decode `encode_labels`; ValueError unless the bytes are such a file of that (height, width)."""
     return LabelDecoder(size).decode(data)
 
 
 class LabelDecoder:
-    """Reads the segmentation images of one camera.
+    """Decoder of the segmentation images of one camera.
 
-    FFmpeg unpacks an image in a third of the time that Pillow takes; to set it up costs as much as to unpack one.
+    FFmpeg unpacks an image in a third of Pillow's time; its set-up costs as much as unpacking one image.
 
     Args:
         size: (height, width) of all images.
@@ -152,31 +152,31 @@ class LabelDecoder:
         self._decoder.options = {"err_detect": "crccheck+explode"}
 
     def decode(self, data: bytes) -> NDArray[np.int32]:
-        """As of `decode_labels`."""
+        """Decode one image; see `decode_labels`."""
         if len(data) < _PNG_HEAD.size:
-            raise ValueError("a segmentation image that is cut off")
+            raise ValueError("a truncated segmentation image")
         signature, width, height, depth, color = _PNG_HEAD.unpack_from(data)
         if signature != _PNG_SIGNATURE or (depth, color) != _GREY_16:
-            raise ValueError("a segmentation image that is no PNG file of 16-bit numbers")
+            raise ValueError("a segmentation image that is not a 16-bit PNG file")
         if (height, width) != self._size:  # before anything is unpacked
             raise ValueError(f"a segmentation image of {width}x{height} pixels")
         packet = av.Packet(data)
-        packet.is_keyframe = True  # else FFmpeg takes it for the difference to the image before
+        packet.is_keyframe = True  # otherwise FFmpeg treats it as a difference to the previous image
         try:
             frames = self._decoder.decode(packet)
         except av.FFmpegError as error:
-            raise ValueError("a segmentation image that is damaged") from error
+            raise ValueError("a damaged segmentation image") from error
         if len(frames) != 1 or frames[0].format.name != "gray16be" or (frames[0].height, frames[0].width) != self._size:
-            raise ValueError("a segmentation image that is damaged")
+            raise ValueError("a damaged segmentation image")
         lines = np.frombuffer(frames[0].planes[0], dtype=">u2").reshape(height, -1)  # FFmpeg may pad lines
         return from_labels(lines[:, :width].astype(np.uint16))
 
 
 def segment_names(info: EpisodeInfo) -> Iterator[tuple[int, str]]:
-    """(segmentation value, name) of the background, every body and every link of the robot.
+    """Yield (segmentation value, name) of the background, every body and every link of the robot.
 
-    Bodies are numbered in the order in which a world loads them (what stands still, the robot, what moves), links as
-    PyBullet does: depth first, in the order of the URDF's joints.
+    Bodies are numbered in loading order (static ones, the robot, movable ones), links as in PyBullet: depth first, in
+    the order of the URDF's joints.
     """
     yield BACKGROUND, "background"
     fixed = [body.name for body in info.simulated.scene.fixed]

@@ -1,4 +1,4 @@
-"""The messages that are written one by one: images, text, and what is said once; and any message by its fields."""
+"""Messages written individually (images, text, latched ones), and decoding of any message by its fields."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ _LOG_LEVELS = {"info": 20, "warning": 30, "error": 40}
 
 
 def read_string(data: bytes) -> str:
-    """The text of a std_msgs/String."""
+    """Decode the text of a std_msgs/String."""
     text: str = decode(STRING, data)[0]["data"]
     return text
 
 
 def read_boolean(data: bytes) -> bool:
-    """The value of a std_msgs/Bool."""
+    """Decode the value of a std_msgs/Bool."""
     return bool(decode(BOOL, data)[0]["data"])
 
 
 def log(time_ns: int, event: Event) -> bytes:
-    """rcl_interfaces/Log, without file, function and line."""
+    """Encode rcl_interfaces/Log, without file, function and line."""
     return encode(LOG, _stamp(time_ns), _LOG_LEVELS[event.level], event.name, event.message, "", "", 0)
 
 
 def read_log(data: bytes) -> Event:
-    """Inverse of `log`; ValueError for an unknown level."""
+    """Decode the message of `log`; ValueError for an unknown level."""
     values, _ = decode(LOG, data)
     for level, number in _LOG_LEVELS.items():
         if number == values["level"]:
@@ -61,57 +61,57 @@ def read_log(data: bytes) -> Event:
 
 
 def _stamp(time_ns: int) -> tuple[int, int]:
-    """builtin_interfaces/Time."""
+    """Build builtin_interfaces/Time."""
     return divmod(time_ns, 1_000_000_000)
 
 
 _U32 = struct.Struct("<I")
 _head = lru_cache(maxsize=256)(encode)
-"""The constant beginning of messages that differ in their stamp and in what comes last."""
+"""Cached constant beginning of messages that differ only in their timestamp and last field."""
 
 
 def _stamped(head: bytes, time_ns: int, data: bytes) -> bytes:
-    """A message from its beginning, which ends with no octets: with a stamp behind the encapsulation, and with data."""
+    """Complete a message from its constant beginning, which ends with an empty array: insert timestamp and data."""
     return b"".join((head[:4], struct.pack("<II", *_stamp(time_ns)), head[12:-4], _U32.pack(len(data)), data))
 
 
 def compressed_image(time_ns: int, frame_id: str, image_format: str, data: bytes) -> bytes:
-    """sensor_msgs/CompressedImage."""
+    """Encode sensor_msgs/CompressedImage."""
     return _stamped(_head(COMPRESSED_IMAGE, (_stamp(0), frame_id), image_format, b""), time_ns, data)
 
 
 def compressed_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
-    """foxglove_msgs/CompressedVideo."""
+    """Encode foxglove_msgs/CompressedVideo."""
     message = _stamped(_head(COMPRESSED_VIDEO, _stamp(0), frame_id, b""), time_ns, data)
     text = video_format.encode() + b"\x00"
     return message + b"\x00" * (-len(message) % 4) + _U32.pack(len(text)) + text
 
 
 def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], data: bytes) -> bytes:
-    """sensor_msgs/Image of (height, width) pixels in little endian."""
+    """Encode sensor_msgs/Image of (height, width) pixels in little endian."""
     head = _head(IMAGE, (_stamp(0), frame_id), *size, encoding, False, len(data) // size[0], b"")
     return _stamped(head, time_ns, data)
 
 
 def read_image(data: bytes) -> bytes:
-    """The pixels of an `image`; ValueError when it is cut off."""
+    """Decode the pixels of an `image`; ValueError if it is truncated."""
     return bytes(decode(IMAGE, data)[0]["data"])
 
 
 def read_compressed_image(data: bytes) -> bytes:
-    """The encoded image of a `compressed_image`."""
+    """Decode the encoded image of a `compressed_image`."""
     start = _compressed_image_start(data)
     (length,) = _U32.unpack_from(data, start - 4)
     image = data[start : start + length]
     if len(image) != length:
-        raise ValueError("an image that is cut off")
+        raise ValueError("a truncated image")
     return image
 
 
 def _compressed_image_start(data: bytes) -> int:
-    """Where the image begins in a message, its length in the four bytes before."""
-    # Encapsulation (4 bytes) and stamp (8), then two strings and the octets, each after its length, which starts at a
-    # multiple of four.
+    """Find the offset of the image in a message; the four bytes before are its length."""
+    # Encapsulation (4 bytes) and timestamp (8), then two strings and the octets, each after its length, which starts at
+    # a multiple of four.
     position = 12
     for _ in range(2):
         (length,) = _U32.unpack_from(data, position)
@@ -120,7 +120,7 @@ def _compressed_image_start(data: bytes) -> int:
 
 
 def coded_images(block: Block, codec: str) -> Block:
-    """The encoded images alone, given the messages of a camera; ValueError for what is no image."""
+    """Extract the encoded images from the messages of a camera; ValueError if one is not an image."""
     if codec == "av1":
         return _one_by_one(block, read_protobuf_video)
     if not len(block):
@@ -128,12 +128,12 @@ def coded_images(block: Block, codec: str) -> Block:
     start = _compressed_image_start(next(iter(block.messages())))
     heads = block.heads(start)
     constant = np.ones(start, dtype=np.bool_)
-    constant[4:12] = constant[-4:] = False  # stamp, length of the image
+    constant[4:12] = constant[-4:] = False  # timestamp, length of the image
     if not (heads[:, constant] == heads[0, constant]).all():
         return _one_by_one(block, read_compressed_image)
     lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
     if (lengths > block.lengths - start).any():
-        raise ValueError("an image that is cut off")
+        raise ValueError("a truncated image")
     return replace(block, starts=block.starts + start, lengths=lengths)
 
 
@@ -144,7 +144,7 @@ def _one_by_one(block: Block, read: Callable[[bytes], bytes]) -> Block:
 
 
 def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
-    """foxglove.CompressedVideo in protobuf: the only form in which Rerun plays AV1 from an MCAP file."""
+    """Encode foxglove.CompressedVideo in protobuf, the only form of AV1 that Rerun plays from an MCAP file."""
     from foxglove.messages import CompressedVideo, Timestamp
 
     stamp = Timestamp(sec=time_ns // 1_000_000_000, nsec=time_ns % 1_000_000_000)
@@ -153,7 +153,7 @@ def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) 
 
 
 def read_protobuf_video(data: bytes) -> bytes:
-    """The encoded image of a `protobuf_video`."""
+    """Decode the encoded image of a `protobuf_video`."""
     for name, value in protobuf_fields(data):
         if name == "data":
             return value
@@ -164,7 +164,7 @@ _VIDEO_FIELDS = {1: "timestamp", 2: "frame_id", 3: "data", 4: "format"}
 
 
 def protobuf_fields(data: bytes) -> Iterator[tuple[str, bytes]]:
-    """(name, bytes) of the fields of a foxglove.CompressedVideo, all of which are length-delimited."""
+    """Yield (name, bytes) of the fields of a foxglove.CompressedVideo, all of which are length-delimited."""
     position = 0
     while position < len(data):
         tag, position = _varint(data, position)
@@ -190,7 +190,7 @@ def _varint(data: bytes, position: int) -> tuple[int, int]:
 
 
 def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequence[float] = (0.0,) * 5) -> bytes:
-    """sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with the distortion of the plumb bob model."""
+    """Encode sensor_msgs/CameraInfo of (height, width) pixels and K (3, 3), with plumb bob distortion."""
     projection = np.hstack((k, np.zeros((3, 1))))
     matrices = (matrix.reshape(-1) for matrix in (k, np.eye(3), projection))
     whole_image = (0, 0, 0, 0, False)  # as the region of interest; without binning
@@ -199,7 +199,7 @@ def camera_info(frame_id: str, size: tuple[int, int], k: Array, distortion: Sequ
 
 
 def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
-    """tf2_msgs/TFMessage at time 0: (parent frame, child frame, parent_from_child) each."""
+    """Encode tf2_msgs/TFMessage at time 0 from (parent frame, child frame, parent_from_child) each."""
     return encode(
         TRANSFORMS,
         [((_stamp(0), parent), child, (pose.position, pose.quat_xyzw)) for parent, child, pose in rows],
@@ -207,12 +207,12 @@ def transforms(rows: Sequence[tuple[str, str, Pose]]) -> bytes:
 
 
 def label_info(labels: Sequence[tuple[int, str]]) -> bytes:
-    """vision_msgs/LabelInfo: which number stands for what in segmentation images."""
+    """Encode vision_msgs/LabelInfo: the meaning of each number in segmentation images."""
     return encode(LABEL_INFO, (_stamp(0), ""), labels, 0.0)
 
 
 def read_label_info(data: bytes) -> dict[int, str]:
-    """Inverse of `label_info`."""
+    """Decode the message of `label_info`."""
     return {item["class_id"]: item["class_name"] for item in decode(LABEL_INFO, data)[0]["class_map"]}
 
 
@@ -220,10 +220,10 @@ Value = bool | int | float | str | bytes
 
 
 def message_fields(schema: str, data: bytes) -> dict[str, Value]:
-    """Any message taken apart by the definition of its type, so that what differs can be named.
+    """Decode any message by the definition of its type, to name differences.
 
-    Name of each field, as in `pose.position.x` or `position[3]`, -> its value, in order. A sequence also has its
-    length, as `position.length`; octets (an encoded image) are one value.
+    Returns name of each field, such as `pose.position.x` or `position[3]`, -> its value, in order. A sequence also has
+    its length, as `position.length`; octets (an encoded image) are one value.
 
     Args:
         schema: Type of the message, one that recordings use.
@@ -235,10 +235,10 @@ def message_fields(schema: str, data: bytes) -> dict[str, Value]:
     if schema == PROTOBUF_VIDEO:
         return dict(protobuf_fields(data))
     if schema not in DEFINITIONS:
-        raise ValueError(f"no recording has messages of the type {schema!r}")
+        raise ValueError(f"recordings have no messages of the type {schema!r}")
     values, num_left = decode(schema, data, text=_any_text)
     if num_left:
-        raise ValueError(f"a message with {num_left} bytes too many")
+        raise ValueError(f"a message with {num_left} excess bytes")
     return dict(_leaves("", values))
 
 
@@ -247,7 +247,7 @@ def _any_text(raw: bytes) -> str:
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, Value]]:
-    """Path and value of every field in a part of a message."""
+    """Yield path and value of every field in a part of a message."""
     if isinstance(value, dict):
         for name, part in value.items():
             yield from _leaves(f"{path}.{name}" if path else name, part)

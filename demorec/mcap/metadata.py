@@ -22,7 +22,7 @@ from demorec.mcap.video import VideoSettings
 EPISODE = "demorec.episode"
 OUTCOME = "demorec.outcome"
 RECOVERED = "demorec.recovered"
-"""Record of a recording that a crash cut off."""
+"""Metadata record of a recording that a crash cut off."""
 _CHECKSUM = "crc32"
 
 
@@ -32,7 +32,7 @@ class CameraStreams:
 
     Attributes:
         video: Coding of the colour images.
-        depth, segmentation: Whether these were recorded; of a depth camera its images are the depth.
+        depth, segmentation: Whether these were recorded; the images of a depth camera are its depth.
     """
 
     video: VideoSettings
@@ -41,7 +41,7 @@ class CameraStreams:
 
 
 def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
-    """Values of the record that makes an MCAP file a recording; the first few are for people.
+    """Build the record that makes an MCAP file a recording; its first values are for human readers.
 
     The URDF is a message; the record has its SHA-256.
     """
@@ -61,18 +61,18 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
 
 
 def urdf_sha256(urdf: str) -> str:
-    """SHA-256 (hex) of a URDF, "" of none."""
+    """Compute SHA-256 (hex) of a URDF; "" if empty."""
     return hashlib.sha256(urdf.encode()).hexdigest() if urdf else ""
 
 
 def outcome_metadata(outcome: Outcome) -> dict[str, str]:
-    """Values of the record that ends a complete recording."""
+    """Build the record that ends a complete recording."""
     success = "unknown" if outcome.success is None else str(outcome.success).lower()
     return sealed({"success": success, "outcome": to_json(outcome)})
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams], str]:
-    """Inverse of `episode_metadata`; third the SHA-256 of the URDF, which `info` lacks.
+    """Parse the record of `episode_metadata`; returns info without URDF, cameras, and the URDF's SHA-256.
 
     Raises:
         RecordingError: The record is damaged, or has another format version.
@@ -81,7 +81,7 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
     version = metadata.get("format_version", "")
     if version != str(FORMAT_VERSION):
         raise RecordingError(
-            f"The recording has format version {version[:20] or 'none'}, this demorec reads {FORMAT_VERSION}: "
+            f"The recording has format version {version[:20] or 'none'}, but this demorec reads {FORMAT_VERSION}: "
             "use the demorec that wrote it, or a newer one"
         )
     try:
@@ -94,23 +94,23 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
 
 
 def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
-    """Raise ValueError unless the cameras, where any were recorded, are as the description says."""
+    """Raise ValueError unless the recorded cameras, if any, match the description."""
     if cameras and cameras.keys() != {camera.name for camera in info.cameras}:
-        raise ValueError("the recorded cameras are not those of the description")
+        raise ValueError("the recorded cameras differ from the description")
     for camera in info.cameras if cameras else ():
         video = cameras[camera.name].video
         if (video.width, video.height, video.fps) != (camera.width, camera.height, info.fps):
-            raise ValueError(f"the video of the camera {camera.name!r} has another size or rate than the description")
+            raise ValueError(f"the video of the camera {camera.name!r} differs in size or rate from the description")
         if not camera.kept and video.gop < 1:
             raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
         if camera.kept and video.codec != camera.kept:
             raise ValueError(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
         if camera.kept and cameras[camera.name].depth != camera.is_depth:
-            raise ValueError(f"the camera {camera.name!r} is not the depth camera that its streams say")
+            raise ValueError(f"the camera {camera.name!r} is not a depth camera, contrary to its streams")
 
 
 def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
-    """Inverse of `outcome_metadata`. Raises RecordingError if the record is damaged."""
+    """Parse the record of `outcome_metadata`. Raises RecordingError if it is damaged."""
     check_seal(OUTCOME, metadata)
     try:
         outcome = from_json(metadata["outcome"], Outcome)
@@ -122,7 +122,7 @@ def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:
 
 
 def sealed(metadata: dict[str, str]) -> dict[str, str]:
-    """The metadata with their checksum, which `check_seal` verifies."""
+    """Add the checksum that `check_seal` verifies."""
     return {**metadata, _CHECKSUM: _checksum(metadata)}
 
 

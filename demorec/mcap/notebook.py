@@ -1,4 +1,4 @@
-"""A recording in notebooks: its facts in a line or on a page, its numbers as a table."""
+"""A recording in notebooks: its facts in one line or on a page, its numbers as a table."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ _OUTCOMES = {True: "success", None: "unknown"}
 
 
 def line_of(recording: EpisodeFile) -> str:
-    """The facts about a recording in one line, without control characters."""
+    """Summarise a recording in one line, without control characters."""
     return printable(", ".join(f"{name} {value}" if name else value for name, value in _facts(recording)))
 
 
 def page_of(recording: EpisodeFile, images: Mapping[str, Iterable[NDArray[np.uint8]]]) -> str:
-    """The facts, and some images of cameras, as one piece of HTML."""
+    """Render the facts, and some images of cameras, as HTML."""
     facts = (("instruction", recording.info.instruction), *_facts(recording), ("file", str(recording.path)))
     rows = [(name or "length", html.escape(printable(value))) for name, value in facts]
     rows += [(camera, "".join(map(_image, shown))) for camera, shown in images.items()]
@@ -68,7 +68,7 @@ def _image(pixels: NDArray[np.uint8]) -> str:
 
 
 def table_of(info: EpisodeInfo, numbers: Table | Trajectory) -> pd.DataFrame:
-    """The table of `Recording.to_pandas`."""
+    """Build the table of `Recording.to_pandas`."""
     try:
         import pandas as pd
     except ImportError as error:
@@ -104,5 +104,5 @@ def _trajectory_columns(info: EpisodeInfo, trajectory: Trajectory) -> dict[str, 
 
 
 def _components(name: str, rows: NDArray[np.float64], parts: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """The columns of (T, D) rows, named by their components."""
+    """Split (T, D) rows into columns named by component."""
     return {f"{name}.{part}": rows[:, number] for number, part in enumerate(parts)}

@@ -1,4 +1,4 @@
-"""An MCAP file in the making: NAME.mcap.part, which gets its name when it is complete and on the disk."""
+"""An unfinished MCAP file: NAME.mcap.part, renamed when it is complete and on disk."""
 
 from __future__ import annotations
 
@@ -27,23 +27,23 @@ _LATCHED_QOS = (
     "  liveliness: 1\n  liveliness_lease_duration:\n    sec: 9223372036\n    nsec: 854775807\n"
     "  avoid_ros_namespace_conventions: false"
 )
-"""Quality of service of topics that are said once: "transient local", so that a late subscriber hears them too."""
+"""Quality of service of topics with one message: "transient local", so that late subscribers receive it too."""
 
 
 class _Disk(io.FileIO):
-    """The file below the MCAP writer, unbuffered.
+    """The file under the MCAP writer, unbuffered.
 
-    It keeps the first error, stores nothing more after it and goes on as if it did: the writer, told of it, would print
-    a line for every message that is logged until the recorder looks at `error`.
+    It keeps the first error, then discards further data silently: otherwise the writer would print a line for every
+    message until the recorder checks `error`.
     """
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "w")
-        self._place = self._end = 0  # as the writer knows them
+        self._place = self._end = 0  # as assumed by the writer
         self.error: OSError | None = None
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        """Write all of it, unless an earlier write failed."""
+        """Write all data, unless an earlier write failed."""
         rest = memoryview(data)
         try:
             while rest and self.error is None:
@@ -55,14 +55,14 @@ class _Disk(io.FileIO):
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """As any file."""
+        """Move the file position."""
         self._place = offset + (0, self._place, self._end)[whence]
         if self.error is None:
             super().seek(self._place)
         return self._place
 
     def sync(self) -> None:
-        """Have the operating system put everything on the disk."""
+        """Flush everything to disk."""
         try:
             os.fsync(self.fileno())
         except OSError as error:
@@ -74,15 +74,15 @@ class PartFile:
 
     Args:
         path: The finished file.
-        part: Where it is until then, when that is not NAME.part.
+        part: Path of the unfinished file, if not NAME.part.
         overwrite: Whether `path`, or an unfinished recording of its name, may be replaced by the new one.
-        is_worthless: Whether an unfinished recording, whose writer is dead, holds nothing that could not be made again,
-            so that it is replaced whether or not that is asked for.
+        is_worthless: Whether an unfinished recording of a dead writer contains nothing that could not be made again, so
+            that it may always be replaced.
 
     Raises:
-        ConfigError: A file of that name, or an unfinished one, is there already and not to be replaced; or no file can
-            be there.
-        RecordingError: It cannot be written.
+        ConfigError: A file of that name, or an unfinished one, exists and must not be replaced; or no file can be
+            created there.
+        RecordingError: The file cannot be written.
     """
 
     def __init__(
@@ -97,12 +97,12 @@ class PartFile:
         check_replaceable(path, RECORDING, overwrite=overwrite)
         self._before = snapshot(path)
         try:
-            # Held until the file has its name or is left: no other process takes it for what a dead one left.
+            # Held until the file is renamed or closed: other processes must not mistake it for a dead one's.
             self._lock: int | None = _lock_part(self.part)
             try:
                 if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
                     raise ConfigError(
-                        "An unfinished recording of that name is there already; recover it, delete it, or --overwrite: "
+                        "An unfinished recording of that name exists; recover it, delete it, or use --overwrite: "
                         f"{self.part}"
                     )
                 self._disk = _Disk(self.part)
@@ -132,7 +132,7 @@ class PartFile:
         self.logger(topic, schema, latched=latched)(data, log_time=time_ns)
 
     def logger(self, topic: str, schema: str, *, latched: bool = False) -> Callable[..., None]:
-        """What adds messages to a topic, for many of them: called with the data and, by name, log_time."""
+        """Return a function that adds many messages to a topic: called with the data and, by name, log_time."""
         if topic not in self._channels:
             if schema == messages.PROTOBUF_VIDEO:
                 encoding, definition = "protobuf", CompressedVideo.get_schema()
@@ -146,7 +146,7 @@ class PartFile:
                 context=self._context,
                 metadata={"offered_qos_profiles": _LATCHED_QOS} if latched else {},
             )
-        log: Callable[..., None] = self._channels[topic].base.log  # past its wrapper, which looks for JSON
+        log: Callable[..., None] = self._channels[topic].base.log  # bypasses its wrapper, which checks for JSON
         return log
 
     def metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -155,7 +155,7 @@ class PartFile:
             self._mcap.write_metadata(name, dict(values))
 
     def flush(self) -> None:
-        """End the chunk; when this returns, what was logged is with the operating system and survives this process.
+        """End the chunk; afterwards everything logged is with the operating system and survives this process.
 
         Raises:
             RecordingError: The disk is full or gone.
@@ -167,13 +167,13 @@ class PartFile:
     def _disk_errors(self) -> Iterator[None]:
         try:
             yield
-        except RuntimeError as error:  # what foxglove makes of any failure below it
+        except RuntimeError as error:  # foxglove's error for any failure below it
             raise self._unwritable(self._disk.error or error) from (self._disk.error or error)
         if self._disk.error is not None:
             raise self._unwritable(self._disk.error) from self._disk.error
 
     def end(self) -> None:
-        """Write the index and make NAME.part durable, whole but without its name; harmless when called twice.
+        """Write the index and make NAME.part durable, complete but not renamed; safe to call twice.
 
         Raises:
             RecordingError: The disk is full.
@@ -188,7 +188,7 @@ class PartFile:
                 self._disk.close()
 
     def close(self) -> None:
-        """End it and leave NAME.part as it is; harmless when called twice."""
+        """End the file and keep it as NAME.part; safe to call twice."""
         try:
             self.end()
         finally:
@@ -197,17 +197,17 @@ class PartFile:
                 self._lock = None
 
     def discard(self) -> None:
-        """Give it up and remove what was written; harmless when called twice, and after `publish`."""
+        """Abandon the file and remove it; safe to call twice, and after `publish`."""
         if self._lock is not None:
-            self.part.unlink(missing_ok=True)  # while the lock is held: nobody else's file has that name
+            self.part.unlink(missing_ok=True)  # while the lock is held, the file is ours
         with suppress(RecordingError):
             self.close()
 
     def publish(self) -> None:
-        """End the file and give it its name.
+        """End the file and rename it.
 
         Raises:
-            ConfigError: A file of that name has appeared meanwhile, or another one than is to be replaced.
+            ConfigError: A file of that name has appeared meanwhile, or differs from the one to replace.
             RecordingError: The disk is full.
         """
         try:
@@ -226,41 +226,41 @@ class PartFile:
 
 
 def name_taken(path: Path, kept: Path) -> ConfigError:
-    """Return the error for a recording whose name somebody else's file has taken, where the recording stays."""
+    """Build the error for a recording with a name taken by another file, and the path where the recording stays."""
     return ConfigError(
-        f"Another file has appeared while this recording was made, and stays as it is ({path}); the recording is kept "
-        f"as {kept}"
+        f"Another file has appeared while this recording was made, and is left unchanged ({path}); the recording is "
+        f"kept as {kept}"
     )
 
 
 def _lock_part(part: Path) -> int:
     """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
 
-    What a dead process left there stays as it is; the caller decides about it.
+    The content left by a dead process is kept; the caller decides about it.
 
     Raises:
-        ConfigError: Another process is writing it, or it is none of ours.
+        ConfigError: Another process is writing it, or it is not an unfinished recording.
         OSError: It cannot be written.
     """
     while True:
         if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
-            raise ConfigError(f"This is no unfinished file and is in the way, move it elsewhere: {part}")
+            raise ConfigError(f"This is not an unfinished file and blocks the new one; move it elsewhere: {part}")
         try:
             handle = open_locked(part)
         except BlockingIOError as error:
-            raise ConfigError(f"Another process is writing this file, wait until it is done: {part}") from error
+            raise ConfigError(f"Another process is writing this file; wait until it is done: {part}") from error
         try:
-            # The owner before us may have given the file its final name between the two calls.
+            # Its previous owner may have renamed the file between the two calls.
             if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
                 os.close(handle)
                 continue
-            if os.fstat(handle).st_nlink > 1:  # a kill came while it got its final name
+            if os.fstat(handle).st_nlink > 1:  # killed during the renaming
                 part.unlink()
                 os.close(handle)
                 continue
             if os.fstat(handle).st_size and not RECORDING.recognises(part):
                 raise ConfigError(
-                    f"This is not the unfinished beginning of {RECORDING.name}, move it elsewhere: {part}"
+                    f"This is not the unfinished beginning of {RECORDING.name}; move it elsewhere: {part}"
                 )
             return handle
         except BaseException:

@@ -37,19 +37,19 @@ if TYPE_CHECKING:
 class Recording(EpisodeFile):
     """Context manager over one recording, and the sequence of its frames; one chunk is in memory at a time.
 
-    `for frame in recording` gives numbers and images together, `recording[120]`, `recording[-1]` and
-    `recording[::30]` any of them; `table` and `trajectory` give all numbers at once, which is much faster
-    where images are not needed. Frames are those of a simulation: other episodes have a `table` only.
+    `for frame in recording` yields numbers and images together; `recording[120]`, `recording[-1]` and `recording[::30]`
+    select frames; `table` and `trajectory` return all numbers at once, which is much faster if images are not needed.
+    Frames exist only for simulations: other episodes have just a `table`.
 
     Attributes:
-        path: Of the file.
+        path: Path of the file.
         info: Description of the episode.
-        outcome: How the episode ended; None when a crash cut it off.
-        num_frames: Length.
+        outcome: Outcome of the episode; None if a crash cut it off.
+        num_frames: Number of frames.
         is_recovered: Whether a crash cut it off.
 
     Raises:
-        RecordingError: No recording, cut off, damaged, or of another format version; so do all methods.
+        RecordingError: Not a recording, cut off, damaged, or of another format version; raised by all methods.
     """
 
     def table(self) -> Table:
@@ -73,12 +73,12 @@ class Recording(EpisodeFile):
 
     @property
     def time_ns(self) -> NDArray[np.int64]:
-        """(T,) stamps of the frames."""
+        """(T,) timestamps of the frames."""
         return self._numbers.time_ns
 
     @property
     def phases(self) -> tuple[str, ...]:
-        """T phases of the motion; empty where none are stated."""
+        """T phases of the motion; empty if unknown."""
         return self._numbers.phase if isinstance(self._numbers, Trajectory) else ()
 
     @property
@@ -87,19 +87,19 @@ class Recording(EpisodeFile):
 
     @cached_property
     def _numbers_and_events(self) -> tuple[Table | Trajectory, TimedMessages]:
-        """Read once: an export and a check look at them from several sides."""
+        """Numbers and events, read once: exports and checks use them repeatedly."""
         topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
         with damage_as_recording_error(self.path):
             return self._layout.read(self._container, self.num_frames, topics)
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
-        """(frame, subtask that begins there), in order; empty if the source states none."""
+        """(frame, subtask that begins there), in order; empty if the source has none."""
         found = []
         for time_ns, text in self._read(channels.SUBTASK, messages.read_string):
             frame = int(np.searchsorted(self.time_ns, time_ns))
             if frame == self.num_frames or self.time_ns[frame] != time_ns:
-                raise RecordingError(f"A subtask of the recording begins where no frame is: {self.path}")
+                raise RecordingError(f"A subtask of the recording begins between frames: {self.path}")
             found.append((frame, text))
         return tuple(found)
 
@@ -119,7 +119,7 @@ class Recording(EpisodeFile):
         )
 
     def description(self, body: str = "") -> str:
-        """URDF of the robot, or of a body: primitives only, complete without any other file; "" if unknown."""
+        """Return the URDF of the robot, or of a body: primitives only, complete without other files; "" if unknown."""
         for _, text in self._read(channels.description_topic(body), messages.read_string):
             with damage_as_recording_error(self.path):
                 check_primitives(text)
@@ -127,7 +127,7 @@ class Recording(EpisodeFile):
         return ""
 
     def joint_samples(self) -> Iterator[JointSample]:
-        """Every recorded joint state of a simulation in order of time: the frames' own and those between them."""
+        """Yield every recorded joint state of a simulation in order of time: at and between the frames."""
         for stream in self.streams:
             if stream.is_dense:
                 yield from self._joint_samples(stream)
@@ -138,8 +138,8 @@ class Recording(EpisodeFile):
             yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
 
     def events(self) -> Iterator[tuple[int, Event]]:
-        """(time_ns, event) in order of time; changes of phase are in `phases`."""
-        # They are stored among the numbers, with which they may have been read already.
+        """Yield (time_ns, event) in order of time; phase changes are in `phases`."""
+        # They are stored among the numbers, and may have been read with them already.
         if "_numbers_and_events" in vars(self):
             found: Iterable[tuple[int, bytes]] = self._numbers_and_events[1]
         else:
@@ -151,7 +151,7 @@ class Recording(EpisodeFile):
                 yield time_ns, event
 
     def coded_images(self, cameras: Sequence[str]) -> dict[str, Block]:
-        """camera -> all its encoded images, read in one pass; they are in memory together."""
+        """Read camera -> all its encoded images in one pass; they are in memory together."""
         topics = {camera: self._image_topic(camera) for camera in cameras}
         found = self._container.blocks(tuple(topics.values()))
         images, due_ns = {}, self._layout.due_ns(self.num_frames)
@@ -163,12 +163,12 @@ class Recording(EpisodeFile):
         return images
 
     def keyframes(self, camera: str) -> NDArray[np.int64]:
-        """Numbers of the images of a camera that are decoded without others; its images are in memory together."""
+        """Find the numbers of a camera's images that are decodable on their own; its images are in memory together."""
         codec = self.video_settings(camera).codec
         return np.flatnonzero([is_keyframe(codec, image) for image in self.coded_images([camera])[camera].messages()])
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
-        """Segmentation images, (H, W) int32 as in `CameraImages`, one per frame; `segment_names` has their names."""
+        """Yield segmentation images, (H, W) int32 as in `CameraImages`, one per frame; see `segment_names`."""
         topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
         for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
             yield labels
@@ -179,38 +179,38 @@ class Recording(EpisodeFile):
         return channels.camera_topic(camera, "segmentation")
 
     def segment_names(self) -> dict[int, str]:
-        """Segmentation value -> name of the body, or ROBOT/LINK; empty when no segmentation was recorded."""
+        """Return segmentation value -> name of the body, or ROBOT/LINK; empty if segmentation was not recorded."""
         for _, names in self._read(channels.LABELS, messages.read_label_info):
             values = from_labels(np.array(list(names), dtype=np.uint16)).tolist()
             return dict(zip(values, names.values(), strict=True))
         return {}
 
     def boxes(self, camera: str) -> Iterator[Box]:
-        """No boxes: recordings have none."""
+        """Yield nothing: recordings have no boxes."""
         return iter(())
 
     def _shown(self, camera: str) -> NDArray[np.int64]:
-        """(T,) number of the image of a camera that each frame holds."""
+        """Return (T,) number of the camera's image at each frame."""
         self._camera(camera)
         return self._table.images[camera]
 
     def image(self, camera: str, frame: int) -> Rgb | None:
-        """The decoded image that a frame holds, (H, W, 3) uint8 RGB; None where it has none of this camera.
+        """Decode a frame's image, (H, W, 3) uint8 RGB; None if the frame has no image of this camera.
 
-        It is decoded from the keyframe before it on.
+        Decoding starts at the preceding keyframe.
 
         Raises:
-            IndexError: There is no such frame; negative ones count from the end.
+            IndexError: The frame does not exist; negative ones count from the end.
         """
         number = int(self._shown(camera)[range(self.num_frames)[frame]])
         return None if number == NO_IMAGE else self.numbered_image(camera, number)
 
     def num_images(self, camera: str) -> int:
-        """How many images there are of a camera."""
+        """Return the number of a camera's images."""
         return self._container.counts.get(self._image_topic(camera), 0)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
-        """What some frames, in rising order, show of a camera that has images, (H, W, 3) uint8 RGB; in one pass.
+        """Yield the images of a camera at some frames, in increasing order, (H, W, 3) uint8 RGB; in one pass.
 
         A frame without an image shows the last one before it, or else the first.
         """
@@ -218,13 +218,13 @@ class Recording(EpisodeFile):
         return self._images(camera, held[list(frames)].tolist())
 
     def to_pandas(self) -> pd.DataFrame:
-        """All numbers as a table, one row a frame, bit-exact float64; the index is `frame_index`.
+        """Convert all numbers to a table, one row per frame, bit-exact float64; the index is `frame_index`.
 
         Columns are named as in `demorec.episode.episode.Trajectory`, vectors with their component:
-        `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`,
-        `wrench.hand.force.z` (N) where it was recorded, `object_poses.red_cube.z` (m, world frame),
-        `phase`. `time_ns` is simulated time since the episode's start. Of an external episode there are the stamps of
-        its frames and its features: `observation.state.shoulder`.
+        `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`, `wrench.hand.force.z`
+        (N) if recorded, `object_poses.red_cube.z` (m, world frame), `phase`. `time_ns` is simulated time since the
+        episode's start. An external episode has the timestamps of its frames and its features:
+        `observation.state.shoulder`.
 
         Raises:
             MissingDependencyError: pandas is not installed.
@@ -250,16 +250,16 @@ class Recording(EpisodeFile):
             return [self[number] for number in range(self.num_frames)[index]]
         frame = self._frames[index]
         first = frame.frame_index
-        colors = {name: self.images_at(name, [first]) for name in self.cameras}  # from the keyframe before it on
+        colors = {name: self.images_at(name, [first]) for name in self.cameras}  # from the preceding keyframe on
         return replace(frame, images=next(self._images_from(first, colors)))
 
     @cached_property
     def _frames(self) -> list[Frame]:
-        """All frames without images, kept from the first on that is asked for."""
+        """All frames without images, cached at first use."""
         return list(frames_of(self.trajectory(), self.events(), self.joint_samples()))
 
     def _images_from(self, first: int, colors: Mapping[str, Iterator[Rgb]]) -> Iterator[Mapping[str, CameraImages]]:
-        """The decoded images of a frame and of those after it, given the colours from that frame on."""
+        """Yield the decoded images of a frame and of those after it, given the colours from that frame on."""
         nothing: Iterator[None] = repeat(None)
         streams = {
             name: (
@@ -289,10 +289,10 @@ class Recording(EpisodeFile):
         return notebook.page_of(self, {camera: self.images_at(camera, moments) for camera in filmed})
 
     def digest(self) -> str:
-        """SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
+        """Compute SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
 
-        Not of how a file lays it out, nor of the versions that wrote it: two recordings of one digest hold bit for bit
-        the same episode.
+        File layout and software versions are excluded: two recordings with the same digest contain the same episode,
+        bit-exact.
         """
         result, numbers = self._digest_of_description(), self._numbers
         for name, data in _content(numbers):
@@ -317,7 +317,7 @@ class Recording(EpisodeFile):
 
 
 def _content(numbers: Table | Trajectory) -> Iterator[tuple[str, bytes]]:
-    """Name and bytes of every array."""
+    """Yield name and bytes of every array."""
     for field in fields(numbers):
         value = getattr(numbers, field.name)
         if isinstance(value, Mapping):
@@ -328,12 +328,12 @@ def _content(numbers: Table | Trajectory) -> Iterator[tuple[str, bytes]]:
 
 
 def open_recording(path: str | Path) -> Recording:
-    """Open a recording; errors as of `Recording`."""
+    """Open a recording; raises as `Recording`."""
     return Recording(path)
 
 
 def open_simulated(path: str | Path) -> Recording:
-    """Open the recording of an episode that demorec simulated.
+    """Open the recording of an episode simulated by demorec.
 
     Raises:
         RecordingError: As `Recording`, or it was recorded by another robot or program.

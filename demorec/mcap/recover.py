@@ -1,7 +1,7 @@
-"""What a crash left of a recording, as an indexed recording.
+"""Recovery of a recording after a crash.
 
-A file without its end has no index, but every chunk in it is whole and has its checksum. They are read from the
-front until one is cut off or damaged; what all streams have in common up to there are the frames that are kept.
+A file without its end has no index, but every complete chunk has a checksum. Chunks are read from the start until one
+is truncated or damaged; the frames present in all streams up to there are kept.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
 @dataclass(frozen=True, kw_only=True)
 class Recovered:
-    """What was kept.
+    """Result of a recovery.
 
     Attributes:
         path: The indexed recording.
-        num_frames: Kept.
-        is_complete: Whether nothing was missing, only the name.
-        reason: Why reading stopped, "" when the file was complete.
+        num_frames: Number of frames kept.
+        is_complete: Whether only the name was missing.
+        reason: Reason why reading stopped; "" if the file was complete.
     """
 
     path: Path
@@ -46,21 +46,21 @@ class Recovered:
 
 
 def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered:
-    """Write an indexed recording of all whole frames of `source`, which stays as it is.
+    """Write an indexed recording of all complete frames of `source`, which is not changed.
 
     Raises:
-        ConfigError: `target` is `source`, or is there already.
-        RecordingError: Not one frame could be kept, or a file cannot be read or written.
+        ConfigError: `target` is `source`, or exists.
+        RecordingError: No frame could be kept, or a file cannot be read or written.
     """
     if source.resolve() == target.resolve():
-        raise ConfigError(f"The recovered recording needs another name than the damaged one: {source}")
+        raise ConfigError(f"The recovered recording needs a different name from the damaged one: {source}")
     try:
         survey = _survey(source)
     except RecordingError as error:
         raise RecordingError(f"{without_path(error, source)}: {source}") from error
     make_folder(target.parent)
     seen: Counter[str] = Counter()
-    # The usual place for an unfinished file is where the source may lie.
+    # The source may be at the usual path of an unfinished file.
     part = target.with_name(f"{target.name}.recovering")
     file = PartFile(target, part=part, overwrite=overwrite, is_worthless=lambda part: True)
     try:
@@ -81,10 +81,10 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
             file.metadata(metadata.RECOVERED, metadata.sealed({"kept_frames": str(survey.num_frames)}))
         file.end()
         with Recording(part) as recording:
-            recording.table()  # a recovered file that cannot be read would be worse than none
+            recording.table()  # an unreadable recovered file would be worse than none
         file.publish()
     except BaseException:
-        file.discard()  # it holds nothing that the source does not
+        file.discard()  # everything in it is in the source
         raise
     return Recovered(
         path=target,
@@ -95,7 +95,7 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
 
 
 def is_whole(source: Path) -> bool:
-    """Whether a recording opens, ended in order, and can be read to its end."""
+    """Check whether a recording opens, ended properly, and can be read to its end."""
     try:
         with open_recording(source) as recording:
             return recording.outcome is not None and bool(recording.digest())
@@ -104,11 +104,11 @@ def is_whole(source: Path) -> bool:
 
 
 def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
-    """Whether an unfinished recording holds nothing yet, or was derived from the same thing in the same way.
+    """Check whether an unfinished recording is still empty, or was derived from the same origin.
 
     Args:
-        part: What a crash left.
-        origin: That of the recording that is about to be written in its place, as its info has it.
+        part: File left by a crash.
+        origin: Origin of the recording that is about to replace it, as in its info.
     """
     for item in _items(part):
         if isinstance(item, Metadata) and item.name == metadata.EPISODE:
@@ -118,18 +118,18 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
             return item == "the end is missing"  # after nothing: the writer was killed before the first frame
         if item is not None:
             return False
-    return True  # it ended in order, before the first frame
+    return True  # it ended properly, before the first frame
 
 
 class _Survey(NamedTuple):
-    """What is whole in a file.
+    """Complete content of a file.
 
     Attributes:
-        episode: The metadata of what is recorded.
-        outcome: Those of how it ended, where all of it is there.
-        reason: Why reading stopped.
-        num_frames: That all streams have in common.
-        keeps: Whether a message belongs to these frames, given which message of its topic it is, from 1.
+        episode: Metadata of the episode.
+        outcome: Metadata of the outcome, if complete.
+        reason: Reason why reading stopped.
+        num_frames: Number of frames present in all streams.
+        keeps: Whether a message belongs to these frames, given its number in its topic, from 1.
     """
 
     episode: dict[str, str]
@@ -140,7 +140,7 @@ class _Survey(NamedTuple):
 
 
 def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
-    """What `scan` gives of a file, and last, unless it ends as it should, a string that says why reading stopped."""
+    """Yield the items of `scan`, and last, unless the file ends properly, a string with the reason."""
     try:
         with open_regular(source) as file:
             size = file.seek(0, 2)
@@ -159,7 +159,7 @@ def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
 
 
 def _survey(source: Path) -> _Survey:
-    """Read everything once to learn how many frames all streams have in common; RecordingError when it is none."""
+    """Read everything once to count the frames present in all streams; RecordingError if no frame is complete."""
     found: dict[str, dict[str, str]] = {}
     reason = ""
     counts: Counter[str] = Counter()
@@ -180,4 +180,6 @@ def _survey(source: Path) -> _Survey:
             outcome = None
         if num_frames:
             return _Survey(episode, outcome, reason, num_frames, keeps)
-    raise RecordingError(f"Nothing can be recovered, the file holds no whole frame ({reason or 'no episode metadata'})")
+    raise RecordingError(
+        f"Nothing can be recovered, since the file has no complete frame ({reason or 'no episode metadata'})"
+    )

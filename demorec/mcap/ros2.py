@@ -1,6 +1,7 @@
-"""The ROS 2 message definitions that recordings use, as text: a recording explains itself to a reader without ROS.
+"""The ROS 2 message definitions of recordings, as text: a recording is self-describing without ROS.
 
-From common_interfaces, rcl_interfaces, geometry2, vision_msgs and foxglove_msgs (field names and order are the format).
+Source: common_interfaces, rcl_interfaces, geometry2, vision_msgs and foxglove_msgs (field names and order are the
+format).
 """
 
 from __future__ import annotations
@@ -85,7 +86,7 @@ _FIELD = re.compile(r"^([\w/]+)(\[(\d*)\])?\s+(\w+)$")
 
 
 class FieldType(NamedTuple):
-    """A field of a message; `length` is that of an array, None where each message says it."""
+    """A field of a message; `length` is that of an array, None if stored in each message."""
 
     name: str
     kind: str
@@ -99,7 +100,7 @@ Types = Mapping[str, tuple[FieldType, ...]]
 
 @cache
 def types_of(schema: str) -> Types:
-    """What the definition of a type says."""
+    """Parse the definition of a type."""
     first, *others = re.split(r"^=+\n", DEFINITIONS[schema], flags=re.MULTILINE)
     types = {"": _fields(first)}
     for text in others:

@@ -1,7 +1,7 @@
 """Streams of an episode that demorec did not simulate: a topic for each feature.
 
-`/frames` lists for each frame the stamps of the features' samples, then the numbers of the cameras' images. Messages of
-features are stored with the frame's time; those that begin with a header have the sample's stamp there.
+`/frames` lists for each frame the timestamps of the features' samples, then the numbers of the cameras' images. Feature
+messages are stored at the frame's time; those with a header have the sample's timestamp there.
 """
 
 from __future__ import annotations
@@ -29,12 +29,12 @@ if TYPE_CHECKING:
 
 
 def sampled_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
-    """The streams that become columns: one for each feature, then `/frames`."""
+    """List the streams that become columns: one for each feature, then `/frames`."""
     return (*map(_feature, info.features), _frames(info))
 
 
 def _frames(info: EpisodeInfo) -> FrameStream:
-    """The stream of `/frames`."""
+    """Build the stream of `/frames`."""
     features = [feature.name for feature in info.features]
     cameras = [camera.name for camera in info.cameras]
 
@@ -58,9 +58,9 @@ def _frames(info: EpisodeInfo) -> FrameStream:
 
 
 def _feature(feature: Feature) -> FrameStream:
-    """Stream of a feature: sensor_msgs/JointState for joints, otherwise std_msgs/Float64MultiArray."""
+    """Build the stream of a feature: sensor_msgs/JointState for joints, otherwise std_msgs/Float64MultiArray."""
     name = feature.name
-    if any(feature.joints):  # velocity and effort are empty: they are not known, and zeros would be invented
+    if any(feature.joints):  # velocity and effort are empty: they are unknown, and zeros would be invented
         joints = [joint or name for name, joint in zip(feature.names, feature.joints, strict=True)]
         schema, laid_out = messages.JOINT_STATE, joint_layout(joints, only_positions=True)
     else:
@@ -69,7 +69,7 @@ def _feature(feature: Feature) -> FrameStream:
         "/" + name.replace(".", "/"),
         schema,
         laid_out,
-        concatenated(lambda frame: (frame.samples[name].vector,)),  # float64 holds every bit of a float32
+        concatenated(lambda frame: (frame.samples[name].vector,)),  # float64 represents every bit of a float32
         lambda values: {"features": {name: values.astype(feature.dtype)}},
         stamp_ns=lambda frame: int(frame.samples[name].stamp_ns),
     )

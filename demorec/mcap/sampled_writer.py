@@ -1,6 +1,6 @@
-"""Write an episode that demorec does not simulate: images come at their own times, and several frames may show one.
+"""Writer of episodes that demorec does not simulate: images have their own times, and several frames may share one.
 
-Images are written in front of the frames that show them, so that all frames left by a crash have their images.
+Images are written before the frames that show them, so that all frames left by a crash have their images.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ from demorec.robots.urdf import Urdf
 
 
 class SampledWriter(BatchWriter):
-    """Context manager that writes an episode of another robot or program; arguments and errors as of `BatchWriter`.
+    """Context manager that writes an episode of another robot or program; arguments and errors as in `BatchWriter`.
 
     Args:
-        begins: Whether all of `info` is known. Otherwise only file and encoders are opened, and `begin` must follow.
+        begins: Whether `info` is complete. Otherwise only file and encoders are opened, and `begin` must follow.
     """
 
     def __init__(
@@ -57,11 +57,11 @@ class SampledWriter(BatchWriter):
         self._cameras = {camera.name: CameraWriter(camera, self._video, info.fps) for camera in info.cameras}
 
     def begin(self, info: EpisodeInfo) -> None:
-        """Describe the episode, of which only the cameras were known; before its first image and frame.
+        """Complete the description, of which only the cameras were known; before the first image and frame.
 
         Raises:
-            ConfigError: The description is impossible.
-            RecordingError: The disk is full; nothing of the episode is left then.
+            ConfigError: The description is invalid.
+            RecordingError: The disk is full; the episode's file is removed.
         """
         check_description(info)
         self._describe(info)
@@ -75,22 +75,22 @@ class SampledWriter(BatchWriter):
         self._write_description()
 
     def _state(self, frames: Sequence[SampledFrame]) -> tuple[Array, Array]:
-        """Joint positions (N, n), and no poses of bodies (N, 0)."""
+        """Return joint positions (N, n), and no poses of bodies (N, 0)."""
         features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
         return joint_positions(self._places, features), np.empty((len(frames), 0))
 
     def image(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
-        """Add the next image of a camera, and return its number, by which frames show it.
+        """Add the next image of a camera; return its number, which frames refer to.
 
         Args:
-            camera: One of the episode's.
-            stamp_ns: When it was taken, by the camera's clock; later than the one before.
-            data: (H, W, 3) uint8 RGB; for a camera whose images are kept an access unit (H.264 and H.265 with start
-                codes), a temporal unit (AV1) or a JPEG file, which stays as it is; for a depth camera (H, W) uint16
-                millimetres or float32 metres.
+            camera: A camera of the episode.
+            stamp_ns: Capture timestamp, by the camera's clock; later than the previous one.
+            data: (H, W, 3) uint8 RGB; for a passthrough camera an access unit (H.264 and H.265 with start codes), a
+                temporal unit (AV1) or a JPEG file, stored unchanged; for a depth camera (H, W) uint16 millimetres or
+                float32 metres.
 
         Raises:
-            RecordingError: An unknown camera, another size or type, or a stamp that goes backwards.
+            RecordingError: Unknown camera, wrong size or type, or a timestamp that goes backwards.
         """
         self._check.check_image(camera, stamp_ns, data)
         self._check.note_image(camera, stamp_ns)
@@ -100,8 +100,8 @@ class SampledWriter(BatchWriter):
         """Add the next frame.
 
         Raises:
-            RecordingError: Frames out of order; features that are missing, unknown, of another length or type; numbers
-                that are not finite; images that have not come; a full disk.
+            RecordingError: Frames are out of order; features are missing, unknown, or of a wrong length or type;
+                numbers are not finite; images have not arrived; or the disk is full.
         """
         self._check.check_frame(frame)
         self._check.note_frame(frame)
@@ -116,18 +116,18 @@ class SampledWriter(BatchWriter):
 
 
 MAX_STAMP_NS = 2**31 * 1_000_000_000 - 1
-"""The seconds of a stamp have 31 bits in ROS messages."""
+"""Maximum timestamp, ns: its seconds have 31 bits in ROS messages."""
 
 MAX_SUBTASK = 1000
-"""Characters."""
+"""Maximum length of a subtask, characters."""
 
 
 class SampledFrameCheck:
-    """Looks at images and frames in the order in which they come, and notes those that were taken.
+    """Validates images and frames in order of arrival, and keeps track of the accepted ones.
 
     Attributes:
-        features: By name, of the episode.
-        image_stamps: Camera -> stamp of the last image that was taken.
+        features: Features of the episode by name.
+        image_stamps: Camera -> timestamp of the last accepted image.
     """
 
     def __init__(self, info: EpisodeInfo) -> None:
@@ -140,7 +140,7 @@ class SampledFrameCheck:
         self._num_frames = 0
 
     def check_image(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> None:
-        """Raise RecordingError unless it can be the next image of the camera."""
+        """Raise RecordingError unless the data can be the next image of the camera."""
         known = self._cameras.get(camera)
         if known is None:
             raise RecordingError(
@@ -151,12 +151,12 @@ class SampledFrameCheck:
         _check_stamp(f"The image of the camera {camera!r}", self.image_stamps.get(camera, -1), stamp_ns)
 
     def note_image(self, camera: str, stamp_ns: int) -> None:
-        """The camera's next image was taken."""
+        """Note that the camera's next image was accepted."""
         self.image_stamps[camera] = int(stamp_ns)
         self._num_images[camera] += 1
 
     def check_frame(self, frame: SampledFrame) -> None:
-        """Raise RecordingError unless it can be the next frame."""
+        """Raise RecordingError unless the frame can be the next one."""
         what = f"frame {self._num_frames}"
         if unknown := [name for name in frame.samples if name not in self.features]:
             raise RecordingError(
@@ -165,7 +165,7 @@ class SampledFrameCheck:
             )
         if missing := [name for name in self.features if name not in frame.samples]:
             raise RecordingError(
-                f"{what.capitalize()} lacks the feature {', '.join(missing)}: every frame has every feature."
+                f"{what.capitalize()} lacks the feature {', '.join(missing)}: every frame needs every feature."
             )
         for name, feature in self.features.items():
             vector, count = frame.samples[name].vector, len(feature.names)
@@ -177,15 +177,17 @@ class SampledFrameCheck:
             if not np.isfinite(vector).all():
                 wrong = int(np.flatnonzero(~np.isfinite(vector))[0])
                 raise RecordingError(
-                    f"The feature {name!r} of {what} is {vector[wrong]} in its element {feature.names[wrong]!r}, "
+                    f"The feature {name!r} of {what} is {vector[wrong]} in its element {feature.names[wrong]!r}; "
                     "numbers must be finite."
                 )
         for camera, number in frame.images.items():
             if camera not in self._cameras or not 0 <= number < self._num_images[camera]:
                 count = self._num_images.get(camera, 0)
-                raise RecordingError(f"The camera {camera!r} has no image {number} for {what}, it has {count} so far.")
+                raise RecordingError(
+                    f"The camera {camera!r} has no image {number} for {what}; images received: {count}."
+                )
         if len(frame.subtask) > MAX_SUBTASK or not frame.subtask.isprintable():
-            raise RecordingError(f"The subtask of {what} is no single line of at most {MAX_SUBTASK} characters.")
+            raise RecordingError(f"The subtask of {what} is not a single line of at most {MAX_SUBTASK} characters.")
         for name in self.features:
             stamp = frame.samples[name].stamp_ns
             last = self._sample_stamps.get(name, -1)
@@ -193,7 +195,7 @@ class SampledFrameCheck:
         _check_stamp(what.capitalize(), self._frame_stamp, frame.time_ns)
 
     def note_frame(self, frame: SampledFrame) -> None:
-        """The next frame was taken."""
+        """Note that the next frame was accepted."""
         for name in self.features:
             self._sample_stamps[name] = int(frame.samples[name].stamp_ns)
         self._frame_stamp = int(frame.time_ns)
@@ -204,11 +206,11 @@ def _check_stamp(what: str, last: int, stamp_ns: int, *, may_repeat: bool = Fals
     if not isinstance(stamp_ns, int | np.integer) or isinstance(stamp_ns, bool):
         raise RecordingError(f"{what} has the stamp {stamp_ns!r}, it must be a whole number of nanoseconds.")
     if not 0 <= stamp_ns <= MAX_STAMP_NS:
-        raise RecordingError(f"{what} has the stamp {stamp_ns} ns, allowed are 0 to {MAX_STAMP_NS} ns.")
+        raise RecordingError(f"{what} has the stamp {stamp_ns} ns; the range is 0 to {MAX_STAMP_NS} ns.")
     if stamp_ns < last or (stamp_ns == last and not may_repeat):
         raise RecordingError(
             f"{what} has the stamp {stamp_ns} ns, the one before it {last} ns: stamps must not "
-            f"{'go backwards' if stamp_ns < last else 'stand still'}."
+            f"{'go backwards' if stamp_ns < last else 'repeat'}."
         )
 
 

@@ -1,6 +1,6 @@
-"""An MCAP file read from its front to its end, without its index, whole or cut off.
+"""Sequential reading of an MCAP file, without its index, complete or truncated.
 
-So are bags read, which others wrote, and what a crash left of a recording.
+Used for third-party bags, and for recordings cut off by a crash.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ MESSAGE_HEAD = struct.Struct("<HIQQ")
 """Channel, sequence number, time of recording and of publishing (MCAP specification, Message)."""
 _IN_CHUNKS = (Opcode.MESSAGE, Opcode.SCHEMA, Opcode.CHANNEL)
 NO_SCHEMA = Schema(id=0, name="", encoding="", data=b"")
-"""Of messages without one."""
+"""Schema of messages without one."""
 
 
 class CutOffError(ValueError):
-    """The file ends before its end; `str` says where, for the inside of a sentence."""
+    """The file ends early; `str` describes where, as part of a sentence."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ScannedChannel:
-    """Messages of one topic, type and encoding; a bag may have several channels of a topic.
+    """Channel of one topic, type and encoding; a bag may have several channels for a topic.
 
     Attributes:
         topic: "/joint_states".
         type: "sensor_msgs/msg/JointState", "foxglove.CompressedImage".
-        encoding: Of its messages: cdr, ros1, protobuf, json.
-        schema_encoding: Of the definition: ros2msg, ros2idl, ros1msg, protobuf, jsonschema; "" for none.
+        encoding: Encoding of its messages: cdr, ros1, protobuf, json.
+        schema_encoding: Encoding of the definition: ros2msg, ros2idl, ros1msg, protobuf, jsonschema; "" for none.
         schema: The definition: data, never code.
-        has_qos: Whether it says with which quality of service it was published; of ours only what is said once does.
+        has_qos: Whether it states a quality of service; in recordings only for latched topics.
     """
 
     topic: str
@@ -52,7 +52,7 @@ class ScannedChannel:
 
 
 class ScannedMessage(NamedTuple):
-    """A message as the file has it, and when it was recorded, nanoseconds."""
+    """A message as in the file, and its recording time, nanoseconds."""
 
     channel: ScannedChannel
     log_ns: int
@@ -60,32 +60,32 @@ class ScannedMessage(NamedTuple):
 
 
 def read_record[R: McapRecord](content: bytes | memoryview, kind: type[R]) -> R:
-    """A record of a kind, from its content."""
+    """Parse a record of a kind from its content."""
     record: R = kind.read(ReadDataStream(BytesIO(content)))
     return record
 
 
-# These are the same bytes in every recording of a run, and an export opens many.
+# These bytes are the same in every recording of a run, and an export opens many.
 @lru_cache(maxsize=1024)
 def read_channel(content: bytes) -> Channel:
-    """A Channel record."""
+    """Parse a Channel record."""
     return read_record(content, Channel)
 
 
 @lru_cache(maxsize=256)
 def read_schema(content: bytes) -> Schema:
-    """A Schema record."""
+    """Parse a Schema record."""
     return read_record(content, Schema)
 
 
 def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
-    """What a file holds: messages and metadata in its order, and None at the end of each chunk.
+    """Yield the messages and metadata of a file in order, and None at the end of each chunk.
 
     Args:
-        file: At its first record.
+        file: Positioned at its first record.
 
     Raises:
-        CutOffError: It ends before its end.
+        CutOffError: The file ends early.
         Exception: A record is damaged; the parsers' own errors share no other base class.
     """
     schemas = {0: NO_SCHEMA}
@@ -115,7 +115,7 @@ def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
 
 
 def _records(file: BinaryIO) -> Iterator[tuple[int, bytes, int, int]]:
-    """(opcode, data, start, end) of the records that `scan` reads, in chunks too; an empty one ends a chunk's."""
+    """Yield (opcode, data, start, end) of the records for `scan`, also inside chunks; an empty one ends a chunk."""
     size = os.fstat(file.fileno()).st_size
     while True:
         head = file.read(RECORD_HEAD.size)

@@ -38,12 +38,12 @@ if TYPE_CHECKING:
     pass
 
 GRIPPER_JOINT = "gripper"
-"""Name of the gripper's opening among the names of joints."""
+"""Joint name that represents the gripper's opening."""
 _JOINT_STATE = ("joint_position", "joint_velocity", "joint_effort")
 
 
 class FrameValues(NamedTuple):
-    """The numbers of a frame; they wait for the rest of their second, and must not be changed meanwhile."""
+    """The numbers of a frame, queued until its second is complete; must not be changed meanwhile."""
 
     observation: Observation
     action: Action
@@ -85,7 +85,7 @@ def _joint_state_columns(values: Array) -> ColumnArrays:
 
 
 def _gripper_parts(robot: RobotSpec, values: FrameValues) -> Sequence[Array]:
-    # The force on the fingers stands in for the effort.
+    # The force on the fingers is stored as the effort.
     observation, n = values.observation, len(robot.arm_joints)
     velocity = float(robot.gripper.width_velocity(observation.joint_position[n:], observation.joint_velocity[n:]))
     return (np.array((observation.gripper_width, velocity, observation.contact_force)),)
@@ -96,7 +96,7 @@ def _gripper_columns(values: Array) -> ColumnArrays:
 
 
 def _targets(kind: str, frames: Sequence[FrameValues]) -> Array:
-    # No velocity or effort is commanded; zeros, since a viewer makes an empty plot of an empty array.
+    # Velocity and effort are not commanded; zeros, since a viewer draws an empty plot for an empty array.
     actions: list[Action] = [getattr(values, kind) for values in frames]
     targets = [part for action in actions for part in (action.joint_target, (action.gripper_target,))]
     rows = np.concatenate(targets).reshape(len(frames), -1)
@@ -131,7 +131,7 @@ def _sensor(quantity: str, feature: Feature, stream: SensorStream) -> FrameStrea
 
 
 def _pose(topic: str, frame_id: str, path: str, column: str, key: str = "") -> FrameStream:
-    """A pose at a path in `FrameValues` that becomes the rows of `column`; or with a key one of the poses there."""
+    """Build the stream of a pose in `FrameValues`, stored in `column`; `key` selects one of several poses."""
     found = attrgetter(path)
 
     def parts(values: FrameValues) -> Sequence[Array]:

@@ -1,4 +1,4 @@
-"""Write the episode of a simulation: images come with the frames, and are written after the numbers of their second."""
+"""Writer of simulated episodes: images arrive with the frames, and are written after the numbers of their second."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ from demorec.robots.urdf import Urdf
 
 
 class EpisodeWriter(BatchWriter):
-    """Context manager that writes an episode that demorec simulates; arguments and errors as of `BatchWriter`.
+    """Context manager that writes an episode simulated by demorec; arguments and errors as in `BatchWriter`.
 
-    Depth and segmentation are recorded of the cameras that have them in the first frame.
+    Depth and segmentation are recorded for the cameras that have them in the first frame.
     """
 
     def _prepare(self, info: EpisodeInfo) -> None:
@@ -39,7 +39,7 @@ class EpisodeWriter(BatchWriter):
         known = {joint.name for joint in urdf.joints if joint.kind != "fixed"}
         if wrong := [name for name in robot.joint_names if name not in known]:
             raise ConfigError(
-                f"The robot {robot.name!r} has no joints {', '.join(wrong)}; those of its URDF are "
+                f"The robot {robot.name!r} has no joints {', '.join(wrong)}; its URDF has "
                 f"{', '.join(sorted(known))}: {robot.urdf}"
             )
         self._tree = FrameTree(urdf, robot.joint_names, info.cameras, scene)
@@ -50,14 +50,14 @@ class EpisodeWriter(BatchWriter):
         """Add the next frame with its images.
 
         Raises:
-            RecordingError: Frames out of order; vectors, objects or cameras that are missing, unknown or of another
-                length; numbers that are not finite; images missing or of another size; a full disk.
+            RecordingError: Frames are out of order; vectors, objects or cameras are missing, unknown or of a wrong
+                length; numbers are not finite; images are missing or have a wrong size; or the disk is full.
         """
         due = (self.num_frames, frame_time_ns(self.num_frames, self._info.fps))
         if (frame.frame_index, frame.time_ns) != due:
             raise RecordingError(
-                f"Frame {frame.frame_index} at {frame.time_ns} ns came where frame {due[0]} at {due[1]} ns was due: "
-                "frames are written in order, one each."
+                f"Frame {frame.frame_index} at {frame.time_ns} ns arrived instead of frame {due[0]} at {due[1]} ns: "
+                "write frames in order, each once."
             )
         self._check(frame)
         if not self._is_described:
@@ -86,7 +86,7 @@ class EpisodeWriter(BatchWriter):
             self._cameras[camera.name] = CameraWriter(camera, self._video, self._info.fps, beside=beside)
 
     def _state(self, frames: Sequence[FrameValues]) -> tuple[Array, Array]:
-        """Joint positions (N, n_joints), and world_from_object of all movable bodies (N, 7 k)."""
+        """Return joint positions (N, n_joints), and world_from_object of all movable bodies (N, 7 k)."""
         positions = np.array([frame.observation.joint_position for frame in frames])
         poses = [frame.observation.object_poses[name].vector() for frame in frames for name in self._objects]
         return positions, np.array(poses).reshape(len(frames), 7 * len(self._objects))
@@ -119,7 +119,7 @@ class EpisodeWriter(BatchWriter):
 
 
 class FrameCheck:
-    """Checks frame after frame of one episode; takes microseconds, since it is part of every recording."""
+    """Checks one episode frame by frame; takes microseconds, since it is part of every recording."""
 
     def __init__(self, info: EpisodeInfo) -> None:
         self._joints, self._arm = (len(info.simulated.robot.joint_names),), (len(info.simulated.robot.arm_joints),)
@@ -128,7 +128,7 @@ class FrameCheck:
         self._sensed = {name: (len(feature.names),) for name, feature in info.sensors.items()}
 
     def __call__(self, frame: Frame) -> None:
-        """Raise RecordingError for a frame that does not fit; images are checked when they are encoded."""
+        """Raise RecordingError if a frame is invalid; images are checked when they are encoded."""
         poses, images = frame.observation.object_poses, frame.images
         for what, found, known, fits in (
             ("poses of the objects", poses, self._objects, poses.keys() == self._objects),
@@ -173,7 +173,7 @@ class FrameCheck:
 
 
 def check_images(frame: Frame, camera: Camera, streams: CameraStreams) -> CameraImages:
-    """A frame's images of a camera; RecordingError unless they are those that are recorded, all of its size."""
+    """Return a frame's images of a camera; RecordingError unless they match the recorded streams and size."""
     images = frame.images.get(camera.name)
     if images is None:
         raise RecordingError(f"Frame {frame.frame_index} has no image of the camera {camera.name!r}.")

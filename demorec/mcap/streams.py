@@ -1,7 +1,7 @@
 """Streams with one message at each frame, and how their messages become columns.
 
-`demorec.mcap.simulated_streams` and `demorec.mcap.sampled_streams` list them; writer, reader,
-recovery and checks go through these lists.
+`demorec.mcap.simulated_streams` and `demorec.mcap.sampled_streams` list them; writer, reader, recovery and checks use
+these lists.
 """
 
 from __future__ import annotations
@@ -24,10 +24,10 @@ _TABLE_BYTES = 1 << 20
 """Size of chunks that are decoded together: decoding takes several times as much memory."""
 
 ColumnArrays = dict[str, NDArray[Any] | dict[str, NDArray[Any]]]
-"""Field of `Trajectory` or `Table` -> its rows, or name -> rows where the field is a mapping."""
+"""Field of `Trajectory` or `Table` -> its rows, or name -> rows if the field is a mapping."""
 
 TimedMessages = list[tuple[int, bytes]]
-"""(time_ns, data) of messages that do not come at each frame."""
+"""(time_ns, data) of messages that are not sent at each frame."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,7 +37,7 @@ class FrameStream:
     Attributes:
         topic: Topic.
         schema: ROS 2 type.
-        layout: Layout of the messages, which hold K values.
+        layout: Layout of the messages, with K values each.
         rows: Values (N, K) of N frames (`FrameValues` of a simulation, `SampledFrame` of any other episode).
         columns: The values (T, K) of T messages as columns.
         stamp_ns: Stamp in the header of a frame's message; None for the frame's time.
@@ -59,7 +59,7 @@ class FrameStream:
 
 
 def concatenated(parts: Callable[[Any], Sequence[Array]]) -> Callable[[Sequence[Any]], Array]:
-    """Make the `rows` of a stream from the pieces of a frame that its message holds one after the other."""
+    """Build the `rows` of a stream from the parts of a frame that its message concatenates."""
 
     def rows(frames: Sequence[Any]) -> Array:
         pieces = [piece for frame in frames for piece in parts(frame)]
@@ -69,7 +69,7 @@ def concatenated(parts: Callable[[Any], Sequence[Array]]) -> Callable[[Sequence[
 
 
 def array_layout(schema: str, columns: Sequence[str]) -> Layout:
-    """Lay out std_msgs/Float64MultiArray or Int64MultiArray, whose label names the columns."""
+    """Lay out std_msgs/Float64MultiArray or Int64MultiArray, with a label that names the columns."""
     count = len(columns)
     dimension = (",".join(columns), count, count)
     return layout(schema, ((dimension,), 0), (Slot.VALUE,) * count)
@@ -83,7 +83,7 @@ def joint_layout(names: Sequence[str], *, only_positions: bool = False) -> Layou
 
 
 def frame_times(num_frames: int, fps: int) -> NDArray[np.int64]:
-    """(T,) `frame_time_ns` of every frame."""
+    """Compute (T,) `frame_time_ns` of every frame."""
     return (np.arange(num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)
 
 
@@ -102,7 +102,7 @@ def read_columns(
         streams: Streams to read.
         due_ns: (T,) times of the frames; None for those of the messages on `frame_topic`.
         frame_topic: Topic of one of the streams.
-        others: Topics whose messages are returned as they are.
+        others: Topics to return as undecoded messages.
 
     Returns:
         Field of `Trajectory` or `Table` -> rows, with `time_ns`; and the messages of `others`.
@@ -126,7 +126,7 @@ def read_columns(
                 timed += zip(blocks[topic].time_ns.tolist(), blocks[topic].messages(), strict=True)
     time_ns = np.concatenate(times[frame_topic]) if due_ns is None else due_ns
     if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
-        raise RecordingError(f"The frames of the recording are not in the order of their times: {container.path}")
+        raise RecordingError(f"The frames of the recording are not in chronological order: {container.path}")
     columns: dict[str, Any] = {"time_ns": time_ns}
     for stream in streams:
         at = np.concatenate(times[stream.topic])

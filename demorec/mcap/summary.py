@@ -1,4 +1,4 @@
-"""What a recording holds, as plain data."""
+"""Content of a recording as plain data."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from demorec.mcap.recording import Recording, open_recording
 
 
 def summarize(path: Path, named: NamedRoles = NO_NAMES) -> dict[str, Any]:
-    """Read a recording, all of its content included, and say what it holds, as `demorec info --json` prints it.
+    """Read a whole recording and summarise its content, as printed by `demorec info --json`.
 
-    Every recording has the same keys. `task`, `root_seed` and `physics_hz` are None of an episode that demorec did not
-    simulate; `success` is None when nobody said, or a crash cut the episode off (`is_recovered`). `seconds` is the
-    length, `rate` the mean frames per second (0 of a single frame), `oldest` the age of the oldest sample or image that
-    a frame holds, in seconds. `depth` and `segmentation` say whether these were recorded: of a simulated camera beside
-    colour, of a depth camera alone.
+    Every recording has the same keys. `task`, `root_seed` and `physics_hz` are None for an episode that demorec did not
+    simulate; `success` is None if unknown or a crash cut the episode off (`is_recovered`). `seconds` is the length,
+    `rate` the mean frames per second (0 for a single frame), `oldest` the age of the oldest sample or image in a frame,
+    in seconds. `depth` and `segmentation` report whether these were recorded: for a simulated camera in addition to
+    colour, for a depth camera alone.
 
     Args:
-        path: Of the recording.
-        named: Features whose role the user names, in one that demorec did not simulate.
+        path: Path of the recording.
+        named: Features with a role named by the user, in a recording that demorec did not simulate.
 
     Raises:
-        ConfigError: It lacks a feature that the user names, or is simulated.
-        RecordingError: It is none, or damaged.
+        ConfigError: It lacks a feature that the user named, or is simulated.
+        RecordingError: It is not a recording, or damaged.
     """
     with open_recording(path) as recording:
         info, facts = recording.info, simulation_facts(recording.info)
@@ -76,7 +76,7 @@ def summarize(path: Path, named: NamedRoles = NO_NAMES) -> dict[str, Any]:
 
 
 def _length(recording: Recording) -> tuple[float, float]:
-    """Seconds to the end of the last frame, which takes one nominal period, and mean frames per second."""
+    """Compute seconds to the end of the last frame, which takes one nominal period, and mean frames per second."""
     times = recording.time_ns
     if not len(times):
         return 0.0, 0.0

@@ -1,7 +1,7 @@
-"""The coordinate frames of an episode (ROS: TF): which frame hangs on which, and how the moving ones move.
+"""The coordinate frames of an episode (ROS: TF): their tree, and the motion of the moving ones.
 
-Every link of a robot that is described, every body and every camera that is placed is a frame. What the joints and the
-physics move is on `/tf` at each frame, the rest on `/tf_static`.
+Every link of a described robot, every body and every camera with a pose is a frame. Those moved by joints or physics
+are on `/tf` at each frame, the rest on `/tf_static`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from demorec.robots.urdf import Urdf, joint_motion
 
 WORLD = "world"
 RERUN_ROOT = "tf#/"
-"""Rerun's name of its scene's root: without this one row its 3D view finds no way to any of the frames."""
+"""Rerun's name of its scene's root: without this row its 3D view cannot connect any frame to it."""
 
 POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
 """Position and quaternion xyzw in a layout."""
@@ -40,13 +40,13 @@ def camera_frame(camera: str) -> str:
 
 
 class FrameTree:
-    """The coordinate frames of one episode whose robot is described; a joint that is not recorded stays at 0.
+    """Coordinate frames of one episode with a robot description; an unrecorded joint stays at 0.
 
     Args:
         urdf: The robot.
         joints: Names of the recorded joints.
         cameras: Cameras; those with a mount become frames.
-        scene: Place of the robot, and bodies.
+        scene: Pose of the robot, and bodies.
 
     Attributes:
         static: Rows that never change.
@@ -75,7 +75,7 @@ class FrameTree:
         )
 
     def streams(self, state: Callable[[Sequence[Any]], tuple[Array, Array]]) -> tuple[FrameStream, ...]:
-        """The stream of the frames that move, which becomes no column; empty where nothing moves.
+        """Build the stream of the moving frames, which becomes no column; empty if nothing moves.
 
         Args:
             state: Joint positions (N, n) in the order of `joints`, and world_from_object of all movable bodies
@@ -93,17 +93,17 @@ class FrameTree:
 
 
 class MovingJoints:
-    """parent_from_child of all joints that move and are recorded, at once; the others stay at 0.
+    """parent_from_child of all recorded moving joints at once; the others stay at 0.
 
     Args:
         urdf: The robot.
-        names: Of the recorded joints, in the order in which vectors have them.
+        names: Names of the recorded joints, in the order of the vectors.
 
     Attributes:
-        moving: (parent, child) of those that move.
+        moving: (parent, child) of the moving joints.
         static: Rows of the others.
 
-    A turning joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
+    A revolute joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
     """
 
     def __init__(self, urdf: Urdf, names: Sequence[str]) -> None:
@@ -131,9 +131,9 @@ class MovingJoints:
                 self._sine[row] = quat_multiply(fixed.quat_xyzw, (*joint.axis, 0.0))
 
     def values(self, joint_position: Array) -> Array:
-        """(N, n, 7) for N joint vectors."""
+        """Compute (N, n, 7) for N joint vectors."""
         position = joint_position[:, self._indices]
-        # math.sin, not numpy's, whose last bit depends on the CPU's vector unit.
+        # math.sin, since the last bit of numpy's depends on the CPU's vector unit.
         angles = (position * self._half).reshape(-1).tolist()
         sine = np.array([math.sin(angle) for angle in angles]).reshape(*position.shape, 1)
         cosine = np.array([math.cos(angle) for angle in angles]).reshape(*position.shape, 1)
@@ -144,7 +144,7 @@ class MovingJoints:
 
 
 def joint_places(features: Sequence[Feature]) -> dict[str, tuple[Feature, int]]:
-    """Joint -> the first feature among the observations, and its element, that is the joint's position."""
+    """Find joint -> the first observation feature, and its element, that is the joint's position."""
     places: dict[str, tuple[Feature, int]] = {}
     for feature in features:
         for index, joint in enumerate(feature.joints if feature.name.partition(".")[0] == "observation" else ()):
@@ -154,14 +154,14 @@ def joint_places(features: Sequence[Feature]) -> dict[str, tuple[Feature, int]]:
 
 
 def joint_positions(places: Mapping[str, tuple[Feature, int]], features: Mapping[str, Vector]) -> Array:
-    """(..., n) rad or m of joints that there are, from features (..., D)."""
+    """Read (..., n) rad or m of the available joints from features (..., D)."""
     used = {feature.name: feature for feature, _ in places.values()}
     values = {name: feature.in_si(features[name]) for name, feature in used.items()}
     return np.stack([values[feature.name][..., index] for feature, index in places.values()], axis=-1)
 
 
 def measured_motion(info: EpisodeInfo, table: Table) -> SceneMotion:
-    """The motion of the joints that features give the positions of."""
+    """Compute the motion of the joints with positions in the features."""
     places = joint_places(info.features)
     if not places:
         return SceneMotion()

@@ -1,8 +1,8 @@
-"""Images to encoded packets and back.
+"""Encoding of images to packets, and decoding.
 
-Every image is encoded once, while recording; the packets go into the recording as they are and later into the
-dataset unchanged. One encoder per camera and episode, one thread each (the same bits on every machine of a type, and
-a pool of workers already fills the cores), no reordering: packet t shows frame t.
+Every image is encoded once, while recording; the packets are stored unchanged in the recording and later in the
+dataset. There is one encoder per camera and episode, with one thread each (bit-exact on all machines of a type, and a
+pool of workers already fills the cores). Images are not reordered: packet t shows frame t.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from demorec.core.errors import ConfigError, RecordingError, describe_error
 Rgb = NDArray[np.uint8]
 Codec = Literal["h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 
-# SVT-AV1 tells its settings on standard error unless this says "errors only"; it reads it when it starts.
+# SVT-AV1 prints its settings to standard error unless this says "errors only"; it is read at start.
 os.environ.setdefault("SVT_LOG", "1")
 
-# Code points of ITU-T H.273, the same in H.264 and AV1: sRGB images through the matrix that libswscale uses by itself
-# (BT.601, 16 to 235). Without them a player guesses, and many guess BT.709: (200, 30, 30) then shows as (214, 45, 28).
+# Code points of ITU-T H.273, the same in H.264 and AV1: sRGB images through libswscale's default matrix (BT.601, 16 to
+# 235). Without them a player guesses, and many guess BT.709: (200, 30, 30) is then shown as (214, 45, 28).
 _LIMITED_RANGE = 1
 _PRIMARIES_BT709 = 1
 _TRANSFER_SRGB = 13
@@ -41,27 +41,27 @@ _MATRIX_BT601 = 6
 
 
 DECODERS = {"h264": "h264", "h265": "hevc", "av1": "libdav1d"}
-"""Codec -> FFmpeg's name of the decoder, of codecs whose images need those before them."""
+"""Codec -> FFmpeg's name of the decoder, for codecs with images that depend on earlier ones."""
 _MAX_UNITS = 256
-"""Of an encoded image before its first slice."""
+"""Maximum number of units of an encoded image before its first slice."""
 _PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
-"""Codec -> FFmpeg's name of the pixel format, of codecs whose every image stands by itself."""
+"""Codec -> FFmpeg's name of the pixel format, for codecs with independent images."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoSettings:
-    """How the images of one camera were encoded: what a dataset's metadata and an mp4 file need to know.
+    """Encoding of one camera's images, as needed by a dataset's metadata and an mp4 file.
 
     Attributes:
-        codec: Of the bit stream; of depth the encoding of its distances.
-        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that came encoded.
+        codec: Codec of the bit stream; for depth the encoding of its distances.
+        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that arrived encoded.
         width, height: Pixels.
         fps: Images per second.
         pix_fmt: FFmpeg's name of the pixel format.
-        gop: Images from one keyframe to the next; 0 when unknown, of packets that came encoded.
+        gop: Images from one keyframe to the next; 0 if unknown, for packets that arrived encoded.
         crf: Constant rate factor; None for jpeg.
         preset: Encoder preset; "" for jpeg.
-        options: Further encoder options, as given to FFmpeg.
+        options: Further encoder options, as passed to FFmpeg.
         jpeg_quality: 1..100; None unless the codec is jpeg.
     """
 
@@ -79,7 +79,7 @@ class VideoSettings:
 
 
 def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
-    """Those of packets that came encoded, of which nobody knows how."""
+    """Build the settings of packets that arrived encoded, with unknown encoder."""
     return VideoSettings(
         codec=codec,
         encoder="",
@@ -99,9 +99,9 @@ class VideoPacket:
     """One encoded image: an H.264 or H.265 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
 
     Attributes:
-        frame_index: Which frame it shows.
-        time_ns: Of that frame.
-        data: The bytes; parameter sets are in front of every keyframe.
+        frame_index: Frame that it shows.
+        time_ns: Time of that frame.
+        data: The bytes; parameter sets precede every keyframe.
         is_keyframe: Whether it can be decoded without the packets before it.
     """
 
@@ -112,9 +112,9 @@ class VideoPacket:
 
 
 def size_problem(video: VideoConfig, width: int, height: int) -> str:
-    """Why images of this size cannot be encoded so, and what can be done; "" when they can.
+    """Return why images of this size cannot be encoded, and the fix; "" if they can.
 
-    libx264 refuses odd sizes; for AV1 libswscale leaves the last column of colours of an odd width as its memory was.
+    libx264 refuses odd sizes; for AV1, libswscale leaves the last colour column of an odd width uninitialised.
     """
     if video.codec == "jpeg" or width % 2 == height % 2 == 0:
         return ""
@@ -125,21 +125,21 @@ def size_problem(video: VideoConfig, width: int, height: int) -> str:
 
 
 def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
-    """An encoder as configured; RecordingError when this build of FFmpeg lacks the codec."""
+    """Make an encoder as configured; RecordingError if this build of FFmpeg lacks the codec."""
     made = _JpegEncoder if video.codec == "jpeg" else _StreamEncoder
     return made(video, width, height, fps)
 
 
 class Encoder(Protocol):
-    """Codes the images of one camera, in order."""
+    """Encodes the images of one camera, in order."""
 
     settings: VideoSettings
 
     def encode(self, image: Rgb) -> list[bytes]:
-        """Take one image; return the packets that are ready, oldest first."""
+        """Encode one image; return the packets that are ready, oldest first."""
 
     def finish(self) -> list[bytes]:
-        """Return the packets that were held back."""
+        """Return the remaining packets."""
 
 
 class _JpegEncoder:
@@ -159,14 +159,14 @@ class _JpegEncoder:
 class _StreamEncoder:
     def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
         if video.codec == "h264":
-            # Keyframes at a fixed distance; no reordering, no delay. Zero latency also leaves x264's macroblock tree
-            # out, which reads memory that it has not set (seen with MALLOC_PERTURB_), so that packets would depend
-            # on what the process did before. The same quality takes about 5 % more bytes at GOP 2 without it.
-            # Without "cpu-independent" x264 takes shortcuts that differ between CPUs; it costs no time and 1.5 % bytes.
+            # Keyframes at a fixed distance; no reordering, no delay. Zero latency also disables x264's macroblock tree,
+            # which reads uninitialised memory (seen with MALLOC_PERTURB_), so that packets would depend on the
+            # process's history. The same quality takes about 5 % more bytes at GOP 2 without it. Without
+            # "cpu-independent", x264 takes shortcuts that differ between CPUs; it costs no time and 1.5 % bytes.
             options = {"bf": "0", "sc_threshold": "0", "tune": "zerolatency", "x264-params": "cpu-independent=1"}
             encoder, crf, preset = "libx264", 23, "veryfast"
         else:
-            # Low delay, one thread: frames leave in the order and at the pace in which they came.
+            # Low delay, one thread: frames leave in the order and at the pace of their arrival.
             encoder, crf, preset, options = "libsvtav1", 30, "12", {"svtav1-params": "fast-decode=0:lp=1:pred-struct=1"}
         if problem := size_problem(video, width, height):
             raise ConfigError(f"{problem[0].upper()}{problem[1:]}.")
@@ -224,7 +224,7 @@ def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
 
 
 def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
-    """Decode packets in order, from a keyframe on: (H, W, 3) uint8 RGB, one a packet.
+    """Decode packets in order, starting at a keyframe: (H, W, 3) uint8 RGB, one per packet.
 
     Raises:
         RecordingError: A packet cannot be decoded, has another size, or images are missing at the end.
@@ -234,7 +234,7 @@ def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[
     for image in images:
         if image.shape != shape:
             raise RecordingError(
-                f"An image is {image.shape[1]}x{image.shape[0]} pixels where the metadata says "
+                f"An image is {image.shape[1]}x{image.shape[0]} pixels, but the metadata states "
                 f"{settings.width}x{settings.height}."
             )
         yield image
@@ -248,10 +248,10 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
                     raise OSError(f"{image.width}x{image.height} pixels")
                 yield np.asarray(image.convert("RGB"))
         except UnidentifiedImageError as error:
-            raise RecordingError(f"The image of frame {packet.frame_index} is no JPEG.") from error
+            raise RecordingError(f"The image of frame {packet.frame_index} is not a JPEG.") from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             reason = describe_error(error)
-            raise RecordingError(f"The image of frame {packet.frame_index} is no valid JPEG ({reason}).") from error
+            raise RecordingError(f"The image of frame {packet.frame_index} is not a valid JPEG ({reason}).") from error
 
 
 def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
@@ -260,7 +260,8 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
     # A few bytes can announce images of gigabytes; encoded images are whole blocks of at most 128 pixels.
     context.options = {"max_pixels": str((settings.width + 128) * (settings.height + 128))}
     num_packets = num_images = 0
-    reformatter = VideoReformatter()  # one for all images: a frame's own is set up anew for it, as long as it decodes
+    # Shared by all images: a frame's own is set up again each time, which takes as long as decoding.
+    reformatter = VideoReformatter()
     try:
         for packet in chain(packets, [None]):
             raw = None if packet is None else av.Packet(packet.data)
@@ -277,11 +278,11 @@ def _decode_stream(settings: VideoSettings, packets: Iterable[VideoPacket]) -> I
 
 
 def is_keyframe(codec: str, data: bytes) -> bool:
-    """Whether an encoded image can be decoded without those before it.
+    """Check whether an encoded image can be decoded without earlier ones.
 
     H.264 (ITU-T H.264, table 7-1): an access unit with a slice of type 5 (IDR). H.265 (ITU-T H.265, table 7-1): one
-    with a slice of the types 16 to 21 (IRAP). AV1: our encoder puts a sequence header (OBU type 1) in front of
-    keyframes and nowhere else.
+    with a slice of the types 16 to 21 (IRAP). AV1: our encoder puts a sequence header (OBU type 1) before keyframes and
+    nowhere else.
     """
     if codec == "h264":
         return any(kind == 5 for kind, _ in nal_units(codec, data))
@@ -293,9 +294,9 @@ def is_keyframe(codec: str, data: bytes) -> bool:
 
 
 def nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
-    """Type and place of the NAL units of an access unit, up to the first slice: the parameter sets are in front of it.
+    """Yield type and offset of the NAL units of an access unit, up to the first slice; parameter sets precede it.
 
-    No more than `_MAX_UNITS` are looked at.
+    At most `_MAX_UNITS` are examined.
     """
     position = data.find(b"\x00\x00\x01")
     for _ in range(_MAX_UNITS):
@@ -328,10 +329,10 @@ def _obu_types(data: bytes) -> Iterator[int]:
 
 @contextmanager
 def ordinary_scheduling() -> Iterator[None]:
-    """Give the threads of this process back, at the end, how they were scheduled before; new ones are as the caller is.
+    """Restore the scheduling of this process's threads at exit; new threads get the caller's.
 
-    SVT-AV1 gives its threads, and the one that starts it, the highest real-time priority when root runs it (as in most
-    containers): all that the process starts later inherits that, and whatever else runs on the machine stands still.
+    SVT-AV1 gives its threads, and the one that starts it, the highest real-time priority if run by root (as in most
+    containers). Everything that the process starts later inherits it, and all other processes on the machine stall.
     """
     own = (os.sched_getscheduler(0), os.sched_getparam(0))
     before = dict(_scheduling())
@@ -346,7 +347,7 @@ def ordinary_scheduling() -> Iterator[None]:
 
 
 def _scheduling() -> Iterator[tuple[int, tuple[int, os.sched_param]]]:
-    """(thread, (policy, parameters)) of every thread of this process."""
+    """Yield (thread, (policy, parameters)) of every thread of this process."""
     for task in Path("/proc/self/task").iterdir():
         with suppress(ProcessLookupError):  # it has ended meanwhile
             thread = int(task.name)

@@ -1,8 +1,8 @@
 """Write an episode as it happens into NAME.mcap.part, which becomes NAME.mcap when it is complete.
 
-Frames are gathered for one second and then written at once, each stream as a batch, the numbers and the images in
-chunks of their own. So a reader of the numbers never decompresses an image, the recorder costs little, and a crash
-loses at most the last second.
+Frames are collected for one second and then written at once, each stream as a batch, numbers and images in separate
+chunks. So a reader of the numbers never decompresses an image, the recorder costs little, and a crash loses at most the
+last second.
 """
 
 from __future__ import annotations
@@ -38,39 +38,39 @@ from demorec.mcap.transforms import FrameTree, camera_frame
 
 _SECOND_NS = 1_000_000_000
 _BACKDROP_METRES = 3.0
-"""Size above which bodies (floors, walls) are not described: a viewer would place itself so far off that the robot is a
-dot."""
+"""Size, metres, above which bodies (floors, walls) are not described: a viewer would zoom out until the robot is a dot.
+"""
 
 
 class PendingFrame(NamedTuple):
-    """A frame that waits to be written, without its images."""
+    """A queued frame without its images."""
 
     time_ns: int
     values: FrameValues | SampledFrame
     images: Mapping[str, int]  # camera -> number of the image that the frame shows
     changes: list[Message]  # written only when something changes
-    dense: list[tuple[int, bytes]]  # time_ns and data of messages on the dense stream since the frame before
+    dense: list[tuple[int, bytes]]  # time_ns and data of messages on the dense stream since the previous frame
 
 
 class BatchWriter(Closing, ABC):
     """Context manager that writes one episode in batches of a second.
 
-    Frames must not be changed after they were given.
+    Frames must not be changed after being passed.
 
     Args:
-        path: The file to be made; its folder must exist.
+        path: The file to create; its folder must exist.
         info: Description of the episode.
-        video: How images are encoded that come as pixels.
+        video: Encoding of images that arrive as pixels.
         overwrite: Whether a recording of that name may be replaced.
-        keeps_part: Whether NAME.mcap.part stays for `recover` when it is left without `finish`.
+        keeps_part: Whether NAME.mcap.part stays for `recover` if the context exits without `finish`.
 
     Attributes:
         num_frames: Number of written frames.
 
     Raises:
-        ConfigError: The description is impossible, or a file of that name, or an unfinished one, is there already and
-            not to be replaced. What a killed import, replay or rendering of the same origin left is replaced.
-        RecordingError: It cannot be written.
+        ConfigError: The description is invalid, or a file of that name, or an unfinished one, exists and must not be
+            replaced. The remains of a killed import, replay or rendering of the same origin are replaced.
+        RecordingError: The file cannot be written.
     """
 
     _tree: FrameTree | None
@@ -95,7 +95,7 @@ class BatchWriter(Closing, ABC):
 
     @abstractmethod
     def _prepare(self, info: EpisodeInfo) -> None:
-        """Prepare for an episode before a file is opened. Raises ConfigError if the description is impossible."""
+        """Prepare for an episode before a file is opened. Raises ConfigError if the description is invalid."""
 
     @abstractmethod
     def flush(self) -> None:
@@ -112,7 +112,7 @@ class BatchWriter(Closing, ABC):
             self.flush()
 
     def _write_description(self) -> None:
-        """Write the messages that come once, or leave nothing."""
+        """Write the latched messages; on failure the file is removed."""
         self._is_described = True
         streams = {name: camera.streams for name, camera in self._cameras.items()}
         try:
@@ -126,7 +126,7 @@ class BatchWriter(Closing, ABC):
             raise
 
     def _write_images(self, until: Mapping[str, int]) -> None:
-        """Write the images of each camera before that number, in the order of their stamps."""
+        """Write the images of each camera before a number, in the order of their timestamps."""
         taken = [self._cameras[name].take(number) for name, number in until.items()]
         for stamp_ns, found in merge(*taken, key=lambda image: image[0]):
             for topic, schema, data in found:
@@ -135,7 +135,7 @@ class BatchWriter(Closing, ABC):
             self._file.flush()
 
     def _write_frames(self) -> list[PendingFrame]:
-        """Write the frames whose images have left the encoders, and return them."""
+        """Write the frames with fully encoded images, and return them."""
         frames = list(takewhile(self._has_its_images, self._pending))
         if not frames:
             return frames
@@ -158,22 +158,26 @@ class BatchWriter(Closing, ABC):
         return all(number < self._cameras[name].num_ready for name, number in frame.images.items())
 
     def finish(self, outcome: Outcome) -> Path:
-        """Write the rest, make the file durable and give it its name, which is returned.
+        """Write the rest, make the file durable and rename it; returns its final path.
 
         Raises:
             ConfigError: A file of that name has appeared meanwhile.
-            RecordingError: The outcome has another number of frames, an encoder keeps images to itself, or the disk is
-                full.
+            RecordingError: The outcome has a different number of frames, an encoder does not return all images, or the
+                disk is full.
         """
         if outcome.num_frames != self.num_frames:
-            raise RecordingError(f"The outcome has {outcome.num_frames} frames, the recording {self.num_frames}.")
+            raise RecordingError(
+                f"The outcome has {outcome.num_frames} frames, but the recording has {self.num_frames}."
+            )
         for camera in self._cameras.values():
             camera.end()
         if not self._is_described:
             self._write_description()
         self.flush()
         if self._pending:
-            raise RecordingError(f"The video encoder kept images of the last {len(self._pending)} frames to itself.")
+            raise RecordingError(
+                f"The video encoder did not return the images of the last {len(self._pending)} frames."
+            )
         for camera in self._cameras.values():
             if (statistics := camera.statistics()) is not None:
                 self._file.log(*statistics, camera.last_ns)
@@ -182,25 +186,25 @@ class BatchWriter(Closing, ABC):
         return self._file.path
 
     def close(self) -> None:
-        """End it, and leave NAME.mcap.part as it is or nothing; harmless when called twice, and after `finish`."""
+        """End the file and keep it as NAME.mcap.part, or remove it; safe to call twice, and after `finish`."""
         if self._keeps_part:
             self._file.close()
         else:
             self._file.discard()
 
     def discard(self) -> None:
-        """Give the episode up and remove its file."""
+        """Abandon the episode and remove its file."""
         self._file.discard()
 
 
 def check_description(info: EpisodeInfo) -> None:
-    """Raise ConfigError for an episode that cannot be recorded."""
+    """Raise ConfigError if an episode cannot be recorded."""
     if wrong := find_problems(info):
         raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
 
 
 def latched_messages(info: EpisodeInfo, tree: FrameTree | None, *, has_labels: bool) -> Iterator[Message]:
-    """Messages that hold for the whole episode, written before the first frame.
+    """Yield the messages that apply to the whole episode, written before the first frame.
 
     Args:
         info: Description of the episode.

@@ -386,7 +386,7 @@ KEPT: dict[str, dict[str, str]] = {
         "thesis": "it is a folder",
         "link_to_thesis": "it is a folder",
         "link_to_nothing": "a link to something that is not there",
-        "broken.mcap": "needs another name than the damaged one",
+        "broken.mcap": "needs a different name from the damaged one",
         "lock.mcap": "lock.mcap",
     },
     "view alone.mcap --save": {

@@ -158,7 +158,7 @@ def test_recovering_damaged_files(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "message"),
     [
-        (b"", "The file is empty, so no recording"),
+        (b"", "The file is empty"),
         (b"\x89MCAP0\r\n", "cut off"),
         (b"\x89MC", "not an MCAP file"),
         (b"PK\x03\x04 a zip file, or so it says" * 99, "not an MCAP file"),
@@ -182,7 +182,7 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
         channel = writer.register_channel("/chatter", "json", 0)
         writer.add_message(channel, 1, b"{}", 1)
         writer.finish()
-    with pytest.raises(RecordingError, match="no demorec recording"):
+    with pytest.raises(RecordingError, match="not a demorec recording"):
         Recording(path)
 
 
@@ -190,5 +190,5 @@ def test_a_foreign_mcap_file(tmp_path: Path) -> None:
 def test_another_format_is_refused_by_its_number(version: str, tmp_path: Path) -> None:
     path = write_episode(tmp_path / "good.mcap", num_frames=2, cameras=())
     (tmp_path / "a.mcap").write_bytes(rewritten(path, change={"demorec.episode": {"format_version": version}}))
-    with pytest.raises(RecordingError, match=f"format version {version}, this demorec reads {FORMAT_VERSION}"):
+    with pytest.raises(RecordingError, match=f"format version {version}, but this demorec reads {FORMAT_VERSION}"):
         Recording(tmp_path / "a.mcap")

@@ -70,7 +70,7 @@ def test_joints_that_are_no_tree_are_named(pairs: list[tuple[str, str]]) -> None
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("no xml", "no XML"),
+        ("no xml", "not valid XML"),
         ('<robot><link name="a"><visual><geometry><box/></geometry></visual></link></robot>', "size"),
         (
             '<robot><link name="a"><visual><geometry><box size="1 x 1"/></geometry></visual></link></robot>',

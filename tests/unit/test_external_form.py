@@ -80,10 +80,10 @@ BAD: dict[str, tuple[Callable[[SampledWriter, SampledFrame], object], str]] = {
     "unknown feature": (_sample("acton", np.zeros(3)), "unknown feature 'acton'.*'action'"),
     "missing feature": (_frame(samples={}), "Frame 1 lacks the feature observation.state, action, observation.force"),
     "earlier": (_frame(time_ns=10**18), "stamps must not go backwards"),
-    "negative time": (_frame(time_ns=-1), "allowed are 0 to"),
+    "negative time": (_frame(time_ns=-1), "the range is 0 to"),
     "float time": (_frame(time_ns=1.5), "must be a whole number of nanoseconds"),
     "feature goes back": (_sample("action", np.zeros(3), 7), "The feature 'action' of frame 1 has the stamp 7 ns"),
-    "no such image": (_frame(images={"top": 9}), "has no image 9 for frame 1, it has 1 so far"),
+    "no such image": (_frame(images={"top": 9}), "has no image 9 for frame 1; images received: 1"),
     "no such camera": (_frame(images={"front": 0}), "camera 'front' has no image 0"),
     "unknown camera": (_image("tip", 5, PIXELS), "Unknown camera 'tip'.*'top'"),
     "size": (_image("top", 2 * 10**18, PIXELS[:-1]), r"uint8 of shape \(47, 64, 3\), it must be uint8 of shape"),
@@ -121,7 +121,7 @@ def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what
         ({"cameras": (replace(TOP, name="my top"),)}, "allowed are letters"),
         ({"cameras": (replace(TOP, width=0),)}, "0x48 pixels"),
         ({"cameras": (replace(TOP, mount="nowhere"),)}, "no link of the URDF"),
-        ({"urdf": "<robot"}, "no XML"),
+        ({"urdf": "<robot"}, "not valid XML"),
     ],
 )
 def test_an_impossible_description_is_refused(tmp_path: Path, changes: dict[str, Any], words: str) -> None:

@@ -171,14 +171,14 @@ BAD: dict[str, tuple[Act, str]] = {
     "ragged": (lambda e: e.write([[0.0], [1.0, 2.0]]), "different lengths"),
     "matrix": (lambda e: e.write(np.zeros((2, 2))), r"float64 of shape \(2, 2\)"),
     "feature": (lambda e: e.write({"stat": [0.0, 1.0]}), "unknown feature 'observation.stat'.*'observation.state'"),
-    "mixture": (lambda e: e.write({"a": 0.0, "force": [1.0]}), "single numbers \\('a'\\) and of others \\('force'\\)"),
+    "mixture": (lambda e: e.write({"a": 0.0, "force": [1.0]}), "single numbers \\('a'\\) and others \\('force'\\)"),
     "element": (lambda e: e.write({"a": 0.0, "c": 1.0}), "no element 'c'"),
     "missing element": (lambda e: e.write({"a": 0.0}), "lacks the element 'b'"),
     "action": (lambda e: e.write([0.0, 1.0], [0.0]), "unknown feature 'action'"),
     "camera": (lambda e: e.write([0.0, 1.0], images={"tip": PIXELS}), "Unknown camera 'tip'"),
     "list": (lambda e: e.write([0.0, 1.0], images={"top": [0]}), "is list, it must be uint8"),
     "tuple": (lambda e: e.write([0.0, 1.0], images={"top": (PIXELS,)}), "must be .pixels, stamp in ns"),
-    "still": (lambda e: e.write([0.0, 1.0], time_ns=1_000_000_000), "stamps must not stand still"),
+    "still": (lambda e: e.write([0.0, 1.0], time_ns=1_000_000_000), "stamps must not repeat"),
     "stamp": (lambda e: e.write([0.0, 1.0], stamps={"acton": 5}), "unknown feature 'acton'"),
     "after the end": (lambda e: (e.finish(), e.write([0.0, 1.0])), "The episode has ended"),
 }  # fmt: skip
@@ -207,15 +207,15 @@ def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, w
         ({"fps": 0}, "fps is 0"),
         ({"robot": ""}, "name is empty"),
         ({"robot": []}, "give a name, a URDF"),
-        ({"robot": "<robot"}, "no XML"),
+        ({"robot": "<robot"}, "not valid XML"),
         ({"robot": "nothing.urdf"}, "No such file"),
-        ({"cameras": {"top": 480}}, "must be \\(height, width\\)"),
+        ({"cameras": {"top": 480}}, "give \\(height, width\\)"),
         ({"cameras": {"to/p": (48, 64)}}, "called 'to/p'"),
         ({"cameras": {"top": Camera(name="tip", width=1, height=1)}}, "described as 'tip'"),
         ({"cameras": {"top": (47, 64)}}, "64x47 pixels cannot be h264 video, which needs even sizes.* the codec jpeg"),
         ({"cameras": {"top": (48, 65)}, "video": VideoConfig(codec="av1")}, "65x48 pixels cannot be av1 video"),
-        ({"when_full": "panic"}, "allowed are error, drop, wait"),
-        ({"task": None}, "The task is None, it must be a text"),
+        ({"when_full": "panic"}, "choose from error, drop, wait"),
+        ({"task": None}, "The task is None; describe"),
     ],
 )
 def test_what_cannot_be_recorded_is_refused_before_a_folder_is_made(
@@ -273,7 +273,7 @@ def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
         episode.write([0.0])
         with pytest.raises(ConfigError, match="Another run is writing here"):
             recorder(tmp_path / "run")
-        with pytest.raises(RecordingError, match="An episode is being recorded already"):
+        with pytest.raises(RecordingError, match="An episode is already being recorded"):
             run.episode()
     with recorder(tmp_path / "run", robot="ur5", fps=20) as run:
         episode = run.episode()
@@ -299,7 +299,7 @@ def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
 def test_frames_that_the_encoder_cannot_take_are_an_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     go_on = held_up(monkeypatch)
     with recorder(tmp_path / "run", when_full="error") as run, run.episode() as episode:
-        with pytest.raises(RecordingError, match="cannot keep up, 15 frames wait for it: choose quicker encoding"):  # noqa: PT012
+        with pytest.raises(RecordingError, match=r"cannot keep up .15 frames are waiting.: choose faster encoding"):  # noqa: PT012
             for _ in range(40):
                 episode.write([0.0])
         go_on.set()

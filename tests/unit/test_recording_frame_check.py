@@ -113,7 +113,7 @@ def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
 @pytest.mark.parametrize(
     ("names", "words"),
     [
-        (("elbow",), "has no joints elbow; those of its URDF are"),
+        (("elbow",), "has no joints elbow; its URDF has"),
         (("panda_joint2",), "2 joints of the robot are called 'panda_joint2'"),
     ],
 )

@@ -127,7 +127,7 @@ def test_without_depth_it_says_so(tmp_path: Path) -> None:
             next(recording.depth("front"))
         with pytest.raises(RecordingError, match="no segmentation images"):
             next(recording.segmentation("front"))
-        with pytest.raises(RecordingError, match=r"no camera 'top', its cameras are front, wrist"):
+        with pytest.raises(RecordingError, match=r"no camera 'top'; its cameras are front, wrist"):
             next(recording.images("top"))
         assert recording.segment_names() == {}
 

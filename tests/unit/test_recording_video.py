@@ -78,7 +78,7 @@ def test_another_size_than_the_settings_say() -> None:
     other = make_encoder(video=VideoConfig(codec="jpeg"), width=32, height=32, fps=30)
     (data,) = other.encode(np.zeros((32, 32, 3), dtype=np.uint8))
     packet = VideoPacket(frame_index=0, time_ns=0, data=data, is_keyframe=True)
-    with pytest.raises(RecordingError, match="An image is 32x32 pixels where the metadata says 64x48"):
+    with pytest.raises(RecordingError, match="An image is 32x32 pixels, but the metadata states 64x48"):
         list(decode(encoder.settings, [packet]))
 
 

@@ -64,7 +64,7 @@ def test_frames_come_in_order(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=3, cameras=())
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         writer.write(frames[0])
-        with pytest.raises(RecordingError, match=r"Frame 2 at 66666667 ns came where frame 1 at 33333333 ns was due"):
+        with pytest.raises(RecordingError, match=r"Frame 2 at 66666667 ns arrived instead of frame 1 at 33333333 ns"):
             writer.write(frames[2])
         with pytest.raises(RecordingError, match="Frame 1 at 7 ns"):
             writer.write(replace(frames[1], time_ns=7))

@@ -1,4 +1,4 @@
-"""Records the episodes of somebody's own robot or program: `Recorder`.
+"""Recording of episodes of any robot or program: `Recorder`.
 
 with Recorder("runs/mine", robot="so101", cameras={"top": (480, 640)}, fps=30, task="stack the cups") as recorder:
     with recorder.episode() as episode:

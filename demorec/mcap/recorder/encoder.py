@@ -1,8 +1,8 @@
-"""The threads that encode images and write frames, so that the program that gives them need not wait.
+"""Threads that encode images and write frames, so that the recorded program need not wait.
 
-Libraries that encode images and write files release Python's lock, so threads are enough, one a camera beside the one
-that writes, and nothing has to be carried to another process. What waits is bounded: a queue that grew without end
-would hide that the machine cannot keep up.
+Libraries that encode images and write files release Python's lock, so threads suffice: one per camera plus one that
+writes, without transfers to another process. The queue is bounded: one that grew without limit would hide that the
+machine cannot keep up.
 """
 
 from __future__ import annotations
@@ -27,18 +27,17 @@ WhenFull = Literal["error", "drop", "wait"]
 
 _FLUSH_SECONDS = 0.25
 _WAITING_SECONDS = 0.5
-"""What has come is written after the first, and of the second at most waits to be encoded: so a crash loses less than a
-second, with the time that writing takes."""
+"""Time after which queued frames are written, s. With the time for writing, a crash loses less than a second."""
 _WAIT_SECONDS = 0.001
 _MAX_WAITING_BYTES = 256 << 20
 _MIN_WAITING_FRAMES = 8
 
 WaitingImages = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
-"""Camera -> stamp and pixels of a new image, or its stamp and None for the same one again."""
+"""Camera -> timestamp and pixels of a new image, or its timestamp and None for the same one again."""
 
 
 class Buffers:
-    """Memory for images that wait, used again and again: fresh memory costs as much as copying into it."""
+    """Reused memory for queued images: fresh memory costs as much as copying into it."""
 
     def __init__(self, cameras: Sequence[Camera]) -> None:
         self._free: dict[tuple[int, ...], deque[NDArray[np.uint8]]] = {
@@ -46,7 +45,7 @@ class Buffers:
         }
 
     def copy(self, pixels: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """A copy that belongs to nobody else until `give_back`."""
+        """Copy pixels into a buffer reserved until `give_back`."""
         free = self._free[pixels.shape]
         try:
             buffer = free.popleft()
@@ -56,24 +55,24 @@ class Buffers:
         return buffer
 
     def give_back(self, buffer: NDArray[np.uint8]) -> None:
-        """Let the copy's memory be used again."""
+        """Release the memory of a copy."""
         self._free[buffer.shape].append(buffer)
 
 
 class BackgroundEncoder:
-    """Feeds a writer from a queue in a thread of its own.
+    """Thread that feeds a writer from a queue.
 
     Args:
-        buffers: Where images are given back to.
-        cameras: Of the episode; they decide how many frames may wait.
-        fps: Frames a second, nominal: as many may wait as come in half a second, if memory allows.
+        buffers: Pool that images are returned to.
+        cameras: Cameras of the episode; they determine the capacity.
+        fps: Nominal frames per second: up to half a second of frames may wait, if memory allows.
         waits: Whether `put` waits for room.
 
     Attributes:
-        writer: Of the episode; used by the thread alone until `end` returns.
-        info: What the episode is, to be set before the first frame is put.
-        error: What ended the thread, if anything did.
-        capacity: How many frames may wait.
+        writer: Writer of the episode; used only by the thread until `end` returns.
+        info: Description of the episode, to be set before the first frame is put.
+        error: Error that ended the thread, if any.
+        capacity: Maximum number of waiting frames.
     """
 
     def __init__(
@@ -99,7 +98,7 @@ class BackgroundEncoder:
         self._thread.start()
 
     def put(self, frame: SampledFrame, images: WaitingImages) -> bool:
-        """Copy the images that a frame holds and queue both; False when the queue is full and is not waited for.
+        """Copy a frame's images and queue both; False if the queue is full and `waits` is off.
 
         Only one thread may put frames.
         """
@@ -117,7 +116,7 @@ class BackgroundEncoder:
         return True
 
     def end(self) -> None:
-        """Wait until all that was queued is with the writer, or the thread has died; harmless when called twice."""
+        """Wait until everything queued is with the writer, or the thread has died; safe to call twice."""
         while self._thread.is_alive():
             try:
                 self._queue.put(None, timeout=0.1)

@@ -1,4 +1,4 @@
-"""The recorder of somebody's own robot or program: a run of episodes, each written while it happens."""
+"""Recorder for any robot or program: a run of episodes, each written while it happens."""
 
 from __future__ import annotations
 
@@ -37,24 +37,24 @@ from demorec.mcap.video import size_problem
 from demorec.runs.external import ExternalFolder, episode_path, open_external_run
 
 Image = NDArray[np.uint8] | tuple[NDArray[np.uint8], int]
-"""(H, W, 3) uint8 RGB, alone or with the stamp (ns) of when it was taken."""
+"""(H, W, 3) uint8 RGB, alone or with its capture timestamp (ns)."""
 
 FRAMES = "frames"
-"""Name of frames among the drops."""
+"""Key of frames in the drop counts."""
 
 _REAL_TIME = VideoConfig(preset="ultrafast")
 
 
 class RecordedEpisode:
-    """Context manager over one episode; `Recorder.episode` makes it.
+    """Context manager over one episode, created by `Recorder.episode`.
 
-    An exception that ends the `with` block marks the episode as failed, Ctrl-C does not; either way all that came is
-    kept. An episode without a frame leaves nothing behind.
+    An exception that ends the `with` block marks the episode as failed, Ctrl-C does not; all received data is kept in
+    both cases. An episode without frames leaves no file.
 
     Attributes:
-        success: Whether it succeeded, for you to set; None when you do not say.
-        drops: "frames" -> how many were dropped because the encoder could not keep up, where that is allowed.
-        num_frames: Frames that were taken.
+        success: Whether it succeeded, to be set by the caller; None if unknown.
+        drops: "frames" -> number of frames dropped because the encoder could not keep up, if that is allowed.
+        num_frames: Number of accepted frames.
     """
 
     def __init__(self, run: Recorder, info: EpisodeInfo, encoder: BackgroundEncoder) -> None:
@@ -68,7 +68,7 @@ class RecordedEpisode:
 
     @property
     def is_open(self) -> bool:
-        """Whether it takes more frames."""
+        """Whether it accepts more frames."""
         return self._encoder is not None
 
     def __enter__(self) -> Self:
@@ -84,7 +84,7 @@ class RecordedEpisode:
                 self.finish(reason="" if exc is None else "interrupted")
         except RecordingError:
             if exc is None:
-                raise  # else the first error is the one to be reported
+                raise  # otherwise the first error is reported
 
     def write(
         self,
@@ -95,23 +95,23 @@ class RecordedEpisode:
         time_ns: int | None = None,
         stamps: Mapping[str, int] | None = None,
     ) -> bool:
-        """Take one frame: copied at once, encoded and written by another thread.
+        """Add one frame: copied immediately, encoded and written by another thread.
 
         Args:
-            observation: At this time: (D,) numbers; or element -> number; or feature -> numbers.
-            action: What was commanded upon it: (D,) numbers, or element -> number.
-            images: Camera -> (H, W, 3) uint8 RGB, or that with its own stamp. A camera that is left out, or None, has
-                no image at this frame. An image with the stamp of the camera's last one is taken for that one, and
-                not encoded again.
-            time_ns: Stamp of the frame; by the recorder's clock when left out.
-            stamps: Feature -> stamp of its numbers; that of the frame where left out.
+            observation: Observation at this time: (D,) numbers; or element -> number; or feature -> numbers.
+            action: Action commanded after it: (D,) numbers, or element -> number.
+            images: Camera -> (H, W, 3) uint8 RGB, optionally with its own timestamp. A camera that is missing or None
+                has no image at this frame. An image with the timestamp of the camera's last one is the same image, and
+                is not encoded again.
+            time_ns: Timestamp of the frame; by default from the recorder's clock.
+            stamps: Feature -> timestamp of its numbers; by default the frame's.
 
         Returns:
-            Whether the frame was taken; False only where drops are allowed, when the encoder cannot keep up.
+            Whether the frame was accepted; False only if drops are allowed and the encoder cannot keep up.
 
         Raises:
-            RecordingError: What was given cannot be recorded, the encoder cannot keep up and drops are not allowed, or
-                the disk is full.
+            RecordingError: The data cannot be recorded, the encoder cannot keep up and drops are not allowed, or the
+                disk is full.
         """
         if self._encoder is None:
             raise RecordingError("The episode has ended: begin another with recorder.episode().")
@@ -134,7 +134,7 @@ class RecordedEpisode:
                 self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
                 return False
             raise RecordingError(
-                f"The encoder cannot keep up, {self._encoder.capacity} frames wait for it: choose quicker encoding "
+                f"The encoder cannot keep up ({self._encoder.capacity} frames are waiting): choose faster encoding "
                 '(video=VideoConfig(codec="jpeg")), smaller or fewer images, or when_full="drop" or "wait".'
             )
         for camera, (stamp_ns, _) in new.items():
@@ -144,17 +144,17 @@ class RecordedEpisode:
         return True
 
     def finish(self, success: bool | None = None, *, reason: str = "") -> Path | None:
-        """End the episode and make its recording whole; harmless when called twice.
+        """End the episode and complete its recording; safe to call twice.
 
         Args:
-            success: In place of the attribute of that name.
-            reason: Why it is no success, in words.
+            success: Replaces the attribute `success`.
+            reason: Reason of a failure, in words.
 
         Returns:
-            The recording; None when there was not one frame.
+            The recording; None if there were no frames.
 
         Raises:
-            RecordingError: The disk is full. What was written so far stays, and is recovered when the run is opened
+            RecordingError: The disk is full. The data written before is kept, and recovered when the run is opened
                 again.
         """
         if success is not None:
@@ -174,13 +174,13 @@ class RecordedEpisode:
         return path
 
     def discard(self) -> None:
-        """End the episode and keep nothing of it; harmless when called twice, and after `finish`."""
+        """End the episode and delete its data; safe to call twice, and after `finish`."""
         encoder = self._end()
         if encoder is not None:
             encoder.writer.discard()
 
     def _end(self) -> BackgroundEncoder | None:
-        """Take no more frames; the encoder, with all that came, if nobody else has ended it."""
+        """Stop accepting frames; returns the encoder, unless the episode has already been ended."""
         encoder, self._encoder = self._encoder, None
         if encoder is not None:
             encoder.end()
@@ -205,7 +205,7 @@ def _samples(
 
 
 def _waiting(check: SampledFrameCheck, images: Mapping[str, Image | None], time_ns: int) -> WaitingImages:
-    """The images that came, not yet copied; one that came before is None."""
+    """Collect the received images, not yet copied; a repeated one is None."""
     waiting: dict[str, tuple[int, NDArray[np.uint8] | None]] = {}
     for camera, image in images.items():
         if isinstance(image, tuple) and len(image) != 2:
@@ -218,30 +218,30 @@ def _waiting(check: SampledFrameCheck, images: Mapping[str, Image | None], time_
 
 
 class Recorder(Closing):
-    """Context manager over a run: a folder of recorded episodes, which goes on where it ended.
+    """Context manager over a run: a folder of recorded episodes, which is continued if it exists.
 
     Args:
-        folder: Of the run; made if it is not there. Nothing that is in it is ever written over.
-        robot: Its name, the path or text of its URDF, an arm of demorec's, or the names of its joints. Vectors as long
-            as there are joints are taken for their positions (rad, m).
-        cameras: Name -> (height, width) of its images, or all that is known of it.
-        fps: Nominal frames per second of the loop; the frames' own stamps say what they were.
-        task: What the robot is asked to do, in words; LeRobot's task text.
-        features: Of the vectors, where the first frame does not say enough: names and units of their elements.
-        video: How images are encoded; H.264 with the preset "ultrafast" where left out, which takes half the CPU time
-            of generate-dataset's "veryfast".
-        clock: Tells the stamp of a frame that comes without one, in nanoseconds; it must never go backwards.
-        when_full: What happens to a frame when the encoder cannot keep up and no more frames may wait: "error" raises,
-            "drop" leaves it out and counts it, "wait" holds up your program, which suits a simulator.
+        folder: Folder of the run; created if missing. Its files are never overwritten.
+        robot: Its name, the path or text of its URDF, an arm of demorec's, or the names of its joints. Vectors with one
+            element per joint are interpreted as joint positions (rad, m).
+        cameras: Name -> (height, width) of its images, or a full description.
+        fps: Nominal frames per second of the loop; timestamps record the actual rate.
+        task: Task of the robot, in words; LeRobot's task text.
+        features: Descriptions of the vectors, if the first frame is not sufficient: names and units of their elements.
+        video: Encoding of the images; by default H.264 with the preset "ultrafast", which takes half the CPU time of
+            generate-dataset's "veryfast".
+        clock: Returns the timestamp of a frame without one, in nanoseconds; must never go backwards.
+        when_full: Treatment of a frame when the encoder cannot keep up and the queue is full: "error" raises, "drop"
+            omits and counts it, "wait" blocks the program, which suits a simulator.
 
     Attributes:
-        path: Of the run's folder.
-        recovered: Recordings of episodes that a crash had cut off and that were made whole now.
-        clock, when_full: As above.
+        path: Path of the run's folder.
+        recovered: Recordings of episodes cut off by a crash, which have now been recovered.
+        clock, when_full: The arguments.
 
     Raises:
-        ConfigError: The folder is in use, holds something else or cannot be written to; or the robot, the cameras or
-            the features cannot be.
+        ConfigError: The folder is in use, contains something else or is not writable; or the robot, the cameras or the
+            features are invalid.
     """
 
     def __init__(
@@ -272,19 +272,19 @@ class Recorder(Closing):
         self.recovered = tuple(self._folder.recovered)
 
     def _check_request(self) -> None:
-        """Refuse at once what no first frame could make good."""
+        """Reject errors that no first frame could fix."""
         placeholder = Feature(name="observation.state", names=("0",))
         asked = self._info(self._features or (placeholder,), 0, self._task or "placeholder")
         wrong = find_problems(asked)
         sizes = [size_problem(self._video, camera.width, camera.height) for camera in self._cameras]
         wrong += list(filter(None, sizes))
         if self.when_full not in get_args(WhenFull):
-            wrong.append(f"when_full is {self.when_full!r}, allowed are {', '.join(get_args(WhenFull))}")
+            wrong.append(f"when_full is {self.when_full!r}, choose from {', '.join(get_args(WhenFull))}")
         if wrong:
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
 
     def close(self) -> None:
-        """End the open episode, if there is one, and the run; harmless when called twice."""
+        """End the open episode, if any, and the run; safe to call twice."""
         try:
             if self._open is not None:
                 self._open.finish()
@@ -293,23 +293,21 @@ class Recorder(Closing):
 
     @property
     def num_episodes(self) -> int:
-        """How many the run has, those of earlier programs included."""
+        """Number of episodes in the run, including those of earlier programs."""
         return len(self._folder.episodes)
 
     def episode(self, task: str = "") -> RecordedEpisode:
-        """Begin an episode: its file and its encoders are opened now, so that no frame waits for that.
+        """Begin an episode; its file and encoders are opened now, so that no frame waits for that.
 
         Args:
-            task: Of this episode, in place of the recorder's.
+            task: Task of this episode, replaces the recorder's.
 
         Raises:
-            RecordingError: One is being recorded already, or the disk is full.
-            ConfigError: There is no task text.
+            RecordingError: An episode is already being recorded, or the disk is full.
+            ConfigError: The task text is missing.
         """
         if self._open is not None and self._open.is_open:
-            raise RecordingError(
-                "An episode is being recorded already: end it first, one robot does one thing at a time."
-            )
+            raise RecordingError("An episode is already being recorded: end it first.")
         instruction = _text(task) or self._task
         if not instruction.strip():
             raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
@@ -325,7 +323,7 @@ class Recorder(Closing):
     # ------------------------------------------------------------------------------- for the episode
 
     def described(self, info: EpisodeInfo, vectors: NamedVectors) -> EpisodeInfo:
-        """An episode whose first frame has these vectors; ConfigError when the run has episodes of another kind."""
+        """Describe an episode by its first frame's vectors; ConfigError if the run has a different kind of episodes."""
         info = replace(info, features=self._features or features_of(vectors, self._robot))
         if wrong := find_problems(info):
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
@@ -333,7 +331,7 @@ class Recorder(Closing):
         return info
 
     def add(self, recording: Path) -> None:
-        """Take a finished recording into the run."""
+        """Add a finished recording to the run."""
         self._folder.add(recording)
 
     def _info(self, features: tuple[Feature, ...], episode_index: int, instruction: str) -> EpisodeInfo:
@@ -352,7 +350,7 @@ class Recorder(Closing):
 
 def _text(task: object) -> str:
     if not isinstance(task, str):
-        raise ConfigError(f"The task is {task!r}, it must be a text: say what the robot is asked to do.")
+        raise ConfigError(f"The task is {task!r}; describe the robot's task in a text.")
     return task
 
 
@@ -360,15 +358,15 @@ def _camera(name: str, camera: tuple[int, int] | Camera) -> Camera:
     if isinstance(camera, Camera):
         if camera.name != name or camera.kept:
             raise ConfigError(
-                f"The camera {name!r} is described as {camera.name!r}{', passthrough' if camera.kept else ''}: a "
-                "recorder takes pixels, under the camera's own name."
+                f"The camera {name!r} is described as {camera.name!r}{', passthrough' if camera.kept else ''}: give "
+                "pixels, under the camera's own name."
             )
         return camera
     try:
         height, width = camera
         return Camera(name=name, width=int(width), height=int(height))
     except (TypeError, ValueError):
-        raise ConfigError(f"The camera {name!r} is {camera!r}, it must be (height, width) in pixels.") from None
+        raise ConfigError(f"The camera {name!r} is {camera!r}; give (height, width) in pixels.") from None
 
 
 def _as_recording_error(error: BaseException) -> RecordingError:

@@ -1,7 +1,7 @@
-"""Observations and actions as a program has them, as the vectors of named features.
+"""Conversion of a program's observations and actions to the vectors of named features.
 
-An observation is a vector, or a mapping: of numbers by the names of elements (as LeRobot's robots give them), which
-makes one vector, or of vectors by the names of features. So is an action, which is always one vector.
+An observation is a vector, or a mapping: of numbers by element names (as from LeRobot's robots), which makes one
+vector, or of vectors by feature names. An action has the same forms, but is always one vector.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
 
 NamedVectors = Mapping[str, tuple[NDArray[Any], tuple[str, ...]]]
-"""Feature -> its numbers, and the names of its elements where a mapping gave them."""
+"""Feature -> its numbers, and the names of its elements if a mapping provided them."""
 
 Vectors = ArrayLike | Mapping[str, ArrayLike]
 
@@ -34,10 +34,10 @@ _PREFIX = "observation."
 
 
 def named_vectors(observation: Vectors, action: Vectors | None) -> NamedVectors:
-    """What was given, copied.
+    """Convert and copy the data.
 
     Raises:
-        RecordingError: Values that are no vectors of numbers, or a mapping of vectors and of single numbers.
+        RecordingError: Values are not vectors of numbers, or a mapping mixes vectors and single numbers.
     """
     found: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {}
     if isinstance(observation, Mapping) and not _is_of_numbers(STATE, observation):
@@ -56,7 +56,7 @@ def _is_of_numbers(name: str, mapping: Mapping[str, Any]) -> bool:
     if single and len(single) != len(mapping):
         other = next(key for key in mapping if key not in single)
         raise RecordingError(
-            f"The {name} is a mapping of single numbers ({single[0]!r}) and of others ({other!r}): give single numbers "
+            f"The {name} is a mapping of single numbers ({single[0]!r}) and others ({other!r}): give numbers "
             "by the names of elements, or vectors by the names of features."
         )
     return bool(single)
@@ -78,7 +78,7 @@ def _vector(name: str, value: ArrayLike) -> NDArray[Any]:
     try:
         vector = np.array(value)
     except ValueError:
-        raise RecordingError(f"The feature {name!r} is no vector: its parts have different lengths.") from None
+        raise RecordingError(f"The feature {name!r} is not a vector: its parts have different lengths.") from None
     if vector.dtype.kind not in "fiub" or vector.ndim != 1:
         raise RecordingError(
             f"The feature {name!r} is {vector.dtype} of shape {vector.shape}: give a vector of numbers, of shape (D,)."
@@ -87,10 +87,10 @@ def _vector(name: str, value: ArrayLike) -> NDArray[Any]:
 
 
 def as_declared(feature: Feature, vector: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
-    """The vector in the feature's type and order of elements, where no bit is lost by that.
+    """Convert a vector to the feature's type and order of elements, without losing a bit.
 
     Raises:
-        RecordingError: Elements that are missing or unknown, or numbers that the feature's type cannot hold.
+        RecordingError: Elements are missing or unknown, or the feature's type cannot represent the numbers.
     """
     if names and names != feature.names:
         if unknown := [name for name in names if name not in feature.names]:
@@ -105,7 +105,7 @@ def as_declared(feature: Feature, vector: NDArray[Any], names: tuple[str, ...]) 
 
 
 def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[Feature, ...]:
-    """What the first frame says of the features that nobody described."""
+    """Describe undeclared features from the first frame."""
     found = []
     for name, (vector, given) in vectors.items():
         known = robot.joints if name in (STATE, ACTION) else ()
@@ -124,7 +124,7 @@ def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[Feature, ...]
 
 
 def _element_names(count: int, joints: tuple[str, ...]) -> tuple[str, ...]:
-    """The robot's joints where there are so many, or one more for a gripper; else numbers."""
+    """Name elements by the robot's joints if the count matches, or is one more for a gripper; else by numbers."""
     if count == len(joints):
         return joints
     if joints and count == len(joints) + 1 and "gripper" not in joints:
@@ -137,13 +137,13 @@ RobotLike = str | Path | RobotSpec | Sequence[str]
 
 @dataclass(frozen=True, kw_only=True)
 class RobotFacts:
-    """What is known of the robot.
+    """Known facts about the robot.
 
     Attributes:
-        name: Of it.
-        urdf: Its description as text, "" when unknown; that of a file with every mesh replaced by its box,
-            so that it can be drawn without any other file.
-        joints: Names of all that move, in the order in which vectors have them, where that is known.
+        name: Name of the robot.
+        urdf: Its description as text, "" if unknown; from a file, every mesh is replaced by its box, so that it can be
+            drawn without other files.
+        joints: Names of all moving joints, in the order of the vectors, if known.
     """
 
     name: str
@@ -152,10 +152,10 @@ class RobotFacts:
 
 
 def robot_facts(robot: RobotLike) -> RobotFacts:
-    """What can be known of a robot that is named so.
+    """Collect the facts about a robot given by name, URDF or joints.
 
     Raises:
-        ConfigError: The URDF cannot be read, or is none; or the joint names are no names.
+        ConfigError: The URDF is unreadable or invalid, or the joint names are invalid.
     """
     if isinstance(robot, RobotSpec):
         joints = robot.joint_names
