@@ -1,1 +1,1 @@
-"""Episodes as plain data: scenes, frames, features, outcomes, and how much they vary."""
+"""Episodes as plain data: scenes, frames, features, outcomes, and their variation."""

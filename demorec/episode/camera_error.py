@@ -1,4 +1,4 @@
-"""By how much recorded camera poses are off on purpose (`--variation full`), among the numbers of the behaviour."""
+"""Deliberate errors of recorded camera poses (`--variation full`), stored among the numbers of the behaviour."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from demorec.core.geometry import Pose, angle_between
 from demorec.episode.scene import SceneCamera
 
 ANGLE_MARGIN = 1e-6
-"""Radians by which quaternion and angle may disagree."""
+"""Maximum disagreement between quaternion and angle, rad."""
 
 
 def error_values(errors: Mapping[str, Pose]) -> dict[str, float]:
-    """The errors as they are recorded.
+    """Convert errors to their recorded form.
 
     Args:
-        errors: Camera name -> true_from_recorded, a turn of less than half a revolution.
+        errors: Camera name -> true_from_recorded, with a rotation of less than half a revolution.
 
     Returns:
-        Of each camera that has an error: `calibration_NAME_x`, `_y`, `_z` (m), `_angle` (rad), and x, y, z of the
-        quaternion, whose w is positive, as `_qx`, `_qy`, `_qz`.
+        For each camera with an error: `calibration_NAME_x`, `_y`, `_z` (m), `_angle` (rad), and x, y, z of the
+            quaternion, with positive w, as `_qx`, `_qy`, `_qz`.
     """
     values: dict[str, float] = {}
     for name, error in errors.items():
@@ -37,14 +37,14 @@ def error_values(errors: Mapping[str, Pose]) -> dict[str, float]:
 
 
 def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
-    """true_from_recorded of a camera, as recorded numbers have it.
+    """Read true_from_recorded of a camera from the recorded numbers.
 
     Args:
-        name: Of the camera.
-        behaviour: Of the episode; from a file, so that anything may stand there.
+        name: Name of the camera.
+        behaviour: Behaviour of the episode, unvalidated from a file.
 
     Returns:
-        None where they do not state it, or contradict each other.
+        The error; None if it is missing or inconsistent.
     """
     words = [f"calibration_{name}_{word}" for word in ("x", "y", "z", "qx", "qy", "qz", "angle")]
     numbers = np.array([behaviour.get(word, math.nan) for word in words])
@@ -58,9 +58,9 @@ def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
 def true_cameras(
     recorded: Sequence[SceneCamera], behaviour: Mapping[str, float]
 ) -> tuple[tuple[SceneCamera, ...], dict[str, Pose]]:
-    """Return the cameras where they truly were, and camera name -> true_from_recorded of those that have an error.
+    """Return the cameras at their true poses, and camera name -> true_from_recorded of those with an error.
 
-    Generation draws from these cameras, so that a recording alone gives the same images again.
+    Generation draws from these cameras, so that a recording alone reproduces its images.
     """
     errors: dict[str, Pose] = {}
     cameras = []

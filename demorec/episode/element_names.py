@@ -1,4 +1,4 @@
-"""Names of the elements of a vector, in every form in which they are written."""
+"""Names of the elements of a vector, in all known notations."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import re
 from collections.abc import Iterator, Sequence
 
 _SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
-"""Ending of an element's name that is not part of its joint's name."""
+"""Suffix of an element's name that is not part of its joint's name."""
 _GRIPPER = re.compile("gripper|finger", re.IGNORECASE)
 
 
 def read_names(names: object, count: int) -> tuple[str, ...] | None:
-    """Read the names of `count` elements; None where they are missing or of another number.
+    """Read the names of `count` elements; None if they are missing or their number differs.
 
-    Known forms: a list; lists within lists, as Unitree writes them; lists in an object by a common word, as
-    `{"motors": [...]}` of LeRobot 2 or `{"axes": [...]}`; an object from each name to its place.
+    Known forms: a list; nested lists, as written by Unitree; lists in an object under a common word, such as
+    `{"motors": [...]}` of LeRobot 2 or `{"axes": [...]}`; an object from each name to its index.
     """
     if isinstance(names, dict) and (places := list(names.values())) and all(type(place) is int for place in places):
         names = sorted(names, key=names.__getitem__) if sorted(places) == list(range(count)) else None
@@ -23,7 +23,7 @@ def read_names(names: object, count: int) -> tuple[str, ...] | None:
 
 
 def _flat(names: object) -> Iterator[str]:
-    """Yield the names in lists and objects within each other, in order; "" for what is no name."""
+    """Yield the names in nested lists and objects, in order; "" for anything that is not a name."""
     waiting = [names]
     while waiting:
         item = waiting.pop()
@@ -36,20 +36,20 @@ def _flat(names: object) -> Iterator[str]:
 
 
 def numbers(count: int) -> tuple[str, ...]:
-    """Names of elements whose names are unknown: "0", "1", ..."""
+    """Number elements without names: "0", "1", ..."""
     return tuple(map(str, range(count)))
 
 
 def is_numbered(names: Sequence[str]) -> bool:
-    """Whether elements have numbers instead of names."""
+    """Check whether elements have numbers instead of names."""
     return tuple(names) == numbers(len(names))
 
 
 def joint_of(name: str) -> str:
-    """The name of an element without what says position, velocity or effort."""
+    """Remove the suffix for position, velocity or effort from an element's name."""
     return _SUFFIX.sub("", name)
 
 
 def is_gripper(name: str) -> bool:
-    """Whether an element is named after a gripper or a finger."""
+    """Check whether an element is named after a gripper or a finger."""
     return _GRIPPER.search(name) is not None

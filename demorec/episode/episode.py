@@ -1,9 +1,8 @@
-"""What is recorded at each control step, and about each episode.
+"""Data recorded at each control step, and about each episode.
 
-The (observation, action) contract, everywhere: frame t holds the observation at time t, taken *before* action t
-is applied. `action` is what the expert wanted (the label to learn from); `command` is what was sent to the motors
-(the same, plus exploration noise where there was any), in float64 as sent: replaying the commands reproduces the
-episode to the bit.
+The (observation, action) contract, everywhere: frame t contains the observation at time t, taken *before* action t is
+applied. `action` is the expert's intended action (the label to learn from). `command` was sent to the motors (the
+action plus any exploration noise), in float64 as sent: replaying the commands reproduces the episode bit-exactly.
 """
 
 from __future__ import annotations
@@ -20,23 +19,23 @@ from demorec.core.geometry import Array, Pose
 from demorec.episode.info import EpisodeInfo
 
 POLICY_PHASE = "policy"
-"""Phase of the frames in which a policy acts, or somebody else who tells no phase; all others are the expert's."""
+"""Phase of frames controlled by a policy, or by another agent without phases; all others are the expert's."""
 HALT_PHASE = "halt"
-"""Phase in which an expert that has taken over does nothing yet but stop the arm. That is not to be learned: it stops
-in states in which a demonstration goes on."""
+"""Phase in which an expert that has taken over only stops the arm. It must not be learned: it stops in states in which
+a demonstration continues."""
 
 TIME_LIMIT = "time_limit"
-"""Reason of a failure that had not ended when its time was over."""
+"""Failure reason of an episode that ran out of time."""
 
 NO_IMAGE = -1
-"""Stands for the number of an image where a frame has none."""
+"""Image number of a frame without an image."""
 
 Vector = NDArray[np.float32] | NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """All that is sensed at one instant.
+    """All measurements at one instant.
 
     Attributes:
         joint_position: (n_joints,) in the order of `RobotSpec.joint_names`; rad, fingers m.
@@ -46,7 +45,7 @@ class Observation:
         base_from_tcp: TCP pose in the base frame.
         object_poses: name -> world_from_object, of every movable body of the scene.
         contact_force: Sum of the normal forces on the fingers, N.
-        sensed: What else is sensed: quantity -> (D,), by the rows of `demorec.sim.sensors`.
+        sensed: Other sensors: quantity -> (D,), by the rows of `demorec.sim.sensors`.
     """
 
     joint_position: Array
@@ -76,7 +75,7 @@ class Action:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class JointSample:
-    """Joint states between two frames (recorded at the physics rate when asked for); shapes as in Observation."""
+    """Joint states between two frames (recorded at the physics rate on request); shapes as in Observation."""
 
     time_ns: int
     joint_position: Array
@@ -86,13 +85,13 @@ class JointSample:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraImages:
-    """What one camera sees at one instant.
+    """Images of one camera at one instant.
 
     Attributes:
         color: (H, W, 3) uint8 RGB, row 0 on top.
-        depth: (H, W) float32 metres along the optical axis, 0 where nothing is hit; None when not asked for.
+        depth: (H, W) float32 metres along the optical axis, 0 for the background; None unless requested.
         segmentation: (H, W) int32, body index + ((link index + 1) << 24) as PyBullet numbers them, -1 for the
-            background; None when not asked for.
+            background; None unless requested.
         world_from_camera: Pose, OpenCV axes.
     """
 
@@ -104,7 +103,7 @@ class CameraImages:
 
 @dataclass(frozen=True, kw_only=True)
 class Event:
-    """Something that happened, for people to read: a grasp, a miss, a retry."""
+    """An event of the episode, for human readers: a grasp, a miss, a retry."""
 
     name: str
     message: str
@@ -118,13 +117,13 @@ class Frame:
     Attributes:
         frame_index: t, from 0.
         time_ns: Simulated time since the episode's start, computed from frame_index.
-        observation: At t.
-        action: What the expert wanted at t.
-        command: What was sent to the motors at t.
-        phase: Of the scripted motion ("approach", "lift", ...).
-        events: At t.
-        images: camera name -> images at t.
-        joint_samples: Joint states since the previous frame, both ends left out; empty unless asked for.
+        observation: Observation at t.
+        action: The expert's intended action at t.
+        command: Command sent to the motors at t.
+        phase: Phase of the scripted motion ("approach", "lift", ...).
+        events: Events at t.
+        images: Camera name -> images at t.
+        joint_samples: Joint states since the previous frame, both ends excluded; empty unless requested.
         is_deliberate_miss: Whether this frame belongs to a deliberate miss, which no policy can predict.
     """
 
@@ -142,14 +141,14 @@ class Frame:
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessCheck:
-    """One condition of success.
+    """One success condition.
 
     Attributes:
-        name: What is measured ("distance_to_goal").
-        value: What was found, in `unit`.
-        limit: What is allowed; `passed` tells on which side.
+        name: Measured quantity ("distance_to_goal").
+        value: Measured value, in `unit`.
+        limit: Allowed value; `passed` implies on which side.
         unit: "m", "rad", "m/s", "N" or "".
-        passed: Whether it holds.
+        passed: Whether the condition holds.
     """
 
     name: str
@@ -161,19 +160,19 @@ class SuccessCheck:
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """How an episode ended.
+    """Result of an episode.
 
     Attributes:
-        success: Whether it succeeded, for a simulated one whether every check passed; None when nobody said.
-        checks: The task's conditions, with the values found.
-        failure_phase: Phase in which it went wrong, "" on success and where it is not known.
-        failure_reason: Name of the first failed check, what made the expert give up, or why in somebody's words; "" on
-            success and when nobody said.
-        num_frames: Length.
-        num_retries: How often the expert tried again within the episode.
+        success: Whether it succeeded; for a simulated one whether every check passed; None if unknown.
+        checks: The task's conditions, with the measured values.
+        failure_phase: Phase of the failure, "" on success and if unknown.
+        failure_reason: Name of the first failed check, reason of the expert's failure, or a reason in words; "" on
+            success and if unknown.
+        num_frames: Number of frames.
+        num_retries: Number of repeated attempts of the expert within the episode.
         final_state_digest: SHA-256 (hex) over positions and velocities of all joints and movable bodies at the end, ""
-            where nobody knows them.
-        drops: "frames", or a camera's name -> how many of them could not be taken; what is not named lost none.
+            if unknown.
+        drops: "frames", or a camera's name -> number of dropped ones; missing names lost none.
     """
 
     success: bool | None = None
@@ -187,8 +186,7 @@ class Outcome:
 
 
 def gave_up(outcome: Outcome, events: Sequence[Event], info: EpisodeInfo) -> bool:
-    """Whether a recording shows the reason of a failure, whatever the conditions say: an event of its name, or the end
-    of the time."""
+    """Check whether a recording explains a failure by an event of its name, or by the time limit."""
     limit = info.simulated.config.get("max_episode_seconds")
     is_over = isinstance(limit, int | float) and outcome.num_frames + 1 > limit * info.fps
     return (outcome.failure_reason == TIME_LIMIT and is_over) or any(
@@ -198,10 +196,10 @@ def gave_up(outcome: Outcome, events: Sequence[Event], info: EpisodeInfo) -> boo
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """A vector as it came.
+    """A received vector.
 
     Attributes:
-        stamp_ns: Of the clock of its stream.
+        stamp_ns: Timestamp by the clock of its stream.
         vector: (D,) of the feature's dtype.
     """
 
@@ -214,12 +212,11 @@ class SampledFrame:
     """One control step.
 
     Attributes:
-        time_ns: Its stamp; frames come in order, at whatever distances. What it holds is `time_ns - stamp_ns` old.
-        samples: Feature -> what it holds; every feature.
-        images: Camera -> number of the image that it holds, counted from 0 in each camera. One image may be held
-            by several frames, or by none; a camera that is left out has no image at this frame.
-        subtask: What the robot begins to do with this frame, in the words of whoever said it; "" where nothing new was
-            said.
+        time_ns: Its timestamp; frames are in order, at any intervals. Its data is `time_ns - stamp_ns` old.
+        samples: Feature -> its sample; contains every feature.
+        images: Camera -> number of its image, counted from 0 in each camera. Several frames, or none, may refer to an
+            image; a missing camera has no image at this frame.
+        subtask: Subtask that begins at this frame, in the source's words; "" if it does not change.
     """
 
     time_ns: int
@@ -233,11 +230,11 @@ class Table:
     """Numbers of an episode of T frames, and the images that the frames show.
 
     Attributes:
-        time_ns: (T,) stamps of the frames.
+        time_ns: (T,) timestamps of the frames.
         features: Feature -> (T, D) in its own dtype.
-        stamps: Feature -> (T,) stamps of the samples.
-        images: Camera -> (T,) number of the image that each frame shows, `NO_IMAGE` for none.
-        image_stamps: Camera -> (P,) stamps of its images.
+        stamps: Feature -> (T,) timestamps of the samples.
+        images: Camera -> (T,) image number of each frame, `NO_IMAGE` if none.
+        image_stamps: Camera -> (P,) timestamps of its images.
     """
 
     time_ns: NDArray[np.int64]
@@ -248,15 +245,15 @@ class Table:
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """Number of frames, T."""
         return len(self.time_ns)
 
     def age_ns(self, feature: str) -> NDArray[np.int64]:
-        """(T,) age of each frame's sample of a feature."""
+        """Compute (T,) age of each frame's sample of a feature."""
         return self.time_ns - self.stamps[feature]
 
     def image_age_ns(self, camera: str) -> NDArray[np.int64]:
-        """(N,) age of the image of each of the N frames that show one of this camera."""
+        """Compute (N,) image age for the N frames that have an image of this camera."""
         numbers = self.images[camera]
         frames = np.flatnonzero(numbers != NO_IMAGE)
         ages: NDArray[np.int64] = self.time_ns[frames] - self.image_stamps[camera][numbers[frames]]
@@ -265,9 +262,9 @@ class Table:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Trajectory:
-    """Everything that demorec simulates in an episode of T frames, as it was computed.
+    """All simulated data of an episode of T frames, exactly as computed.
 
-    Shapes and units of a row are those of `Observation` and `Action`. A pose is (7,): position, then quaternion xyzw.
+    Shapes and units of a row are as in `Observation` and `Action`. A pose is (7,): position, then quaternion xyzw.
     """
 
     time_ns: NDArray[np.int64]  # (T,)
@@ -291,19 +288,19 @@ class Trajectory:
 
     @property
     def num_frames(self) -> int:
-        """T."""
+        """Number of frames, T."""
         return len(self.time_ns)
 
 
 def frame_time_ns(frame_index: int, fps: int) -> int:
-    """Nanoseconds of a frame since the episode's start: exact integer arithmetic, rounded half up."""
+    """Compute nanoseconds of a frame since the episode's start: exact integer arithmetic, rounded half up."""
     return (frame_index * 2_000_000_000 + fps) // (2 * fps)
 
 
 def interventions(phases: Sequence[str]) -> NDArray[np.bool_]:
-    """(T,) where an expert acts that has taken over from a policy, and does more than stop the arm.
+    """Find (T,) frames in which an expert that took over from a policy acts, excluding the stop of the arm.
 
-    False in all frames of a demonstration, which nobody took over.
+    False in all frames of a demonstration without a takeover.
     """
     acts = np.array([phase not in (POLICY_PHASE, HALT_PHASE) for phase in phases], dtype=np.bool_)
     return acts & (POLICY_PHASE in phases)

@@ -1,11 +1,11 @@
-"""The vectors that a policy sees and gives: one computation for the export and for the environments.
+"""The input and output vectors of policies: one computation for the export and for the environments.
 
-A policy trained on an exported dataset meets the same numbers in closed loop only if both come from the same
-arithmetic. So everything here works on rows (T frames, or one) with additions, multiplications, divisions and
-square roots alone: IEEE 754 rounds these the same on every CPU and for every array length, unlike the
-vectorised sines of NumPy. The result is rounded once, at the end, where float32 is asked for.
+A policy trained on an exported dataset receives the same numbers in closed loop only if both come from the same
+arithmetic. So all functions here work on rows (T frames, or one) with additions, multiplications, divisions and square
+roots alone: IEEE 754 rounds these equally on every CPU and for every array length, unlike NumPy's vectorised sines. The
+result is rounded once, at the end, if float32 is requested.
 
-Frames: everything is expressed in the robot's base frame (the world's, where the robot stands at its origin).
+Frames: all vectors are in the robot's base frame (equal to the world's if the robot is at its origin).
 """
 
 from __future__ import annotations
@@ -36,26 +36,27 @@ ENVIRONMENT_STATE = "observation.environment_state"
 """Privileged state: poses and sizes of objects, which no sensor of a real robot measures."""
 ACTION = "action"
 COMMAND = "command"
-"""What the motors were sent: the action in joint space plus exploration noise."""
+"""Feature of the motor commands: the action in joint space plus exploration noise."""
 IMAGE_PREFIX, DEPTH_SUFFIX = "observation.images.", "_depth"
-"""A camera's images are called IMAGE_PREFIX + its name, its distances have the suffix, too."""
+"""A camera's images are named IMAGE_PREFIX + its name; its distances also have the suffix."""
 
 ActionKind = Literal["joint", "joint_increment", "ee", "ee_delta"]
-"""What the action column holds; `action_vectors` defines each."""
+"""Content of the action column; `action_vectors` defines each kind."""
 
 StateKind = Literal["joint", "joint_ee"]
 STATE_KINDS: tuple[StateKind, ...] = get_args(StateKind)
-"""What `observation.state` holds; `observation_vectors` defines both."""
+"""Content of `observation.state`; `observation_vectors` defines both kinds."""
 
 NOISE_DECAY = 0.3
-"""Share of the exploration noise on the executed commands that goes away within 1/30 s, when none is added.
+"""Ratio of the exploration noise on the executed commands that decays within 1/30 s, when none is added.
 
-Known to both sides: `demorec.loop.session.ActionNoise` makes the noise so, and increments below contain this return.
+Shared by both sides: `demorec.loop.session.ActionNoise` shapes the noise accordingly, and increments below include this
+return.
 """
 
 NEAR = 0.02
-"""Offset, metres, at which a near-field component is a half. A centimetre decides whether an object is where it shall
-be, but is a twentieth of a standard deviation of the plain offset, which a policy learns last."""
+"""Offset, metres, at which a near-field component is 0.5. A centimetre decides whether an object is at its goal, but is
+a twentieth of a standard deviation of the plain offset, which a policy learns last."""
 
 _POSITION = ("x", "y", "z")
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -63,7 +64,7 @@ _TCP_NAMES = tuple(f"tcp.{axis}" for axis in _POSE)
 
 
 def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
-    """Name of every component of `observation.state`."""
+    """List the name of every component of `observation.state`."""
     joints = (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
     return (*joints, *_TCP_NAMES) if kind == "joint_ee" else joints
 
@@ -80,7 +81,7 @@ def observation_names(
     state: StateKind = "joint",
     sensed: Sequence[Feature] = (),
 ) -> dict[str, tuple[str, ...]]:
-    """Feature name -> name of every component, in the order of `observation_vectors`."""
+    """List feature name -> name of every component, in the order of `observation_vectors`."""
     names = {
         STATE: state_names(robot, state),
         VELOCITY: _velocity_names(robot),
@@ -101,15 +102,15 @@ def observation_vectors(
     sensed: Sequence[Feature] = (),
     dtype: VectorType = np.float32,
 ) -> dict[str, Vectors]:
-    """Feature name -> (T, D) numbers of that type.
+    """Compute feature name -> (T, D) numbers of the requested type.
 
-    - `observation.state`: arm joint positions (rad), gripper opening (m); with `state` "joint_ee" the seven numbers of
-      `observation.ee_pose` behind them, for policies that take no second vector (LeRobot's ACT).
+    - `observation.state`: arm joint positions (rad), gripper opening (m); with `state` "joint_ee" followed by the seven
+    numbers of `observation.ee_pose`, for policies without a second input vector (LeRobot's ACT).
     - `observation.velocity`: arm joint velocities (rad/s), speed of the gripper's opening (m/s).
-    - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw. Of the two signs of the quaternion the one
-      with x >= 0: it does not jump for a hand that points down within 180 degrees of yaw.
+    - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw, with the sign that makes x >= 0: it does not
+    jump for a hand that points down within 180 degrees of yaw.
     - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
-    - `sensed`: the observations that are there on request, in their units.
+    - `sensed`: the optional observations, in their units.
     """
     arm, count = len(robot.arm_joints), len(rows.gripper_width)
     tcp = _continuous(rows.base_from_tcp)
@@ -122,7 +123,7 @@ def observation_vectors(
         features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
     for feature in sensed:
         values = rows.sensed[feature.name].reshape(count, -1)
-        features[feature.name] = [values[:, : len(feature.names)]]  # a gripper's joints are behind those of the arm
+        features[feature.name] = [values[:, : len(feature.names)]]  # a gripper's joints follow those of the arm
     return {name: _joined(columns, dtype) for name, columns in features.items()}
 
 
@@ -157,15 +158,15 @@ def _yaw_names(prefix: str, n: int) -> tuple[str, str]:
 
 
 def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) -> list[Array]:
-    """What a policy learns best from, then what is as it is (metres, rad; base frame).
+    """Compute first the inputs a policy learns best from, then raw poses (metres, rad; base frame).
 
-    First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents,
-    position relative to the TCP in base axes and in hand axes, and, for a body that looks the same every 2 pi / n,
-    its yaw as sine and cosine of n times the angle, absolute and relative to the hand. The same of the wanted pose
-    (the extents are those of the body that is placed onto, 0 for a place in the world; the relative yaw is that
-    to the object), and the offsets object - TCP, goal - TCP and goal - object once more as near-field components
-    (`near_field`). Then the velocities of `observation.velocity`, because LeRobot's ACT takes no second state
-    vector, and last the raw poses of all movable bodies.
+    First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents, position
+    relative to the TCP in base axes and in hand axes, and, for a body with a yaw symmetry of 2 pi / n, its yaw as sine
+    and cosine of n times the angle, absolute and relative to the hand. The same for the target pose (with the extents
+    of the body that supports it, 0 for a goal in the world; the yaw is relative to the object). The offsets object -
+    TCP, goal - TCP and goal - object follow again as near-field components (`near_field`). Then the velocities of
+    `observation.velocity`, because LeRobot's ACT takes no second state vector, and last the raw poses of all movable
+    bodies.
     """
     count = len(rows.gripper_width)
     base_from_world = scene.robot.world_from_base.inverse().vector()[np.newaxis]
@@ -191,7 +192,7 @@ def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) 
 
 
 def _labelled_goals(scene: Scene) -> list[tuple[str, Goal]]:
-    """Each goal with a unique label: its object's name, numbered from the second goal for the same object on."""
+    """Give each goal a unique label: its object's name, numbered from the second goal of the same object on."""
     seen: dict[str, int] = {}
     labelled = []
     for goal in scene.goals:
@@ -218,12 +219,12 @@ def _seen_from(tcp: Array, pose: Array) -> tuple[Array, Array]:
 
 
 def near_field(offset: Array) -> Array:
-    """Offsets (metres, any shape) as near-field components d / (|d| + NEAR), in -1..1 and steep around 0."""
+    """Convert offsets (metres, any shape) to near-field components d / (|d| + NEAR), in -1..1 and steep around 0."""
     return np.asarray(offset / (np.abs(offset) + NEAR), dtype=np.float64)
 
 
 def _yaw(pose: Array, n: int) -> tuple[Array, Array]:
-    """Sine and cosine (T,) of n times the yaw of the body axis that `demorec.episode.scene.yaw_of` takes."""
+    """Compute sine and cosine (T,) of n times the yaw of the body axis used by `demorec.episode.scene.yaw_of`."""
     rotation = _rotation(pose[:, 3:])
     vertical = np.argmax(np.abs(rotation[:, 2]), axis=1)
     horizontal = (vertical + 1) % 3
@@ -246,7 +247,7 @@ def _difference(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, 
 
 
 def action_names(robot: RobotSpec, kind: ActionKind) -> tuple[str, ...]:
-    """Name of every component of `action_vectors`."""
+    """List the name of every component of `action_vectors`."""
     if kind == "joint":
         return state_names(robot, "joint")
     if kind == "joint_increment":
@@ -264,25 +265,25 @@ def action_vectors(
     *,
     dtype: VectorType = np.float32,
 ) -> Vectors:
-    """(T, D) numbers, the expert's wanted commands; the last component is always the absolute gripper opening (m).
+    """Compute (T, D) numbers of the expert's intended actions, ending with the absolute gripper opening (m).
 
     - `joint`: absolute joint targets, rad.
-    - `joint_increment`: joint target minus the one of the frame before; the first minus the scene's initial joint
-      positions. Sum them up to execute them (`joint_target_from_increment`). Where the executed command of the frame
-      before had noise on it, the increment also takes back the share that lets go within a frame (`NOISE_DECAY`):
-      it is then what the robot is expected to do next from where the noise has brought it. Without this, noise would
-      teach a policy to stay off the path: increments of the clean targets alone do not know that it left it.
+    - `joint_increment`: joint target minus that of the previous frame; the first minus the scene's initial joint
+    positions. To execute them, sum them up (`joint_target_from_increment`). If the previous frame's executed command
+    included noise, the increment also removes the part that decays within a frame (`NOISE_DECAY`): it is then the
+    expected motion from the robot's actual state. Otherwise noise would teach a policy to stay off the path, since
+    increments of the clean targets do not reflect the deviation.
     - `ee`: absolute base_from_tcp target, xyz (m) and quaternion xyzw with x >= 0.
-    - `ee_delta`: change of that pose since the frame before, the first since the TCP pose observed at frame 0:
-      translation in base axes (m), then rotation vector in base axes (rad, |r| <= pi), to be applied from the left
-      (`pose_from_delta`); noise is taken back as in `joint_increment`, the rotation vectors being added.
+    - `ee_delta`: change of that pose since the previous frame, the first since the TCP pose observed at frame 0:
+    translation in base axes (m), then rotation vector in base axes (rad, |r| <= pi), applied from the left
+    (`pose_from_delta`); noise is removed as in `joint_increment`, with rotation vectors added.
 
     Args:
-        trajectory: Of the whole episode.
-        scene: Of the episode.
-        kind: Which form.
-        rows: Frames whose actions are wanted; increments are taken between these.
-        dtype: Of the numbers.
+        trajectory: Numbers of the whole episode.
+        scene: Scene of the episode.
+        kind: Kind of action.
+        rows: Frames to return; increments are taken between these.
+        dtype: Type of the numbers.
     """
     gripper = trajectory.action_gripper[rows]
     if kind == "joint":
@@ -304,24 +305,24 @@ def action_vectors(
 
 
 def command_vectors(trajectory: Trajectory, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
-    """(T, D) float64, what the motors were sent: joint targets (rad), gripper opening (m)."""
+    """Compute (T, D) float64 motor commands: joint targets (rad), gripper opening (m)."""
     return _joined([trajectory.command_joint_target[rows], trajectory.command_gripper[rows]], np.float64)
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:
-    """`NOISE_DECAY` for the interval between these frames."""
+    """Compute `NOISE_DECAY` for the interval between these frames."""
     if len(time_ns) < 2:
         return 0.0
     return float(1.0 - (1.0 - NOISE_DECAY) ** (30.0 * 1e-9 * int(time_ns[1] - time_ns[0])))
 
 
 def joint_target_from_increment(previous: Array, action: NDArray[np.floating]) -> Array:
-    """(n_arm,) joint target after one action of kind `joint_increment`; start from the initial joint positions."""
+    """Compute the (n_arm,) joint target after one `joint_increment` action; start from the initial positions."""
     return np.asarray(previous + np.asarray(action, dtype=np.float64)[: len(previous)], dtype=np.float64)
 
 
 def pose_from_delta(previous: Pose, action: NDArray[np.floating]) -> Pose:
-    """base_from_tcp target after one action of kind `ee_delta`; start from the observed TCP pose."""
+    """Compute the base_from_tcp target after one action of kind `ee_delta`; start from the observed TCP pose."""
     delta = np.asarray(action, dtype=np.float64)
     angle = math.sqrt(float(delta[3]) ** 2 + float(delta[4]) ** 2 + float(delta[5]) ** 2)
     scale = math.sin(angle / 2) / angle if angle > 0 else 0.5
@@ -330,9 +331,9 @@ def pose_from_delta(previous: Pose, action: NDArray[np.floating]) -> Pose:
 
 
 def _rotation_vectors(before: Array, after: Array) -> Array:
-    """(T, 3) rotation vector that turns `before` into `after`, applied from the left.
+    """Compute the (T, 3) rotation vector from `before` to `after`, applied from the left.
 
-    Python's scalar functions, since those of NumPy round differently from one CPU to the next.
+    Uses Python's scalar functions, since NumPy's round differently between CPUs.
     """
     vectors = np.empty((len(after), 3))
     for t, (a, b) in enumerate(zip(after, before, strict=True)):
@@ -359,26 +360,26 @@ def _repeat(values: tuple[float, ...], count: int) -> Array:
 
 
 def _velocities(rows: ObservationRows, robot: RobotSpec) -> list[Array]:
-    """Of the arm's joints, and of the gripper's opening."""
+    """Return the velocities of the arm's joints and of the gripper's opening."""
     arm = len(robot.arm_joints)
     opening = robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
     return [rows.joint_velocity[:, :arm], opening]
 
 
 def _continuous(pose: Array) -> Array:
-    """The same poses, quaternions with x >= 0."""
+    """Flip quaternions of poses to x >= 0."""
     sign = np.where(pose[:, 3:4] < 0, -1.0, 1.0)
     return np.concatenate([pose[:, :3], pose[:, 3:] * sign], axis=1)
 
 
 def _compose(a: Array, b: Array) -> Array:
-    """(T, 7) of a @ b; either may have one row."""
+    """Compute (T, 7) a @ b; either may have one row."""
     position = a[:, :3] + _rotate(a[:, 3:], b[:, :3])
     return np.concatenate([position, np.stack(quat_product(a[:, 3:].T, b[:, 3:].T), axis=1)], axis=1)
 
 
 def _rotation(quat: Array) -> Array:
-    """(T, 3, 3) of unit quaternions (T, 4) xyzw."""
+    """Compute (T, 3, 3) rotations of unit quaternions (T, 4) xyzw."""
     return np.stack([np.stack(row, axis=1) for row in rotation_rows(*quat.T)], axis=1)
 
 

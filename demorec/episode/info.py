@@ -29,18 +29,18 @@ NOT_SIMULATED = (
 
 Kept = Literal["", "h264", "h265", "av1", "jpeg", "16UC1", "32FC1"]
 DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
-"""Encoding of distances -> how many of its units a metre has."""
+"""Encoding of distances -> its units per metre."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SensorStream:
-    """The messages of a simulated sensor, one a frame.
+    """Messages of a simulated sensor, one per frame.
 
     Attributes:
         topic: Topic of the messages.
         layout: "wrench" for three forces and three torques (geometry_msgs/WrenchStamped), "array" for any vector
             (std_msgs/Float64MultiArray).
-        frame: Link along whose axes the vectors of a wrench are.
+        frame: Link along the axes of which a wrench's vectors are given.
     """
 
     topic: str
@@ -50,19 +50,20 @@ class SensorStream:
 
 @dataclass(frozen=True, kw_only=True)
 class Feature:
-    """A vector that every frame has.
+    """A vector present in every frame.
 
     Attributes:
-        name: As datasets call it: "observation.state", "action", "observation.force".
+        name: Name in datasets: "observation.state", "action", "observation.force".
         dtype: Type of its numbers, as recorded.
-        names: Of its elements; there are D.
-        units: Of its elements ("rad", "deg", "m"), or none where they are unknown.
-        joints: For each element the joint of the URDF of which it is the position ("" for none); empty where none is.
-            Positions are in rad and m, or in degrees where the unit is "deg", unless there is a calibration.
-        source: Where it came from, in words: "/joint_states position, latest before, header stamps".
-        calibration: For each element a factor and an offset: factor times the value plus offset is rad or m, of servos
+        names: Names of its D elements.
+        units: Units of its elements ("rad", "deg", "m"), or empty if unknown.
+        joints: For each element the URDF joint that it measures ("" for none); empty without joints. Positions are
+            in rad and m, or in degrees if the unit is "deg", unless there is a calibration.
+        source: Its origin, in words: "/joint_states position, latest before, header stamps".
+        calibration: For each element a factor and an offset, for servos with other units: factor times the value plus
+            offset is rad or m; empty if the unit suffices.
             that say something else; empty where the unit says it.
-        role: Role that its name does not say; "" where names in common use do (`demorec.episode.roles`).
+        role: Role that its name does not imply; "" if its common name does (`demorec.episode.roles`).
         stream: Messages of a simulated sensor; None for any other feature.
     """
 
@@ -77,7 +78,7 @@ class Feature:
     stream: SensorStream | None = None
 
     def in_si(self, values: NDArray[Any]) -> Array:
-        """(..., D) float64 of values (..., D): positions in rad and m, other values unchanged."""
+        """Convert values (..., D) to float64 (..., D): positions to rad and m, other values unchanged."""
         degree = (math.radians(1.0), 0.0)
         units = self.units or ("",) * len(self.names)
         scale = self.calibration or [degree if unit in ("deg", "degree") else (1.0, 0.0) for unit in units]
@@ -102,14 +103,14 @@ class Camera:
     Attributes:
         name: Unique; also its topic.
         width, height: Pixels.
-        kept: Codec of images that are encoded already and pass through; "" for pixels, which the recorder encodes. For
-            a depth camera ROS's name for its distances, recorded bit-exact: "16UC1" (whole millimetres, 0 where nothing
-            was measured) or "32FC1" (metres, 0 or not finite where nothing was measured).
-        intrinsics: K row by row, 9 numbers in pixels; None when unknown.
-        distortion: Of the plumb bob model (k1, k2, p1, p2, k3); empty for none.
-        mount: The link of the URDF that carries it, "world" for a fixed camera of a scene; "" when unknown.
-        mount_from_camera: Pose in the frame of that link, OpenCV axes; None when unknown.
-        source: Where its images came from, in words.
+        kept: Codec of passthrough images; "" for pixels, which the recorder encodes. For a depth camera ROS's name of
+            its bit-exact distances: "16UC1" (whole millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or
+            not finite where nothing was measured).
+        intrinsics: K row by row, 9 numbers in pixels; None if unknown.
+        distortion: Plumb bob coefficients (k1, k2, p1, p2, k3); empty for none.
+        mount: The URDF link that carries it, "world" for a fixed camera of a scene; "" if unknown.
+        mount_from_camera: Pose in the frame of that link, OpenCV axes; None if unknown.
+        source: Origin of its images, in words.
     """
 
     name: str
@@ -144,7 +145,7 @@ class Origin:
     """The origin of an external episode.
 
     Attributes:
-        kind: The `Recorder` in a user's program, `demorec import`, or a dataset that is read in place.
+        kind: The `Recorder` in a user's program, `demorec import`, or a dataset that is read directly.
         files: Imported files.
         mapping_digest: Digest of the mapping used by the import.
     """
@@ -159,13 +160,13 @@ class Simulation:
     """The part of a description that only simulated episodes have.
 
     Attributes:
-        root_seed: Of the run.
+        root_seed: Root seed of the run.
         task: Name of the task (or "package.module:Name").
         robot: The arm.
-        scene: The world at the start, cameras with intrinsics and mounts included.
+        scene: Scene at the start, including cameras with intrinsics and mounts.
         physics_hz: Steps per second.
         cpu: Type of the CPU that simulated it (`demorec.core.config.cpu_type`).
-        behaviour: name -> value of everything else that was drawn for this episode (speed, approach height,
+        behaviour: Name -> value of all other random draws of this episode (speed, approach height,
             noise level), for the card and for analysis.
         config: The resolved GenerateConfig as plain JSON data.
         config_digest: SHA-256 of it, 16 hex digits.
@@ -187,18 +188,18 @@ class EpisodeInfo:
     """The description of an episode, recorded as metadata. Holds no clock, host name or path.
 
     Attributes:
-        episode_index: Which episode of the run.
-        attempt: Which attempt at it.
+        episode_index: Index of the episode in the run.
+        attempt: Number of the attempt.
         instruction: The task in words; LeRobot's task text.
         robot_name: Name of the robot.
-        urdf: Its description as text, "" when unknown; that of a simulated robot is in the scene's models.
+        urdf: Its description as text, "" if unknown; that of a simulated robot is in the scene's models.
         fps: Nominal frames per second; the timestamps of the frames are exact.
         features: Vectors that every frame has.
         cameras: None to many.
-        origin: How the episode came here; of a simulated one "" for a generated one, "replay of DIGEST", "render of
-            DIGEST" for a derived one.
+        origin: Origin of the episode; for a simulated one "" if generated, "replay of DIGEST" or "render of DIGEST" if
+            derived.
         versions: package -> version of the packages that wrote it; for a simulated one those that determine the bits
-            (demorec, pybullet, numpy, numba, av), and digests of the user's own modules.
+            (demorec, pybullet, numpy, numba, av), and digests of the user's modules.
         simulation: Scene, seed, task; None for an episode that demorec did not simulate.
     """
 
@@ -221,7 +222,7 @@ class EpisodeInfo:
 
     @property
     def simulated(self) -> Simulation:
-        """The simulation, for code that needs one.
+        """The simulation of the episode, for code that requires one.
 
         Raises:
             RecordingError: demorec did not simulate this episode.

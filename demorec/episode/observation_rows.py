@@ -1,4 +1,4 @@
-"""Numbers of several observations at once, whether they are sensed now or were recorded."""
+"""Numbers of several observations at once, measured now or recorded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class ObservationRows:
     """The numbers of T observations; shapes and units as in `demorec.episode.episode.Observation`.
 
     Attributes:
-        sensed: Feature -> (T, ...), of what datasets have only on request.
+        sensed: Feature -> (T, ...), for features that datasets have only on request.
     """
 
     joint_position: Array  # (T, n_joints)
@@ -30,7 +30,7 @@ class ObservationRows:
 
     @classmethod
     def of_trajectory(cls, trajectory: Trajectory, rows: NDArray[np.intp] | slice = slice(None)) -> ObservationRows:
-        """Those of a recorded episode, or of some of its frames."""
+        """Take the rows of a recorded episode, or of some of its frames."""
         sensed = {
             "effort": trajectory.joint_effort,
             "contact_force": trajectory.contact_force,
@@ -47,7 +47,7 @@ class ObservationRows:
 
     @classmethod
     def of_observation(cls, observation: Observation) -> ObservationRows:
-        """One observation, as T = 1."""
+        """Take one observation, as T = 1."""
         force = np.array(observation.contact_force)
         sensed = {"effort": observation.joint_effort, "contact_force": force, **observation.sensed}
         return cls(

@@ -1,4 +1,4 @@
-"""The interface that every recorded episode has: a recording, and an episode of a LeRobot dataset."""
+"""The interface of every recorded episode: a recording, or an episode of a LeRobot dataset."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from demorec.mcap.video import Rgb, VideoPacket, VideoSettings
 
 Box = tuple[int, str, tuple[float, float, float, float]]
-"""Frame, name, and x, y, width and height in pixels, of a thing in a camera's image."""
+"""Frame, name, and x, y, width and height in pixels, of an object in a camera's image."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -55,19 +55,19 @@ class Episode(Protocol):
 
     @property
     def info(self) -> EpisodeInfo:
-        """The description: instruction, robot, rate, features, cameras, origin."""
+        """Description: instruction, robot, rate, features, cameras, origin."""
 
     @property
     def outcome(self) -> Outcome | None:
-        """How the episode ended; None if a crash cut it off."""
+        """Outcome of the episode; None if a crash cut it off."""
 
     @property
     def time_ns(self) -> NDArray[np.int64]:
-        """(T,) stamps of the frames."""
+        """(T,) timestamps of the frames."""
 
     @property
     def phases(self) -> tuple[str, ...]:
-        """T phases of the motion; empty where none are stated."""
+        """T phases of the motion; empty if unknown."""
 
     @property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
@@ -75,7 +75,7 @@ class Episode(Protocol):
 
     @property
     def cameras(self) -> tuple[str, ...]:
-        """Names of the cameras with images in colour."""
+        """Names of the colour cameras."""
 
     @property
     def depth_cameras(self) -> tuple[str, ...]:
@@ -97,10 +97,10 @@ class Episode(Protocol):
         """Yield the decoded images of a camera in order, (H, W, 3) uint8 RGB."""
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
-        """Yield what some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
+        """Yield the images of a camera at some frames, in increasing order, (H, W, 3) uint8 RGB."""
 
     def video_settings(self, camera: str) -> VideoSettings:
-        """Return how the images of a camera are encoded."""
+        """Return the encoding settings of a camera's images."""
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """Yield the encoded images of a camera in order."""
@@ -109,7 +109,7 @@ class Episode(Protocol):
         """Yield the images of a depth camera in order, (H, W) uint16 millimetres or float32 metres."""
 
     def has_segmentation(self, camera: str) -> bool:
-        """Return whether there are segmentation images of a camera."""
+        """Check whether a camera has segmentation images."""
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Yield the segmentation images of a camera in order, (H, W) int32."""

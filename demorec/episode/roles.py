@@ -1,8 +1,8 @@
 """Roles of an episode's features: which ones are the robot's state, its action, its gripper, and so on.
 
-Roles are found by the names in common use: LeRobot's `observation.state` and `action`; openpi's `state`, `actions`,
+Roles are found by common names: LeRobot's `observation.state` and `action`; openpi's `state`, `actions`,
 `joint_position` and `gripper_position`; AgiBot's `observation.states.*` and `actions.*`; GR00T's `modality.json` and
-`annotation.*`; the HDF5 files of robomimic, ALOHA and Isaac Lab. What the user names overrides them.
+`annotation.*`; the HDF5 files of robomimic, ALOHA and Isaac Lab. Names given by the user override them.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, 
 from demorec.episode.info import EpisodeInfo, Feature
 
 Role = Literal["state", "action", "gripper", "velocity", "pose", "sensor", "command", "label", "camera"]
-"""state, action: what a policy sees and predicts, in one feature or several.
-gripper: a gripper that has a feature of its own.
-velocity: of the state's elements.
-pose: of the hand or of objects.
+"""state, action: input and output of a policy, in one feature or several.
+gripper: a gripper with a separate feature.
+velocity: velocities of the state's elements.
+pose: pose of the hand or of objects.
 sensor: any other observation.
 command: the action in another form, or as it was sent.
-label: what is said about a frame: an annotation, a reward, a task.
+label: information about a frame: an annotation, a reward, a task.
 camera: images."""
 
 ROLES: tuple[Role | None, ...] = (*get_args(Role), None)
-"""The order in which people are shown features."""
+"""Roles in display order."""
 RecordedRole = Literal["", "state", "action", "gripper"]
-"""Role that a recording keeps of a feature; "" where names alone say it."""
+"""Role stored in a recording for a feature; "" if its name implies it."""
 SIMULATED_ROLES = (
     "--state, --action and --gripper are for data that demorec did not simulate; leave them out for its own."
 )
 COUNTERS = frozenset(("timestamp", "frame_index", "episode_index", "index", "task_index"))
-"""Columns that every LeRobot dataset has; they need no role."""
+"""Columns of every LeRobot dataset; they need no role."""
 HDF5_PARTS: Mapping[str, str] = {
     "joint_pos": STATE,
     "gripper_qpos": STATE,
@@ -52,7 +52,7 @@ HDF5_PARTS: Mapping[str, str] = {
     "qpos": STATE,
     "qvel": VELOCITY,
 }
-"""Ending of an observation's name in HDF5 files of robomimic, Isaac Lab and ALOHA -> the feature it is a part of."""
+"""Suffix of an observation's name in HDF5 files of robomimic, Isaac Lab and ALOHA -> the feature it is a part of."""
 
 _SEPARATOR = re.compile(r"[./_]+")
 _OBSERVATION = frozenset(("observation", "observations", "obs"))
@@ -69,16 +69,16 @@ _KINDS: tuple[tuple[Role, frozenset[str]], ...] = (
     ("pose", _WORLD | {"pose", "poses", "ee", "eef", "tcp", "end", "endpose", "cartesian", "orientation"}),
     ("gripper", frozenset(("gripper", "grippers", "finger", "fingers", "effector"))),
 )
-"""Role -> words in a name that say it, the first that fits; an end_effector is no effector."""
+"""Role -> words in a name that imply it, first match wins; an end_effector is not an effector."""
 _MAX_LISTED = 20
 _QUANTITIES = frozenset(("position", "positions", "pos", "velocity", "velocities", "vel"))
-"""Words that say what is measured, not of what."""
+"""Words for the measured quantity, not for the measured part."""
 _JOINTS = re.compile(r"(^|_)(joints?(_(pos|positions?|angles?))?|qpos|proprio)$")
-"""How the name of joint positions ends where no feature is called the state."""
+"""Suffix of joint positions' names, used if no feature is named as the state."""
 
 
 class Column(NamedTuple):
-    """A feature as its role is found.
+    """A feature, as input to the search for roles.
 
     Attributes:
         dtype: Its type: "float32", "int64", "string", "video", ...
@@ -101,7 +101,7 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class NamedRoles:
-    """Features whose role the user names."""
+    """Features with a role named by the user."""
 
     state: tuple[str, ...] = ()
     """Feature that is the robot's state (auto: by its name); several are joined in this order."""
@@ -115,15 +115,15 @@ class NamedRoles:
 
 
 NO_NAMES = NamedRoles()
-"""Where the user says nothing."""
+"""No roles named by the user."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Modality:
-    """What GR00T's `modality.json` says of a dataset.
+    """Content of GR00T's `modality.json`.
 
     Attributes:
-        state, action: Features that they are made of, in order.
+        state, action: Features that they consist of, in order.
         labels: Features that are annotations.
         elements: Feature -> names of its elements after their groups: "left_arm.0", "gripper".
     """
@@ -139,10 +139,10 @@ class Roles:
     """The role of each feature of an episode or a dataset.
 
     Attributes:
-        of: Feature -> its role, None where it has none; without `COUNTERS`.
+        of: Feature -> its role, None if it has none; without `COUNTERS`.
         columns: Feature -> its type and elements.
-        state, action: Features whose elements make them, one behind the other.
-        named: What the user said.
+        state, action: Features that they consist of, concatenated.
+        named: Roles named by the user.
     """
 
     of: Mapping[str, Role | None]
@@ -157,31 +157,31 @@ class Roles:
         return tuple(name for name, role in self.of.items() if role is None)
 
     def having(self, *roles: Role) -> tuple[str, ...]:
-        """Features of some roles."""
+        """List the features with any of some roles."""
         return tuple(name for name, role in self.of.items() if role in roles)
 
     def elements(self, parts: Sequence[str], *, qualified: bool = False) -> tuple[str, ...]:
-        """Names of the elements of joined features.
+        """List the names of the elements of concatenated features.
 
         Args:
             parts: The features.
-            qualified: Call an element "joint.0" after its feature even where there is one feature.
+            qualified: Whether an element is named "joint.0" after its feature even if there is only one feature.
         """
         if len(parts) == 1 and not (qualified and _head(parts[0])[1]):
             return self.columns[parts[0]].elements
         return tuple(name for part in parts for name in _qualified(part, self.columns[part]))
 
     def in_state(self, parts: Sequence[str]) -> list[int | None]:
-        """For each element of the state the place of the same one in other features; None where there is none."""
+        """Find for each element of the state the index of the matching one in other features; None if missing."""
         others = self.elements(parts, qualified=len(self.state) > 1)
         return matching_elements(self.elements(self.state), others)
 
     def usual_name(self, name: str) -> str:
-        """The name in common use of a feature: `observation.state` of the whole state, `action` of the whole action."""
+        """Return a feature's common name: `observation.state` for the whole state, `action` for the whole action."""
         return {self.state: STATE, self.action: ACTION}.get((name,), name)
 
     def grippers(self) -> NDArray[np.bool_]:
-        """(D,) which elements of the state are grippers."""
+        """Find (D,) which elements of the state are grippers."""
         owners = [part for part in self.state for _ in self.columns[part].elements]
         elements = zip(owners, self.elements(self.state), strict=True)
         chosen = self.named.gripper
@@ -190,7 +190,7 @@ class Roles:
         return np.array([self.of[part] == "gripper" or is_gripper(name) for part, name in elements], dtype=np.bool_)
 
     def beyond_names(self) -> dict[str, RecordedRole]:
-        """Features whose role is not found by names alone, for a recording to keep."""
+        """Find features with a role that names alone do not imply, for a recording to store."""
         usual = find_roles(self.columns, NO_NAMES)
         grippers = [name for name in self.having("gripper") if usual.of[name] != "gripper"]
         found: dict[str, RecordedRole] = dict.fromkeys(grippers, "gripper")
@@ -201,7 +201,7 @@ class Roles:
         return found
 
     def notes(self) -> Iterator[str]:
-        """Sentences about what has no role."""
+        """Yield sentences about missing roles."""
         if missing := [word for word, parts in (("state", self.state), ("action", self.action)) if not parts]:
             flags = ", ".join(f"--{word} FEATURE" for word in missing)
             yield f"No {' and no '.join(missing)} found, so nothing was judged by it; name it: {flags}."
@@ -210,10 +210,10 @@ class Roles:
 
 
 def roles_of_recording(info: EpisodeInfo, named: NamedRoles) -> Roles:
-    """The roles of a recording's features.
+    """Find the roles of a recording's features.
 
     Raises:
-        ConfigError: As `find_roles`, or the user names features of a simulated recording.
+        ConfigError: As `find_roles`, or the user named features of a simulated recording.
     """
     if named and info.simulation is not None:
         raise ConfigError(SIMULATED_ROLES)
@@ -221,7 +221,7 @@ def roles_of_recording(info: EpisodeInfo, named: NamedRoles) -> Roles:
 
 
 def roles_of_features(features: Iterable[Feature], named: NamedRoles) -> Roles:
-    """The roles of features as recordings describe them; errors as `find_roles`."""
+    """Find the roles of recorded features; raises as `find_roles`."""
     features = tuple(features)
     taken = {*named.state, *named.action, *named.gripper}
     free = [feature for feature in features if feature.name not in taken]
@@ -237,11 +237,12 @@ def find_roles(columns: Mapping[str, Column], named: NamedRoles, modality: Modal
 
     Args:
         columns: Feature -> its type and elements, in their order.
-        named: What the user says; it counts most.
-        modality: What `modality.json` says; it counts more than names.
+        named: The user's roles; they take precedence.
+        modality: Roles of `modality.json`; they precede names.
 
     Raises:
-        ConfigError: The user names what is not there, or is no vector of numbers, or one feature for two roles.
+        ConfigError: The user named a missing feature, one that is not a vector of numbers, or one feature for two
+            roles.
     """
     modality = modality or Modality()
     columns = {
@@ -275,10 +276,10 @@ def find_roles(columns: Mapping[str, Column], named: NamedRoles, modality: Modal
 
 
 def matching_elements(names: Sequence[str], others: Sequence[str]) -> list[int | None]:
-    """For each element the place of the same one among others; None where there is none.
+    """Find for each element the index of the same one among others; None if missing.
 
-    They match by name, whatever it says of position or velocity. Where one side has numbers instead of names, they
-    match by place if there are as many.
+    They match by name, ignoring words for position or velocity. If one side has numbers instead of names, they match by
+    index if the counts are equal.
     """
     if is_numbered(names) or is_numbered(others) or list(names) == list(others):
         return list(range(len(names))) if len(names) == len(others) else [None] * len(names)
@@ -287,7 +288,7 @@ def matching_elements(names: Sequence[str], others: Sequence[str]) -> list[int |
 
 
 def _qualified(part: str, column: Column) -> tuple[str, ...]:
-    """Names of a part's elements among those of others, by what its name says beyond state or action."""
+    """Qualify the names of a part's elements by the words of its name beyond state or action."""
     _, words = _head(part)
     stem = ".".join(word for word in words if word not in _QUANTITIES) or part
     if len(column.elements) == 1 and not column.is_named:
@@ -300,13 +301,13 @@ def _words(name: str) -> list[str]:
 
 
 def _head(name: str) -> tuple[str, list[str]]:
-    """("state", "action", "observation" or "", the other words) of a feature's name."""
+    """Split a feature's name into ("state", "action", "observation" or "", the other words)."""
     words = _words(name)
     is_observed = len(words) > 1 and words[0] in _OBSERVATION
     words = words[1:] if is_observed else words
     for head, known in (("state", _STATE), ("action", _ACTION)):
         if head == "action" and is_observed:
-            continue  # the action before
+            continue  # the previous action
         if words and words[0] in known:
             return head, words[1:]
         if words and words[-1] in known:
@@ -315,13 +316,13 @@ def _head(name: str) -> tuple[str, list[str]]:
 
 
 def _kind(words: Iterable[str]) -> Role | None:
-    """What the words of a name say, None where they say nothing known."""
+    """Determine the role implied by the words of a name; None if none is known."""
     there = set(words)
     return next((role for role, known in _KINDS if there & known), None)
 
 
 def _role_by_name(name: str, column: Column) -> Role | None:
-    """The role of a feature as far as its own name and type say it; a state or an action may still be found."""
+    """Determine a feature's role by its own name and type; a state or an action may still be found."""
     head, words = _head(name)
     first = (_words(name) or [""])[0]
     if column.dtype in ("video", "image"):
@@ -338,7 +339,8 @@ def _role_by_name(name: str, column: Column) -> Role | None:
 
 
 def _state_parts(free: Sequence[str]) -> tuple[str, ...]:
-    """The state: a feature of this name, else all parts of one that are joints or grippers, else joints, else poses."""
+    """Find the state: a feature of this name, else all parts of one that are joints or grippers, else joints, else
+    poses."""
     heads = {name: _head(name) for name in free}
     whole = [name for name, (head, words) in heads.items() if head == "state" and words in ([], ["robot"])]
     if whole:
@@ -355,7 +357,7 @@ def _state_parts(free: Sequence[str]) -> tuple[str, ...]:
 
 
 def _action_parts(free: Sequence[str]) -> tuple[str, ...]:
-    """The action: a feature of this name, else all parts of one that are joints or grippers, else poses."""
+    """Find the action: a feature of this name, else all parts of one that are joints or grippers, else poses."""
     heads = {name: _head(name) for name in free}
     own = {name: words for name, (head, words) in heads.items() if head == "action"}
     whole = [name for name, words in own.items() if not words]
@@ -366,17 +368,17 @@ def _action_parts(free: Sequence[str]) -> tuple[str, ...]:
 
 
 def _check_named(columns: Mapping[str, Column], wanted: Mapping[str, Sequence[str]]) -> None:
-    """Raise ConfigError for features that cannot have the role that the user names."""
+    """Raise ConfigError for features that cannot have the role named by the user."""
     seen: dict[str, str] = {}
     for flag, names in wanted.items():
         for name in names:
             if name not in columns:
                 raise _nothing_called(flag, name, columns)
             if not columns[name].is_vector:
-                raise ConfigError(f"--{flag} names {name!r}, which is {columns[name].dtype} and no vector of numbers.")
+                raise ConfigError(f"--{flag} names {name!r}, which is {columns[name].dtype}, not a vector of numbers.")
             if name in seen:
                 raise ConfigError(
-                    f"--{flag} names {name!r}, which --{seen[name]} names already: one feature, one role."
+                    f"--{flag} names {name!r}, which --{seen[name]} already names: give each feature one role."
                 )
             seen[name] = flag
 
@@ -386,4 +388,4 @@ def _nothing_called(flag: str, name: str, columns: Mapping[str, Column], element
     vectors = [each for each, column in columns.items() if column.is_vector]
     there = listed([*vectors, *elements], _MAX_LISTED, ", ") or "none"
     near = nearest_match(name, [*columns, *elements])
-    return ConfigError(f"--{flag}: there is no {what} {name!r}.{near} Vectors of numbers are: {there}.")
+    return ConfigError(f"--{flag}: unknown {what} {name!r}.{near} Vectors of numbers are: {there}.")

@@ -1,8 +1,8 @@
-"""What a world is made of, as plain data: enough to rebuild it years later without the task's code.
+"""Content of a world as plain data: enough to rebuild it years later without the task's code.
 
 A task samples a `Scene`; the simulator builds it; every recording contains it. Replay and re-render start from
 the recorded scene, so they need neither the task nor its random numbers.
-Frames: `world` has z up, the robot's base stands where `RobotPlacement` says. SI units throughout.
+Frames: `world` has z up, the robot's base is at the pose of `RobotPlacement`. SI units throughout.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ class Shape:
     """The geometry of a body, in its own frame (origin at the centre of mass, unless the URDF says otherwise).
 
     Attributes:
-        kind: Which geometry; decides what `size` means.
+        kind: Geometry; decides the meaning of `size`.
         size: box: (x, y, z) full extents; sphere: (radius,); cylinder and capsule: (radius, length) along z;
             mesh and urdf: (x, y, z) extents of the bounding box after scaling, for features and grasping.
-        file: mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`,
-            or "module:PATH" for one beside a module of the user's own (a task may give it relative to its module).
+        file: mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`, or
+            "module:PATH" for one next to a user's module (a task may give it relative to its module).
         scale: mesh and urdf: uniform scale of the file.
         origin: mesh: the point of the file, in its own axes before scaling, that becomes the body's origin.
         y_up: mesh: whether the file's y axis points up (its x axis stays x).
-        mesh: mesh: the solid itself instead of a file, as `demorec.episode.mesh` writes it, with origin and scale.
+        mesh: mesh: the solid itself instead of a file, as encoded by `demorec.episode.mesh`, with origin and scale.
     """
 
     kind: ShapeKind
@@ -48,7 +48,7 @@ class Shape:
 
     @property
     def body_from_mesh(self) -> Pose:
-        """mesh: pose of the scaled file's axes in the body's frame."""
+        """Pose of a mesh file's scaled axes in the body's frame."""
         half = math.sqrt(0.5)
         turn = Pose(quat_xyzw=np.array([half, 0.0, 0.0, half])) if self.y_up else Pose()
         return Pose(position=-turn.apply(self.scale * np.array(self.origin)), quat_xyzw=turn.quat_xyzw)
@@ -70,13 +70,13 @@ Pattern = Literal["plain", "checker", "stripes", "noise", "wood"]
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """A procedural texture, a pure function of its fields: nothing is downloaded.
+    """A procedural texture, a pure function of its fields, without external files.
 
     Attributes:
-        pattern: Which pattern.
-        colors: The two colours (r, g, b in 0..1) between which it runs.
+        pattern: Kind of pattern.
+        colors: The two colours (r, g, b in 0..1) that it blends.
         scale: Repetitions over the texture's side.
-        seed: Of the pattern's noise.
+        seed: Seed of the pattern's noise.
     """
 
     pattern: Pattern
@@ -87,22 +87,24 @@ class Texture:
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """One body beside the robot.
+    """One body other than the robot.
 
     Attributes:
         name: Unique in the scene; also its topic and coordinate frame.
-        role: object: to be manipulated; target: where to; support, fixture: stand still; distractor: in the way.
+        role: object: to be manipulated; target: its destination; support, fixture: fixed; distractor: irrelevant to the
+            task.
         shape: Geometry.
         world_from_body: Pose at the start.
-        mass: kg; 0 stands still for ever.
+        mass: kg; 0 for a fixed body.
         lateral_friction, spinning_friction, rolling_friction: Coulomb coefficients, as PyBullet's changeDynamics.
         restitution: 0 (no bounce) .. 1.
         linear_damping, angular_damping: 1/s.
-        rgba: Colour; (1, 1, 1, 1) leaves a URDF's or mesh file's own.
-        color_name: The word for it in instructions, or "".
-        texture: Procedural texture, by which the colour is multiplied, or None.
-        collides: False for a mark that is only seen.
-        yaw_symmetry: n when it looks the same every 2 pi / n about its vertical axis; 0 when at every angle.
+        rgba: Colour; (1, 1, 1, 1) keeps the colours of a URDF or mesh file.
+        color_name: Its word in instructions, or "".
+        texture: Procedural texture, multiplied by the colour, or None.
+        collides: False for a visual-only mark.
+        yaw_symmetry: n if its appearance repeats every 2 pi / n about its vertical axis; 0 if it is the same at every
+            angle.
     """
 
     name: str
@@ -129,7 +131,7 @@ class Body:
 
     @property
     def mean_color(self) -> Rgba:
-        """`rgba`, times the mean of the texture's two colours."""
+        """`rgba` multiplied by the mean of the texture's two colours."""
         if self.texture is None:
             return self.rgba
         first, second = self.texture.colors
@@ -139,15 +141,15 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
-    """Where one object shall end: the plain-data part of a task's aim, for features, cards and checks.
+    """Target of one object: the plain-data part of a task's aim, for features, cards and checks.
 
     Attributes:
-        object: Name of the body to be placed.
-        onto: Name of the body that it is placed onto or into, or "" for a place in the world.
-        onto_from_goal: Wanted pose of the object in that body's frame (in the world for "").
-        yaw_symmetry: As `Body.yaw_symmetry`, for the wanted yaw; 0 when any yaw will do.
-        area: Least x and y, greatest x and y in that body's frame, metres: the object's origin may be anywhere in it,
-            as in a tray; None where it shall be at the wanted pose.
+        object: Name of the object.
+        onto: Name of the body that it is placed on or in, or "" for a goal in the world.
+        onto_from_goal: Target pose of the object in that body's frame (in the world for "").
+        yaw_symmetry: As `Body.yaw_symmetry`, for the target yaw; 0 if any yaw is acceptable.
+        area: Minimum x and y, maximum x and y in that body's frame, metres: the object's origin may be anywhere in it,
+            as in a tray; None if it must be at the target pose.
     """
 
     object: str
@@ -157,7 +159,7 @@ class Goal:
     area: tuple[float, float, float, float] | None = None
 
     def distance(self, world_from_onto: Pose, world_from_object: Pose) -> float:
-        """From the object to where it shall end, seen from above, metres; the world stands for no `onto`."""
+        """Compute the horizontal distance of the object to its target, metres; the world replaces a missing `onto`."""
         if self.area is None:
             wanted = world_from_onto @ self.onto_from_goal
             return math.dist(world_from_object.position[:2], wanted.position[:2])
@@ -168,7 +170,7 @@ class Goal:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotPlacement:
-    """Which robot stands where, and how it starts.
+    """Robot, its placement and its initial state.
 
     Attributes:
         name: Row of the robots' table.
@@ -186,7 +188,7 @@ class RobotPlacement:
 
 
 POSITION_GAIN = 0.2
-"""Of the arm joints' position control: the share of the error that is gone after a physics step."""
+"""Gain of the arm joints' position control: the ratio of the error that a physics step removes."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -194,16 +196,16 @@ class Physics:
     """Engine parameters, all set at every reset (PyBullet leaks some into later clients).
 
     Attributes:
-        hz: Steps a second.
-        solver_iterations: Of each step, at most.
-        grip_iterations: The same of steps while a finger touches something; 0 for as many as of the others.
+        hz: Steps per second.
+        solver_iterations: Maximum iterations of each step.
+        grip_iterations: The same while a finger touches an object; 0 for the same number.
         gravity: m/s^2.
-        contact_breaking_threshold: How far two bodies may move along each other until Bullet forgets a contact point
-            that it found before, as a share of the smaller one's radius. With Bullet's 0.02 a small, light, slippery
-            cube can rock between fingers that touch it in one point each, and they sink into it (docs/simulation.md).
-        finger_stiffness: Of the contact of a finger, N/m: a finger that pushes with a force at one point is as deep in
-            what it holds as the force divided by it. With PyBullet's 30,000 and 20 N that is 0.7 mm, and more than a
-            millimetre when the object meets the table (docs/simulation.md).
+        contact_breaking_threshold: Relative motion of two bodies after which Bullet drops a contact point, as a ratio
+            of the smaller one's radius. With Bullet's 0.02 a small, light, slippery cube can rock between fingers that
+            touch it in one point each, and they penetrate it (docs/simulation.md).
+        finger_stiffness: Contact stiffness of a finger, N/m: a finger that pushes at one point penetrates the object by
+            the force divided by it. With PyBullet's 30,000 and 20 N that is 0.7 mm, and over a millimetre when the
+            object meets the table (docs/simulation.md).
     """
 
     hz: int = 240
@@ -220,10 +222,10 @@ class Light:
 
     Attributes:
         direction: From the scene towards the light, world frame; need not be of unit length.
-        color: Of the light, r, g, b in 0..1.
+        color: Colour of the light, r, g, b in 0..1.
         ambient, diffuse, specular: Coefficients of the Phong terms.
-        shadow: How much of the direct light a shadow takes away, 0 (no shadows) .. 1.
-        sky_color: Of the background, r, g, b in 0..1.
+        shadow: Ratio of the direct light removed in a shadow, 0 (no shadows) .. 1.
+        sky_color: Colour of the background, r, g, b in 0..1.
     """
 
     direction: Vector3 = (0.5, -0.4, 1.0)
@@ -259,7 +261,7 @@ class SceneCamera:
 
     @property
     def intrinsics(self) -> Array:
-        """(3, 3) K, pixels."""
+        """Intrinsic matrix K (3, 3), pixels."""
         return intrinsic_matrix(width=self.width, height=self.height, fov_y=self.fov_y)
 
 
@@ -269,12 +271,12 @@ class Scene:
 
     Attributes:
         robot: The robot.
-        bodies: In loading order, which is part of the physics' determinism.
-        goals: What shall be where at the end, in the order of execution.
+        bodies: Bodies in loading order, which is part of the physics' determinism.
+        goals: Final placements, in the order of execution.
         physics, light: Parameters.
         cameras: All cameras, in order; empty without images.
-        hold: How the hand holds things: by friction alone, or by a rigid constraint from the moment when both
-            fingers press on something until the gripper is told to open (a shortcut of many tutorials).
+        hold: How the hand holds objects: by friction alone, or by a rigid constraint from the moment both fingers press
+            on one until the gripper opens (a shortcut of many tutorials).
     """
 
     robot: RobotPlacement
@@ -286,31 +288,31 @@ class Scene:
     hold: Literal["friction", "constraint"] = "friction"
 
     def body(self, name: str) -> Body:
-        """The body called `name`; KeyError when there is none."""
+        """Return the body called `name`; KeyError if it does not exist."""
         for body in self.bodies:
             if body.name == name:
                 return body
         raise KeyError(name)
 
     def world_from_goal(self, goal: Goal) -> Pose:
-        """Where the goal's object shall end, as things stand at the start."""
+        """Compute the target pose of the goal's object, with bodies at their initial poses."""
         return self.body(goal.onto).world_from_body @ goal.onto_from_goal if goal.onto else goal.onto_from_goal
 
     @property
     def fixed(self) -> tuple[Body, ...]:
-        """The bodies that stand still; worlds load and number them first, then the robot, then what is movable."""
+        """The fixed bodies; worlds load and number them first, then the robot, then the movable ones."""
         return tuple(body for body in self.bodies if not body.movable)
 
     @property
     def movable(self) -> tuple[Body, ...]:
-        """The bodies whose poses are recorded at every frame."""
+        """The bodies with poses recorded at every frame."""
         return tuple(body for body in self.bodies if body.movable)
 
 
 def yaw_of(pose: Pose) -> float:
-    """Rotation about the vertical, rad, of the body axis that is nearest to horizontal.
+    """Compute the rotation about the vertical, rad, of the body axis nearest to horizontal.
 
-    A cube that rests on any of its faces gives a meaningful value: the axis nearest to vertical is left out.
+    This is meaningful for a cube on any of its faces: the axis nearest to vertical is excluded.
     """
     rotation = pose.rotation
     vertical = int(np.argmax(np.abs(rotation[2])))

@@ -1,4 +1,4 @@
-"""The description and the table of an episode that demorec simulated, in the form that every episode has."""
+"""Description and table of a simulated episode, in the form of all episodes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def simulated_cameras(scene: Scene) -> tuple[Camera, ...]:
 
 
 def simulated_features(simulation: Simulation, sensors: Sequence[Feature]) -> tuple[Feature, ...]:
-    """Describe the vectors of a simulated episode; `simulated_table` gives their values."""
+    """Describe the vectors of a simulated episode; `simulated_table` returns their values."""
     robot, arm = simulation.robot, simulation.robot.arm_joints
     names = observation_names(robot, simulation.scene)
     target_names = action_names(robot, "joint")
@@ -114,7 +114,7 @@ def simulated_features(simulation: Simulation, sensors: Sequence[Feature]) -> tu
 
 
 def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
-    """Convert a trajectory to the features of its description, in float64; each frame shows the image of its number."""
+    """Convert a trajectory to its described features, in float64; each frame has the image of its number."""
     robot, scene = info.simulated.robot, info.simulated.scene
     rows = ObservationRows.of_trajectory(trajectory)
     vectors = {
@@ -134,7 +134,7 @@ def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
 
 
 def on_request(info: EpisodeInfo) -> tuple[Feature, ...]:
-    """Return the observations that datasets and environments have only when they are asked for by name."""
+    """Return the observations that datasets and environments include only on request."""
     return tuple(feature for feature in info.features if feature.name in (EFFORT, CONTACT_FORCE) or feature.stream)
 
 
@@ -148,7 +148,7 @@ def description_of(info: EpisodeInfo) -> dict[str, Any]:
 
 
 def simulation_facts(info: EpisodeInfo) -> Mapping[str, Any]:
-    """Return what people ask about a simulation, as plain data; empty for any other episode.
+    """Return the facts that users ask about a simulation, as plain data; empty for any other episode.
 
     Keys: task, root_seed, physics_hz, objects (names of the movable bodies), config_digest.
     """
@@ -165,12 +165,12 @@ def simulation_facts(info: EpisodeInfo) -> Mapping[str, Any]:
 
 
 def scene_of(info: EpisodeInfo) -> Scene | None:
-    """Return the world at the start of the episode; None where it is not known."""
+    """Return the scene at the start of the episode; None if unknown."""
     return None if info.simulation is None else info.simulation.scene
 
 
 def has_failed(info: EpisodeInfo, outcome: Outcome | None) -> bool:
-    """Whether an episode failed: its outcome says so, or a crash cut off a simulation, which always has one."""
+    """Check whether an episode failed, by its outcome or because a crash cut off a simulation without one."""
     if outcome is None:
         return info.simulation is not None
     return outcome.success is False

@@ -1,8 +1,7 @@
-"""Whether the description of an episode, read from a file or just made, can be worked with at all.
+"""Validity of an episode's description, read from a file or just made.
 
-Types are right when `demorec.core.plain` has read it; here is what else the rest of the program takes for granted:
-sizes that are positive, names that are unique, references that lead somewhere. Whether the numbers are *plausible* is
-what `demorec check` judges.
+`demorec.core.plain` has already checked types; this module checks further assumptions of the program: positive sizes,
+unique names, valid references. `demorec check` judges whether the numbers are *plausible*.
 """
 
 from __future__ import annotations
@@ -24,25 +23,25 @@ from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
 
 _MOST = {"bodies": 255, "goals": 255, "cameras": 64, "arm joints": 64, "gripper joints": 64}
-"""Segmentation images tell 255 bodies apart; the others are far beyond any scene that was ever made."""
+"""Maximum counts. Segmentation images distinguish 255 bodies; the others are far beyond any known scene."""
 _SIZE_LENGTH = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3, "urdf": 3}
 _MAX_METRES = 1e4
 _MAX_LISTED = 5
 
 
 def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
-    """The description of an episode from its JSON.
+    """Parse the description of an episode from its JSON.
 
     Args:
-        text: What to read.
-        simulated: Whether only that of a simulated episode will do.
+        text: JSON text.
+        simulated: Whether only a simulated episode is accepted.
 
     Raises:
-        ValueError: One line that says what is wrong with it.
+        ValueError: One line with the reason.
     """
     info = from_json(text, EpisodeInfo)
     if simulated and info.simulation is None:
-        raise ValueError("it describes no simulated episode")
+        raise ValueError("it does not describe a simulated episode")
     wrong = find_problems(info)
     if wrong:
         raise ValueError("; ".join(wrong[:_MAX_LISTED]))
@@ -60,11 +59,11 @@ def _episode(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
     yield from _scene(scene)
     placed = len(scene.robot.joint_position)
     if placed != len(robot.arm_joints):
-        yield f"the robot has {len(robot.arm_joints)} arm joints, the scene places {placed}"
+        yield f"the robot has {len(robot.arm_joints)} arm joints, but the scene places {placed}"
 
 
 def _contradictions(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
-    """What the description of a possible simulation says twice, and differently."""
+    """Yield contradictions within the description of a valid simulation."""
     if info.robot_name != simulation.robot.name:
         yield f"the robot is {info.robot_name!r} and {simulation.robot.name!r}"
     known = simulated_features(simulation, list(info.sensors.values()))
@@ -117,9 +116,9 @@ def _scene(scene: Scene) -> Iterator[str]:
             if not (least_x <= most_x and least_y <= most_y and max(map(abs, goal.area)) <= _MAX_METRES):
                 yield f"the area of a goal is from ({least_x}, {least_y}) to ({most_x}, {most_y})"
         if goal.object not in movable:
-            yield f"a goal is for {goal.object!r}, which is no movable body of the scene"
+            yield f"a goal is for {goal.object!r}, which is not a movable body of the scene"
         if goal.onto and goal.onto not in known:
-            yield f"a goal is on {goal.onto!r}, which is no body of the scene"
+            yield f"a goal is on {goal.onto!r}, which is not a body of the scene"
 
 
 def _body(body: Body) -> Iterator[str]:
@@ -170,8 +169,8 @@ def _pixels(what: str, camera: Camera | SceneCamera) -> Iterator[str]:
 def _pose(what: str, pose: Pose) -> Iterator[str]:
     if float(abs(pose.position).max()) > _MAX_METRES:
         yield f"the position of {what} is far away"
-    if not 0.5 < math.hypot(*pose.quat_xyzw.tolist()) < 2.0:  # how exact it is, `demorec check` judges
-        yield f"the rotation of {what} is none"
+    if not 0.5 < math.hypot(*pose.quat_xyzw.tolist()) < 2.0:  # `demorec check` judges the precision
+        yield f"the rotation of {what} is invalid"
 
 
 def _positive(what: str, value: float) -> Iterator[str]:
@@ -201,9 +200,9 @@ _FEATURE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*")
 _TOPIC = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*)+")
 _CAMERA = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
 _RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera", "language")
-"""First words of topics that are no feature's."""
+"""Reserved first words of topics."""
 _DATASET = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task", "next", "observation.images")
-"""What datasets call their own columns."""
+"""Column names of datasets."""
 _MAX_ELEMENTS = 4096
 MAX_FEATURES = 256
 MAX_CAMERAS = 64
@@ -211,7 +210,7 @@ _MAX_TEXT = 10_000
 
 
 def find_problems(info: EpisodeInfo) -> list[str]:
-    """Everything that makes a description impossible, in words; empty when nothing does."""
+    """List all problems that make a description invalid, in words; empty if it is valid."""
     if info.simulation is None:
         return list(_external(info))
     return list(_episode(info, info.simulation)) or list(_contradictions(info, info.simulation))
@@ -224,7 +223,7 @@ def _external(info: EpisodeInfo) -> Iterator[str]:
         yield "the task text is empty"
     for what, text in (("task text", info.instruction), ("name of the robot", info.robot_name)):
         if len(text) > _MAX_TEXT or not text.isprintable():
-            yield f"the {what} is no single line of at most {_MAX_TEXT} characters"
+            yield f"the {what} is not a single line of at most {_MAX_TEXT} characters"
     if not 1 <= len(info.features) <= MAX_FEATURES or len(info.cameras) > MAX_CAMERAS:
         yield (
             f"there are {len(info.features)} features and {len(info.cameras)} cameras, allowed are 1 to {MAX_FEATURES}"
@@ -264,7 +263,7 @@ def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
             yield f"the feature {name!r} has {count} elements, but {len(words)} {what}"
     named = list(filter(None, feature.joints))
     if unknown := [joint for joint in named if joints and joint not in joints]:
-        yield f"the feature {name!r} has joints that the URDF does not have: {', '.join(unknown)}"
+        yield f"the feature {name!r} has joints that the URDF lacks: {', '.join(unknown)}"
     yield from _unique(f"joints of the feature {name!r}", named, commas=False)
 
 
@@ -284,6 +283,6 @@ def _external_camera(camera: Camera, links: frozenset[str]) -> Iterator[str]:
         yield f"a camera is called {camera.name!r}, allowed are letters, digits and _, beginning with a letter"
     yield from _pixels(what, camera)
     if camera.intrinsics is not None and len(camera.intrinsics) != 9:
-        yield f"{what} has {len(camera.intrinsics)} intrinsics, K has 9"
+        yield f"{what} has {len(camera.intrinsics)} intrinsics, but K has 9"
     if links and camera.mount and camera.mount not in links:
-        yield f"{what} is mounted on {camera.mount!r}, which is no link of the URDF"
+        yield f"{what} is mounted on {camera.mount!r}, which is not a link of the URDF"

@@ -1,8 +1,8 @@
-"""How much episodes differ: presets, and every range in one place.
+"""Variation of episodes: presets, and all ranges in one place.
 
-A field that is None takes the preset's range. Ranges are drawn from evenly; a single number is the size of a
-symmetric spread, or a probability. What is drawn is recorded: in the scene where it is part of the scene, otherwise
-in `EpisodeInfo.behaviour`.
+A field that is None takes the preset's range. Ranges are sampled uniformly; a single number is the size of a symmetric
+spread, or a probability. Sampled values are recorded: in the scene if they are part of it, otherwise in
+`EpisodeInfo.behaviour`.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ _Value = Range | float | None
 
 
 def _within(low: float, high: float, *, none: _Value = None, mild: _Value = None, full: _Value = None) -> Any:
-    """A field of `Ranges`.
+    """Define a field of `Ranges`.
 
     Args:
-        low, high: What a user may ask for.
-        none, mild, full: What it is in the preset of that name; left out: as in the one before, and in "none" it is
-            left to the task.
+        low, high: Limits for the user.
+        none, mild, full: Default in the preset of that name; if missing, as in the previous one, and in "none" decided
+            by the task.
     """
     mild = none if mild is None else mild
     presets = {"none": none, "mild": mild, "full": mild if full is None else full}
@@ -36,7 +36,7 @@ def _within(low: float, high: float, *, none: _Value = None, mild: _Value = None
 
 @dataclass(frozen=True, kw_only=True)
 class Ranges:
-    """Ranges of everything that varies from episode to episode; left out: as the preset says."""
+    """Ranges of everything that varies from episode to episode; None: the preset's range."""
 
     cube_side: Range | None = _within(0.02, 0.065)
     """Side of cubes, m (auto: each task's own range)."""
@@ -49,7 +49,7 @@ class Ranges:
     held_out_y: Range | None = _within(-1.0, 1.0, none=(0.05, 0.15))
     """y of that rectangle, m."""
     joint_spread: float | None = _within(0.0, 0.3, none=0.0, mild=0.05, full=0.1)
-    """The arm starts within this of its home configuration, rad per joint."""
+    """Maximum deviation of the arm's start from its home configuration, rad per joint."""
     mass_factor: Range | None = _within(0.1, 5.0, none=(1.0, 1.0), full=(0.8, 1.25))
     """Factor on the mass of movable bodies."""
     friction_factor: Range | None = _within(0.1, 5.0, none=(1.0, 1.0), full=(0.85, 1.2))
@@ -57,18 +57,18 @@ class Ranges:
     damping: Range | None = _within(0.0, 5.0, none=(0.04, 0.04), full=(0.0, 0.1))
     """Linear and angular damping of movable bodies, 1/s."""
     gravity_offset: Range | None = _within(-5.0, 5.0, none=(0.0, 0.0), full=(-0.15, 0.15))
-    """Added to gravity, m/s^2."""
+    """Offset added to gravity, m/s^2."""
     table_height: Range | None = _within(-0.08, 0.0, none=(0.0, 0.0), full=(-0.03, 0.0))
     """Table top relative to the robot's base, m."""
     distractors: tuple[int, int] | None = _within(0, 6, none=(0, 0), full=(0, 3))
-    """How many distractor objects lie on the table."""
+    """Number of distractor objects on the table."""
 
     speed: Range | None = _within(0.2, 2.0, none=(1.0, 1.0), full=(0.6, 1.5))
     """Factor on the expert's speeds."""
     approach_height: Range | None = _within(0.05, 0.25, none=(0.12, 0.12), full=(0.08, 0.18))
-    """Above the grasp, m."""
+    """Approach height above the grasp, m."""
     lift_height: Range | None = _within(0.05, 0.25, none=(0.15, 0.15), full=(0.10, 0.20))
-    """Above the grasp, m."""
+    """Lift height above the grasp, m."""
     grasp_offset: Range | None = _within(-0.015, 0.015, none=(0.0, 0.0), full=(-0.005, 0.005))
     """Shift of the grasp along the fingers' faces, m."""
     # Clean demonstrations hardly teach: a policy that leaves their narrow path has never seen the way back. Noise of
@@ -78,12 +78,12 @@ class Ranges:
     miss_probability: float | None = _within(0.0, 1.0, none=0.0, full=0.1)
     """Probability that the expert deliberately misses first, and recovers."""
     miss_distance: Range | None = _within(0.02, 0.08, none=(0.03, 0.05))
-    """How far a deliberate miss is off, m; farther where the fingers would touch the object."""
-    # No perception error even in "full": the label would point where nothing is seen.
+    """Error of a deliberate miss, m; larger where the fingers would touch the object."""
+    # No perception error even in "full": the label would point to an empty place.
     perception_error: float | None = _within(0.0, 0.02, none=0.0)
-    """Standard deviation of perceived object positions, m; spoils the labels."""
+    """Standard deviation of perceived object positions, m; degrades the labels."""
     perception_yaw: float | None = _within(0.0, 0.2, none=0.0)
-    """Standard deviation of perceived object yaws, rad; spoils the labels."""
+    """Standard deviation of perceived object yaws, rad; degrades the labels."""
 
     camera_position: float | None = _within(0.0, 0.3, none=0.0, full=0.03)
     """Jitter of each camera's position, m per axis."""
@@ -97,7 +97,7 @@ class Ranges:
     """Error of the recorded camera rotations, rad per axis."""
 
     light_turn: Range | None = _within(-7.0, 7.0, none=(0.0, 0.0), full=(-3.1416, 3.1416))
-    """Turn of the light about the vertical, rad."""
+    """Rotation of the light about the vertical, rad."""
     light_elevation: Range | None = _within(0.2, 1.57, none=(1.0, 1.0), full=(0.7, 1.4))
     """Elevation of the light above the horizon, rad."""
     light_ambient: Range | None = _within(0.0, 1.0, none=(0.5, 0.5), full=(0.35, 0.6))
@@ -105,33 +105,33 @@ class Ranges:
     light_diffuse: Range | None = _within(0.0, 1.0, none=(0.55, 0.55), full=(0.4, 0.7))
     """Diffuse coefficient."""
     light_shadow: Range | None = _within(0.0, 1.0, none=(0.6, 0.6), full=(0.3, 0.8))
-    """How dark shadows are, 0..1."""
+    """Darkness of shadows, 0..1."""
     light_warmth: Range | None = _within(-1.0, 1.0, none=(0.0, 0.0), full=(-1.0, 1.0))
     """Colour of the light, from bluish (-1) to reddish (1)."""
     sky_brightness: Range | None = _within(0.0, 1.5, none=(1.0, 1.0), full=(0.4, 1.1))
     """Factor on the background's colour."""
     object_shade: float | None = _within(0.0, 0.5, none=0.0, full=0.15)
-    """Relative spread of the brightness of objects and targets; their colour's name stays true."""
+    """Relative spread of the brightness of objects and targets; their colour names stay valid."""
     surface_color: float | None = _within(0.0, 1.0, none=0.0, full=1.0)
-    """How far table and floor may be from their own colour, 0..1."""
+    """Maximum deviation of table and floor from their own colour, 0..1."""
     texture_probability: float | None = _within(0.0, 1.0, none=0.0, full=0.6)
     """Probability that table or floor has a procedural texture."""
 
     def range(self, name: str) -> Range:
-        """The (low, high) of a resolved field."""
+        """Return the (low, high) of a resolved field."""
         low, high = getattr(self, name)
         return float(low), float(high)
 
     def number(self, name: str) -> float:
-        """The value of a resolved field that is a single number."""
+        """Return the value of a resolved field that is a single number."""
         return float(getattr(self, name))
 
     def draw(self, name: str, rng: np.random.Generator) -> float:
-        """A number from a resolved range."""
+        """Draw a number from a resolved range."""
         return float(rng.uniform(*self.range(name)))
 
     def validate(self) -> None:
-        """Raise OptionError for a range that is upside down or beyond what makes sense."""
+        """Raise OptionError if a range is reversed or out of bounds."""
         for own in fields(self):
             value = getattr(self, own.name)
             if value is None:
@@ -140,7 +140,7 @@ class Ranges:
             pair = value if isinstance(value, tuple) else (value, value)
             if not (low <= pair[0] <= pair[1] <= high):
                 what = f"from {pair[0]:g} to {pair[1]:g}" if isinstance(value, tuple) else f"{value:g}"
-                raise OptionError(own.name, f"is {what}; it must lie within {low:g} to {high:g}, the lower end first.")
+                raise OptionError(own.name, f"is {what}; it must be within {low:g} to {high:g}, the lower end first.")
 
 
 PRESETS: Mapping[Preset, Ranges] = {
@@ -149,6 +149,6 @@ PRESETS: Mapping[Preset, Ranges] = {
 
 
 def resolve(preset: Preset, overrides: Ranges) -> Ranges:
-    """The preset's ranges with those of the user in their place; only cube_* may still be None."""
+    """Combine the preset's ranges with the user's; only cube_* may remain None."""
     chosen = {own.name: getattr(overrides, own.name) for own in fields(overrides)}
     return replace(PRESETS[preset], **{name: value for name, value in chosen.items() if value is not None})

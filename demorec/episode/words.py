@@ -1,4 +1,4 @@
-"""Words for the things of a scene: colours, nouns, and vessels that things go into."""
+"""Words for the objects of a scene: colours, nouns, and containers."""
 
 from __future__ import annotations
 
@@ -7,9 +7,9 @@ from demorec.episode.scene import Body
 COLOR_WORDS = ("red", "green", "blue", "yellow", "orange", "purple", "black", "white", "grey")
 """Words for colours in instructions and names."""
 VESSELS = ("tray", "bowl")
-"""Nouns of what things are put into and are in, not onto and on."""
+"""Nouns of containers, which take "in" and "into" instead of "on" and "onto"."""
 _NOUNS = {"jenga": "wooden plank", "lego": "toy brick"}
-"""Nouns for things whose names say less."""
+"""Nouns for objects with less descriptive names."""
 _SYNONYMS = {
     "target": ("target", "mark", "square"),
     "mark": ("mark", "target", "square"),

@@ -39,7 +39,7 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
         (["--seed", "-1"], "--seed is -1"),
         (["--workers", "0"], "--workers is 0"),
         (["--repo-id", "cubes"], "--repo-id is 'cubes', but must be OWNER/NAME"),
-        (["--cube-mass", "0.5", "0.2"], "--cube-mass is from 0.5 to 0.2; it must lie within"),
+        (["--cube-mass", "0.5", "0.2"], "--cube-mass is from 0.5 to 0.2; it must be within"),
         (["--address", "auto"], "--address is for Ray"),
         (["--config", "missing.toml"], "The config file cannot be read (No such file or directory): missing.toml"),
     ],

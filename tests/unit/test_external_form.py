@@ -116,11 +116,11 @@ def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what
         ({"features": (replace(STATE, name="timestamp"),)}, "reserved"),
         ({"features": (replace(STATE, name="a/b"),)}, "allowed are words"),
         ({"features": (replace(STATE, units=("rad",)),)}, "3 elements, but 1 units"),
-        ({"features": (replace(STATE, joints=("shoulder", "wrist", "")),)}, "URDF does not have: wrist"),
+        ({"features": (replace(STATE, joints=("shoulder", "wrist", "")),)}, "URDF lacks: wrist"),
         ({"features": (replace(STATE, names=("a", "a", "b")),)}, "are called 'a'"),
         ({"cameras": (replace(TOP, name="my top"),)}, "allowed are letters"),
         ({"cameras": (replace(TOP, width=0),)}, "0x48 pixels"),
-        ({"cameras": (replace(TOP, mount="nowhere"),)}, "no link of the URDF"),
+        ({"cameras": (replace(TOP, mount="nowhere"),)}, "not a link of the URDF"),
         ({"urdf": "<robot"}, "not valid XML"),
     ],
 )

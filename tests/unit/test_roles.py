@@ -119,7 +119,7 @@ def test_a_feature_that_does_not_exist_is_refused(call: str, flag: str, tmp_path
     given = ("--state", "measured") if flag == "--gripper" else ()
     assert exit_code(*words, *given, flag, "mesured") == 2
     error = capsys.readouterr().err
-    assert f"{flag}: there is no feature" in error
+    assert f"{flag}: unknown feature" in error
     assert "Did you mean 'measured'?" in error
     assert not list(tmp_path.glob("new*"))
 
@@ -331,5 +331,5 @@ def test_the_users_gripper_joins_the_state() -> None:
     assert roles.state == ("observation.state", "jaw")
     assert roles.grippers().tolist() == [False, False, False, True]
     assert roles.in_state(roles.action) == [0, 1, 2, 3]
-    with pytest.raises(ConfigError, match="is int64 and no vector"):
+    with pytest.raises(ConfigError, match="is int64, not a vector"):
         find_roles({**columns, "counts": Column("int64", ("0",))}, NamedRoles(state=("counts",)))
