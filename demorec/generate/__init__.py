@@ -1,4 +1,4 @@
-"""From a config to a folder of verified recordings: the same dataset whatever the workers, the order or the crashes.
+"""Generation: from a config to a folder of verified recordings, independent of workers, order and crashes.
 
-`demorec.generate.run.generate` is the way in; `demorec.runs.run_file.load_run_file` reads what a run is.
+The entry point is `demorec.generate.run.generate`; `demorec.runs.run_file.load_run_file` reads a run's description.
 """

@@ -1,6 +1,6 @@
-"""What is in the folder of a run: what is the run's own, so that --overwrite may replace it, and what can be kept.
+"""Content of a run's folder: the run's own files, which --overwrite may replace, and recordings that can be kept.
 
-Everything else is somebody's. Every recording is verified before a run builds on it.
+Everything else is the user's. Every recording is verified before a run builds on it.
 """
 
 from __future__ import annotations
@@ -32,20 +32,20 @@ from demorec.runs.run_file import (
 )
 
 PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
-"""All that a run writes; what else is in its folder is never touched."""
+"""All entries that a run writes; anything else in its folder is never touched."""
 
 _NAME = r"episode_\d{6,}(\.attempt_\d+)?\.mcap"
 _RECORDING = re.compile(_NAME)
-_SCRATCH = re.compile(r".+-\d+-\d+")  # of a worker: host, process, number
+_SCRATCH = re.compile(r".+-\d+-\d+")  # worker folder: host, process, number
 _PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}(\.part)?")
-_RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # since it was damaged or of another run
+_RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # damaged, or of another run
 _REPORT = re.compile(r"error_episode_\d+\.txt")
-_CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by somebody, so that --overwrite does not delete it
+_CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by a user, so that --overwrite does not delete it
 _SET_ASIDE_DATASET = re.compile(rf"({DATASET_FOLDER}(?:\.\d+)?)/(.*)")
 
 
 def set_aside(folder: Path) -> list[str]:
-    """What a run has left or moved to its unfinished/, in words: how many of each kind; not what somebody put there."""
+    """Count the files that a run has left in its unfinished/, by kind, in words; the user's are excluded."""
     names = list(files_below(folder / UNFINISHED))
     datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
     others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
@@ -54,7 +54,7 @@ def set_aside(folder: Path) -> list[str]:
     counted = [
         (len(datasets), "dataset", " that the run did not leave like this"),
         (_number(_RECORDING_ASIDE, others), "recording", " not of this run, or damaged"),
-        (len(parts) - empty, "unfinished recording", " (demorec recover keeps what is whole)"),
+        (len(parts) - empty, "unfinished recording", " (demorec recover keeps the complete frames)"),
         (empty, "unfinished recording", " in which nothing was written"),
         (_number(_REPORT, others), "error report", ""),
         (_number(_CARD, others), "edited dataset card", ""),
@@ -63,9 +63,9 @@ def set_aside(folder: Path) -> list[str]:
 
 
 def clear_scratch(folder: Path, run: RunFile) -> None:
-    """Remove what lost workers have left of attempts that have been made since.
+    """Remove the remains of lost workers' attempts that have been made since.
 
-    Whatever else is in unfinished/, or is being written, stays.
+    Anything else in unfinished/, or being written, stays.
     """
     made = {recording_name(line.episode_index, line.attempt, success=False) for line in run.known}
     for scratch in (folder / UNFINISHED).glob("*"):
@@ -73,10 +73,10 @@ def clear_scratch(folder: Path, run: RunFile) -> None:
             continue
         for path in scratch.iterdir():
             if path.name.removesuffix(".part") in made:
-                with suppress(OSError):  # it is being written, or is no file
+                with suppress(OSError):  # it is being written, or is not a file
                     os.close(open_locked(path))
                     path.unlink()
-        with suppress(OSError):  # it holds something else
+        with suppress(OSError):  # it contains something else
             scratch.rmdir()
 
 
@@ -91,12 +91,12 @@ def foreign_recordings(
     known: frozenset[str] = frozenset(),
     is_ours: Callable[[Path], bool] = RECORDING.recognises,
 ) -> Iterator[str]:
-    """What in a folder of recordings is none of ours.
+    """Yield the files in a folder of recordings that are not ours.
 
     Args:
-        folder: Of the run or the evaluation.
+        folder: Folder of the run or the evaluation.
         place: episodes or failed.
-        known: Files, relative to `folder`, that it has made, whatever has become of them.
+        known: Files, relative to `folder`, that it has made, in any state.
         is_ours: Whether another file may be one that it has made.
     """
     if (folder / place).is_symlink():
@@ -110,7 +110,7 @@ def foreign_recordings(
 
 
 def is_dataset_of_run(dataset: Path, config_digest: str) -> bool:
-    """Whether a folder is a dataset of episodes of one run alone, with nothing else in it."""
+    """Check whether a folder is a dataset of episodes of one run alone, without other content."""
     return (
         not dataset.is_symlink()
         and DATASET.recognises(dataset)
@@ -120,14 +120,14 @@ def is_dataset_of_run(dataset: Path, config_digest: str) -> bool:
 
 
 def check_dataset_place(folder: Path, run: RunFile) -> None:
-    """Refuse what keeps a run's dataset from its place. Only reads.
+    """Raise if a run's dataset cannot be put into its place. Only reads.
 
     Args:
-        folder: Of the run.
-        run: What is known of it; without a line about its dataset where run.json was lost.
+        folder: Folder of the run.
+        run: Known state of the run; without a dataset record if run.json was lost.
 
     Raises:
-        ConfigError: A dataset that the run did not make, or a link to nothing, is there.
+        ConfigError: A dataset that the run did not make, or a broken link, exists there.
     """
     dataset = folder / DATASET_FOLDER
     if not os.path.lexists(dataset):
@@ -135,18 +135,18 @@ def check_dataset_place(folder: Path, run: RunFile) -> None:
     if not dataset.exists():
         raise ConfigError(f"The dataset is a link to something that is not there, mend or remove it: {dataset}")
     if run.export is None and not is_dataset_of_run(dataset, run.config_digest):
-        raise ConfigError(f"A dataset that this run did not make is in the way: move it elsewhere: {dataset}")
+        raise ConfigError(f"A dataset that this run did not make is in the way; move it elsewhere: {dataset}")
 
 
 def _recognises(folder: Path) -> bool:
     run = json_object(folder / RUN_NAME)
-    if run:  # a run that was imported has one as well
+    if run:  # an imported run has one as well
         return isinstance(run.get("episodes"), list) and "config_digest" in run
     return any(_may_be_generated(file) for file in recordings_of(folder))
 
 
 def _may_be_generated(file: Path) -> bool:
-    """Whether a file is a recording that does not say itself that something else made it: a render, an import."""
+    """Check whether a file is a recording without another origin, such as a render or an import."""
     from demorec.mcap import open_recording
 
     if not RECORDING.recognises(file):
@@ -155,7 +155,7 @@ def _may_be_generated(file: Path) -> bool:
         with open_recording(file) as recording:
             return recording.info.simulation is not None and not recording.info.origin
     except RecordingError:
-        return True  # what is damaged is made again
+        return True  # damaged ones are made again
 
 
 def _strangers(folder: Path) -> list[str]:
@@ -188,27 +188,28 @@ def _is_unfinished(name: str) -> bool:
 RUN = ReplaceableKind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)
 
 Inspector = Callable[[Path], tuple[Attempt, Mapping[str, Any], Mapping[str, str]]]
-"""Reads all of a recording, as `inspect_recording` does; DemorecError or OSError when it is none."""
+"""Reads a whole recording, as `inspect_recording` does; DemorecError or OSError if it is invalid."""
 
 
 def recordings_of(folder: Path) -> list[Path]:
-    """Everything in episodes/ and failed/ that is named as a recording, whatever it is."""
+    """List everything in episodes/ and failed/ with the name of a recording, of any type."""
     return sorted(path for place in (EPISODES, FAILED) for path in (folder / place).glob("*.mcap"))
 
 
 def survey(
     folder: Path, run: RunFile, *, inspect: Inspector, progress: Callable[[int, int], None]
 ) -> tuple[list[Attempt], dict[str, str]]:
-    """Verify every recording of a folder against run.json, or read it in full where run.json does not know it.
+    """Verify every recording of a folder against run.json, or read it in full if run.json does not list it.
 
-    What is damaged, unfinished, of another run or no file at all is moved to unfinished/; nothing is deleted.
+    Damaged or unfinished recordings, those of other runs and other entries are moved to unfinished/; nothing is
+    deleted.
 
     Returns:
-        The attempts whose recordings are there and sound, and those that failed without one; and file -> why it was
-        moved to unfinished/.
+        The attempts with intact recordings, and failed ones without a recording; and file -> reason why it was moved to
+        unfinished/.
 
     Raises:
-        ResourceError: This machine cannot read one of them now; nothing is moved for that.
+        ResourceError: This machine cannot read one of them now; nothing is moved.
     """
     known = {a.file: a for a in run.known if a.file}
     kept = [a for a in run.known if not a.file]
@@ -221,7 +222,7 @@ def survey(
             if line is None:
                 line = _adopt(path, run, inspect)
             elif path.stat().st_size != line.num_bytes or sha256_of(path) != line.sha256:
-                raise DemorecError("its bytes are not those that run.json knows")
+                raise DemorecError("its bytes differ from those in run.json")
             kept.append(line)
         except (DemorecError, OSError, MemoryError) as error:
             if (lack := resource_error(error, path)) is not None:
@@ -238,7 +239,7 @@ def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
     place = EPISODES if line.success else FAILED
     name = recording_name(line.episode_index, line.attempt, success=line.success)
     if (path.parent.name, path.name) != (place, name):
-        raise DemorecError(f"it holds episode {line.episode_index}, attempt {line.attempt}")
+        raise DemorecError(f"it contains episode {line.episode_index}, attempt {line.attempt}")
     if different := differences(config, versions, to_plain(run.config), run.versions):
         raise DemorecError(f"it is of another run ({'; '.join(different)})")
     return replace(line, file=f"{place}/{name}")

@@ -1,4 +1,4 @@
-"""What a run would take, from pilot episodes on this machine: `--dry-run`."""
+"""Estimate of a run's cost, from pilot episodes on this machine: `--dry-run`."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from demorec.generate.options import RunOptions
 from demorec.runs.run_file import EPISODES, FAILED, UNFINISHED
 
 _MEASURED = 2
-"""Attempts with images: the first of a worker compiles, loads and fills caches, the second is what counts."""
+"""Number of pilot attempts with images: a worker's first one compiles, loads and fills caches, the second counts."""
 _TRIED = 20
-"""Episodes made without images, to see how often they succeed: images do not touch the physics."""
+"""Number of pilot episodes without images, to estimate the success rate: images do not affect the physics."""
 
 
 def estimate(config: GenerateConfig, options: RunOptions) -> tuple[list[Made], list[Made], int]:
     """Make pilot episodes in a temporary folder.
 
     Returns:
-        Attempts with images, of which the last is measured and the first has the seconds that a worker needs to start;
-        attempts without images, which show how many succeed; and bytes that an episode adds to the dataset (0 without).
+        Attempts with images, of which the last is measured and the first has a worker's start-up time; attempts without
+        images, for the success rate; and bytes that an episode adds to the dataset (0 without one).
 
     Raises:
-        ConfigError, GenerationError: A pilot could not be made.
+        ConfigError, GenerationError: A pilot episode could not be made.
     """
     workers = options.workers or available_cores()
     with tempfile.TemporaryDirectory(prefix="demorec-pilot-") as temporary:
@@ -54,7 +54,7 @@ def _new_run(folder: Path) -> Path:
 
 
 def _make(folder: Path, config: GenerateConfig, count: int, *, workers: int) -> list[Made]:
-    """The first episodes, in order of their ends."""
+    """Make the first episodes, in order of their ends."""
     made: list[Made] = []
     plans = (EpisodePlan(config=config, episode_index=index) for index in range(count))
     with LocalExecutor(MAKE_EPISODE, folder, workers=workers, recycle_after=count) as executor:
@@ -66,7 +66,7 @@ def _make(folder: Path, config: GenerateConfig, count: int, *, workers: int) -> 
 
 
 def _added_to_dataset(recordings: Sequence[Path], folder: Path) -> int:
-    """Bytes by which the last of some recordings makes their dataset larger: what every dataset has counts once."""
+    """Compute the bytes that the last recording adds to a dataset, excluding the fixed size of any dataset."""
     sizes = [0, 0]
     for count in range(max(1, len(recordings) - 1), len(recordings) + 1):
         dataset = folder / f"dataset_of_{count}"

@@ -1,4 +1,4 @@
-"""What an executor is, and what it reports: the driver is the same for one process, one machine and a cluster."""
+"""Interface and reports of executors: the driver is the same for one process, one machine and a cluster."""
 
 from __future__ import annotations
 
@@ -23,20 +23,20 @@ Maker = Callable[[EpisodePlan, Path], Attempt]
 """Makes one attempt in the run's folder: writes the recording to its place, then returns its line."""
 
 MAKE_EPISODE = "demorec.generate.worker:make_episode"
-"""Makers are given by name and imported in the worker, so that the driver never loads a simulator."""
+"""Makers are named and imported in the worker, so that the driver never loads a simulator."""
 
 _THREAD_SETTINGS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
 SINGLE_THREADED = dict.fromkeys(_THREAD_SETTINGS, "1")
-"""Environment of a worker: a worker is one core, so that N workers take N cores and not N times N threads."""
+"""Environment of a worker: a worker uses one core, so that N workers use N cores and not N times N threads."""
 CAPACITY_WAIT_S = 300.0
-"""How long a run waits without room for any worker: a cloud takes 1 to 5 min to boot a machine for a lost one."""
+"""Maximum wait, s, without room for any worker: a cloud takes 1 to 5 min to boot a replacement for a lost machine."""
 POLL_S = 0.2
-"""How often the caller of `Executor.carry_out` may look around, at Ctrl-C for example."""
+"""Interval, s, at which the caller of `Executor.carry_out` regains control, for example to handle Ctrl-C."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Made:
-    """An attempt has come to its end, with a recording unless no scene was found for it."""
+    """An attempt has ended, with a recording unless no scene was found for it."""
 
     plan: EpisodePlan
     attempt: Attempt
@@ -45,10 +45,10 @@ class Made:
 
 @dataclass(frozen=True, kw_only=True)
 class Raised:
-    """An attempt raised an exception. Told in words: an exception of somebody's task may not survive pickling.
+    """An attempt raised an exception, described in words: an exception of a user's task may not survive pickling.
 
-    `errno` is that of the operating system's error in the chain, if any (ENOMEM for a MemoryError); `exit_code` that of
-    a DemorecError, else 0; `own_line` the line of the user's own code, as `demorec.core.own_code.own_line`.
+    `errno` is that of the operating system's error in the chain, if any (ENOMEM for a MemoryError). `exit_code` is that
+    of a DemorecError, else 0. `own_line` is the line of the user's code, as `demorec.core.own_code.own_line`.
     """
 
     plan: EpisodePlan
@@ -60,12 +60,12 @@ class Raised:
     own_line: str = ""
 
     def error(self, sentence: str) -> DemorecError:
-        """What the driver raises for it."""
+        """Build the error that the driver raises."""
         return (ConfigError if self.exit_code == ConfigError.exit_code else GenerationError)(sentence)
 
 
 def lost(plan: EpisodePlan, reason: str) -> Raised:
-    """The worker ended without a word (killed, its machine gone): mostly for lack of memory."""
+    """Report a worker that ended silently (killed, its machine gone): mostly for lack of memory."""
     return Raised(plan=plan, kind="lost", message=f"{reason}.", errno=errno.ENOMEM)
 
 
@@ -73,15 +73,15 @@ Report = Made | Raised
 
 
 class Executor(Protocol):
-    """Carries out plans in other processes; a context manager, which is closed at its end."""
+    """Runs plans in other processes; a context manager that closes itself at exit."""
 
     @property
     def workers(self) -> int:
-        """How many processes work at the same time."""
+        """Number of processes that work at the same time."""
 
     @property
     def has_room(self) -> bool:
-        """Whether `submit` may be called; bounds what is in flight."""
+        """Whether `submit` may be called; bounds the number of running plans."""
         return self.pending < self.workers
 
     @property
@@ -89,16 +89,16 @@ class Executor(Protocol):
         """Plans submitted and not yet reported."""
 
     def submit(self, plan: EpisodePlan) -> None:
-        """Start an attempt; returns at once."""
+        """Start an attempt; returns immediately."""
 
     def wait(self, timeout_s: float) -> list[Report]:
-        """What has ended; waits up to `timeout_s` for the first."""
+        """Return the attempts that have ended; waits up to `timeout_s` for the first."""
 
     def interrupt(self) -> None:
-        """Ask every worker to leave its attempt where it is and end."""
+        """Ask every worker to abandon its attempt and end."""
 
     def close(self) -> None:
-        """End every worker, whatever it does; harmless when called twice."""
+        """End every worker, even a busy one; safe to call twice."""
 
     def __enter__(self) -> Self:
         return self
@@ -109,17 +109,17 @@ class Executor(Protocol):
     def carry_out(
         self, take: Callable[[], EpisodePlan | None], *, says: Callable[[str], None] = lambda message: None
     ) -> Iterator[list[Report]]:
-        """Carry out plans until none is due and none is pending, as many at a time as there is room for.
+        """Run plans until none is due and none is pending, as many at a time as there is room for.
 
         Args:
-            take: Gives the next plan, or None when none is due now; asked again after each list of reports.
-            says: Told when there is no room for any worker, which is waited for.
+            take: Returns the next plan, or None if none is due now; called again after each list of reports.
+            says: Receives a message while the run waits for room for any worker.
 
         Yields:
-            What has ended; an empty list when nothing has for `POLL_S`.
+            Reports of ended attempts; an empty list if none has ended for `POLL_S`.
 
         Raises:
-            GenerationError: There was no room for `CAPACITY_WAIT_S`.
+            GenerationError: No room was available for `CAPACITY_WAIT_S`.
         """
         lost_at: float | None = None
         plan = take()
@@ -136,11 +136,11 @@ class Executor(Protocol):
                 lost_at = None
             elif lost_at is None:
                 lost_at = time.monotonic()
-                says(f"There is no room for any worker now: waiting for it, at most {CAPACITY_WAIT_S:.0f} s.")
+                says(f"The cluster has no room for any worker now: waiting up to {CAPACITY_WAIT_S:.0f} s.")
             elif time.monotonic() - lost_at > CAPACITY_WAIT_S:
                 raise GenerationError(
-                    f"There has been no room for any worker for {CAPACITY_WAIT_S:.0f} s: see whether the nodes of the "
-                    "cluster are up, then run the same command again."
+                    f"The cluster has had no room for any worker for {CAPACITY_WAIT_S:.0f} s: check that its nodes "
+                    "are up, then run the same command again."
                 )
             yield reports
             if plan is None:
@@ -148,13 +148,13 @@ class Executor(Protocol):
 
 
 def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raised:
-    """Run the maker of that name and turn what happens into a report; the same in every executor."""
+    """Run the named maker and convert its result to a report; the same in every executor."""
     try:
         module, _, name = maker.partition(":")
         make: Maker = getattr(importlib.import_module(module), name)
         attempt = make(plan, folder)
     except Exception as error:
-        # A library may wrap the operating system's error; the first one in the chain tells what to do.
+        # A library may wrap the operating system's error; the first one in the chain determines the fix.
         cause = next((c for c in error_chain(error) if isinstance(c, OSError | MemoryError)), None)
         number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
         return Raised(
@@ -170,7 +170,7 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
 
 
 def peak_memory() -> int:
-    """Largest resident size of this process so far, bytes (the present one where the system does not keep it)."""
+    """Return the largest resident size of this process, bytes (the current one if the system does not store it)."""
     with suppress(OSError):
         for line in Path("/proc/self/status").read_text().splitlines():
             if line.startswith("VmHWM:"):

@@ -1,4 +1,4 @@
-"""From a finished run to its dataset: made once for a content, made anew when the run has grown."""
+"""Export of a finished run to its dataset: once per content, again when the run has grown."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ def export_run(
     progress: Callable[[int, int], None] = lambda done, total: None,
     says: Callable[[str], None] = lambda message: None,
 ) -> tuple[ExportRecord, ExportReport | None]:
-    """Export the successful episodes of a run to its dataset/, unless that is there already.
+    """Export the successful episodes of a run to its dataset/, unless it exists already.
 
-    Episodes beyond what was asked for last are left out. A dataset that this run made from other content is replaced;
-    one that it did not make is left alone. One that it made but that is damaged, was changed since, or has
-    something in it that is no part of a dataset, is moved to unfinished/, and made again. So is a card that was edited.
+    Episodes beyond the requested number are excluded. A dataset that this run made from other content is replaced; one
+    that it did not make is left alone. One that it made but that is damaged, was changed, or contains other files, is
+    moved to unfinished/ and made again. So is an edited card.
 
     Args:
-        folder: Of the run.
+        folder: Folder of the run.
         repo_id: Name of the dataset.
         progress: Called after every recording.
-        says: Told what a person should know.
+        says: Receives messages for the user.
 
     Returns:
-        What run.json says about the dataset now, and the export's own report if it was made just now.
+        The dataset's record in run.json, and the export's report if it was made now.
 
     Raises:
-        ConfigError: Somebody else's dataset, or a link to nothing, is in the way.
+        ConfigError: A foreign dataset, or a broken link, is in the way.
         ExportError: The export failed.
     """
     target = folder / DATASET
@@ -56,14 +56,14 @@ def export_run(
         if target.exists():
             if present and not _is_as_made(target, present, run):
                 aside = _move_aside(target, folder)
-                says(f"{DATASET}/ is not as the run made it (damaged, or changed since); it was moved to {aside}.")
+                says(f"{DATASET}/ was damaged or changed after the run made it; it was moved to {aside}.")
             elif present and (present.run_digest, present.repo_id) == (run.digest, repo_id) and present.dataset_digest:
                 return present, None
             _keep_what_is_not_ours(target, folder, says)
         elif present is not None and present.dataset_digest:
-            says(f"{DATASET}/ is no longer there; it is made again.")
+            says(f"{DATASET}/ is missing; it is made again.")
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)
-        # Written down before: after a crash in between, what is there is known to be ours.
+        # Saved first: after a crash in between, the dataset is known to be ours.
         save_run_file(run.with_generation(export=record), folder)
         start = time.process_time()
         wanted = f":{run.num_episodes}" if run.beyond else ""
@@ -79,8 +79,8 @@ def export_run(
 
 
 def _is_as_made(dataset: Path, record: ExportRecord, run: RunFile) -> bool:
-    """Whether a dataset is whole and what the run wrote down about it, read back from all its files."""
-    if not record.dataset_digest:  # the export was killed: before, or after the dataset took its place
+    """Check that a dataset is complete and matches the run's record, by reading all its files."""
+    if not record.dataset_digest:  # the export was killed, before or after the dataset took its place
         return is_dataset_of_run(dataset, run.config_digest)
     try:
         check_tables(dataset)
@@ -92,13 +92,13 @@ def _is_as_made(dataset: Path, record: ExportRecord, run: RunFile) -> bool:
 
 
 def _keep_what_is_not_ours(dataset: Path, folder: Path, says: Callable[[str], None]) -> None:
-    """Move to unfinished/ what would be lost with a dataset of the run's that is about to be replaced."""
+    """Move files to unfinished/ that would be lost when the run's dataset is replaced."""
     if reason := obstacle(dataset, DATASET_KIND):
         aside = _move_aside(dataset, folder)
         says(f"{DATASET}/ was moved to {aside} and is made again, since {reason}.")
     elif has_own_card(dataset):
         aside = _move_aside(dataset / CARD_PATH, folder)
-        says(f"{DATASET}/{CARD_PATH} is not as the run wrote it; it was moved to {aside}, and a new one is made.")
+        says(f"{DATASET}/{CARD_PATH} was edited; it was moved to {aside}, and a new one is made.")
 
 
 def _move_aside(path: Path, folder: Path) -> str:

@@ -53,12 +53,12 @@ from demorec.runs.run_file import (
 
 
 class RunFolder:
-    """An opened run. Lines are saved at intervals: one that a crash loses is read back from its recording.
+    """An opened run. Lines are saved at intervals; one lost in a crash is read back from its recording.
 
     Attributes:
-        path: Of the folder.
-        run: All that is known.
-        lost_workers: Of this session.
+        path: Path of the folder.
+        run: Known state of the run.
+        lost_workers: Workers lost in this session.
     """
 
     def __init__(self, path: Path, run: RunFile) -> None:
@@ -77,18 +77,18 @@ class RunFolder:
 
     @property
     def kept(self) -> str:
-        """A sentence on what is there, for messages."""
+        """Progress of the run in one sentence, for messages."""
         done = sum(bool(a.success) for a in self._attempts.values() if a.episode_index < self.run.num_episodes)
         return f"{done} of {self.run.num_episodes} episodes are complete and kept: {self.path}"
 
     def begin_session(self, *, executor: str, workers: int) -> None:
-        """Work begins: write down who does it."""
+        """Record the start of the work and who does it."""
         self._has_session = True
         self._session = replace(self._session, executor=executor, workers=workers)
         self.save()
 
     def add(self, attempt: Attempt, *, peak_worker_bytes: int) -> None:
-        """Take a line in; saves when the last save is old enough to cost little."""
+        """Add a line; saves if the last save is old enough to cost little."""
         self._attempts[attempt.episode_index, attempt.attempt] = attempt
         self._made.append(attempt)
         self._peak_worker_bytes = max(self._peak_worker_bytes, peak_worker_bytes)
@@ -96,16 +96,16 @@ class RunFolder:
             self.save()
 
     def end_session(self, state: str) -> None:
-        """Work has ended, for whatever reason."""
+        """Record the end of the work, for any reason."""
         self._session = replace(self._session, ended=utc_now(), state=state)
         try:
             self.save()
         except GenerationError:
-            if state != "stopped":  # else the reason why it stopped is the one to report
+            if state != "stopped":  # otherwise report the reason why it stopped
                 raise
 
     def save(self) -> None:
-        """Write run.json; GenerationError when that is not possible."""
+        """Write run.json; GenerationError if that fails."""
         start = time.monotonic()
         self._session = replace(
             self._session,
@@ -121,14 +121,14 @@ class RunFolder:
         except OSError as error:
             self.check_alive()
             raise resource_error(error) or GenerationError(
-                f"run.json cannot be written ({error.strerror}); mend that and run the same command again, which "
+                f"run.json cannot be written ({error.strerror}); fix that and run the same command again, which "
                 f"finds every complete episode: {self.path}"
             ) from error
         self._saved_at = time.monotonic()
         self._save_seconds = self._saved_at - start
 
     def check_alive(self) -> None:
-        """Raise GenerationError when the folder has been moved or deleted under our feet."""
+        """Raise GenerationError if the folder has been moved or deleted meanwhile."""
         if not (self.path / LOCK_NAME).exists() or not (self.path / EPISODES).is_dir():
             raise GenerationError(
                 "The output folder has vanished while the run was writing to it: bring it back, or start again: "
@@ -136,7 +136,7 @@ class RunFolder:
             )
 
     def result(self, *, interrupted: bool) -> RunResult:
-        """What this session has come to."""
+        """Return the result of this session."""
         return RunResult(folder=self.path, run=self.run, made=tuple(self._made), interrupted=interrupted)
 
 
@@ -146,11 +146,11 @@ def open_run(
 ) -> Iterator[RunFolder]:
     """Open, continue or begin a run in `options.out`, locked until the context ends.
 
-    Nothing is written, not even the lock, before the request is known to fit what is there.
+    Nothing is written, not even the lock, before the request is known to fit the folder.
 
     Raises:
-        ConfigError: The folder is in use, holds another run or somebody's files, or cannot be written to; or what is
-            to be overwritten is not a run alone.
+        ConfigError: The folder is in use, contains another run or the user's files, or is not writable; or it contains
+            more than a run to be overwritten.
     """
     assert options.out is not None
     path = options.out.absolute()
@@ -161,10 +161,10 @@ def open_run(
         if not check_unsettled_parts(path, PARTS):
             _check_request(path, asked, options, inspect=inspect)
     make_folder(path)
-    with run_lock(path):  # from here on nobody else changes it, so what was found is looked at once more
+    with run_lock(path):  # from here on no other process changes it, so it is examined again
         settle_parts(path, PARTS)
         replaces = _check_request(path, asked, options, inspect=inspect)
-        # What is overwritten is deleted when the new run's run.json is there, and put back when that cannot be made.
+        # Overwritten files are deleted once the new run's run.json exists, and restored if it cannot be made.
         with replaced_parts(path, PARTS) if replaces else nullcontext():
             folder = _begin_or_continue(path, asked, progress=progress, inspect=inspect)
         yield folder
@@ -172,7 +172,7 @@ def open_run(
 
 
 def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: Inspector) -> bool:
-    """Refuse what does not fit the folder; tell whether a run that is there shall be replaced. Only reads."""
+    """Reject a request that does not fit the folder; return whether to replace its run. Only reads."""
     if options.overwrite and _would_replace(path):
         check_replaceable(path, RUN, overwrite=True)
         return True
@@ -185,13 +185,13 @@ def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: 
 
 
 def _would_replace(path: Path) -> bool:
-    """Whether anything is where the run will be, be it of a run or not."""
+    """Check whether anything exists at the run's place, part of a run or not."""
     parts = [path / name for name in PARTS if os.path.lexists(path / name)]
     return any(not part.is_dir() or any(files_below(part)) for part in parts)
 
 
 def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, inspect: Inspector) -> RunFolder:
-    """Bring the folder and its run.json to what is known now."""
+    """Update the folder and its run.json to the known state."""
     run, damage = _known_run(path, asked, inspect=inspect)
     if damage:
         kept = free_name(path / f"{RUN_NAME}.damaged")
@@ -208,8 +208,8 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
     if run.beyond:
         more = len({line.episode_index for line in run.beyond})
         progress.says(
-            f"Beyond what is asked for now ({run.num_episodes}), the folder holds recordings of later episodes "
-            f"({more}): they stay, outside of the run's digest and dataset."
+            f"Beyond the requested episodes ({run.num_episodes}), the folder contains recordings of later ones "
+            f"({more}): they stay, but are not in the run's digest and dataset."
         )
     folder = RunFolder(path, run)
     folder.save()
@@ -217,7 +217,7 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
 
 
 def machine() -> dict[str, str]:
-    """What a session runs on, for people."""
+    """Describe the machine of a session, for human readers."""
     return {
         "host": platform.node(),
         "system": platform.platform(),
@@ -229,19 +229,19 @@ def machine() -> dict[str, str]:
 
 
 def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFile, str]:
-    """The run that the folder holds, if it is the one that is asked for, and what is wrong with run.json ("": nothing).
+    """Find the folder's run, if it is the requested one, and the problem of its run.json ("" if none).
 
-    Only reads. A run without any episode claims nothing: the one that is asked for takes its place.
+    Only reads. A run without episodes is replaced by the requested one.
 
     Raises:
-        ConfigError: The folder holds another run.
+        ConfigError: The folder contains another run.
     """
     run, damage = asked, ""
     try:
         if (path / RUN_NAME).exists():
             run = load_run_file(path)
     except DamagedRunFileError as error:
-        # The recordings know what they are of; a run.json that nobody can read is kept for whoever wants to try.
+        # The recordings identify their run; an unreadable run.json is kept in case it can be repaired.
         damage = str(error)
     recordings = recordings_of(path)
     if run is asked and recordings:
@@ -259,7 +259,7 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
 
 
 def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Inspector) -> RunFile:
-    """The run that the first readable recording belongs to; the survey looks at each of them."""
+    """Identify the run of the first readable recording; the survey examines each of them."""
     strange: NotGeneratedError | None = None
     for file in recordings:
         try:
@@ -274,13 +274,13 @@ def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Insp
             continue
         return asked.with_generation(config=config, versions=versions)
     if strange is not None:
-        raise ConfigError(f"Nothing in the output folder was generated, choose another --out: {strange}")
+        raise ConfigError(f"Nothing in the output folder was generated; choose another --out: {strange}")
     return asked
 
 
 @contextmanager
 def _told_as_unusable(path: Path) -> Iterator[None]:
-    """Turn errors of the file system into one sentence about the folder."""
+    """Convert errors of the file system to one sentence about the folder."""
     try:
         yield
     except OSError as error:

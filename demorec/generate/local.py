@@ -1,7 +1,7 @@
 """Workers on this machine: spawned processes, one pipe each, so that killing one cannot harm the others.
 
-A shared queue (multiprocessing.Queue, ProcessPoolExecutor) has locks that a killed worker takes with it; with a
-pipe of its own a worker's death is an end-of-file and nothing else.
+A shared queue (multiprocessing.Queue, ProcessPoolExecutor) has locks that a killed worker never releases; with a
+separate pipe a worker's death is just an end-of-file.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from demorec.generate.executor import SINGLE_THREADED, Executor, Report, attempt
 
 _OF_THE_GROUP = frozenset({signal.SIGINT, signal.SIGTERM})
 _LEAVE = signal.SIGUSR1
-"""With it the driver asks a worker to leave its attempt where it is."""
+"""Signal from the driver to abandon the attempt."""
 
 
 class _Interrupted(BaseException):
-    """Raised in a worker that shall leave its attempt; passes every `except Exception`: the part file stays."""
+    """Raised in a worker to abandon its attempt; passes every `except Exception`, so that the part file stays."""
 
 
 @dataclass(eq=False)
@@ -39,11 +39,11 @@ class _Worker:
 
 
 class LocalExecutor(Executor):
-    """A fixed number of worker processes, started when they are needed, replaced when they die or have grown old.
+    """A fixed number of worker processes, started on demand, replaced when they die or reach their number of attempts.
 
     Args:
-        maker: What a worker does with a plan, as "module:function".
-        folder: Of the run.
+        maker: Function that runs a plan, as "module:function".
+        folder: Folder of the run.
         workers: Number of processes.
         recycle_after: Attempts after which a worker is replaced.
     """
@@ -63,22 +63,22 @@ class LocalExecutor(Executor):
 
     @property
     def pending(self) -> int:
-        """Busy workers."""
+        """Number of busy workers."""
         return sum(worker.plan is not None for worker in self._live)
 
     def submit(self, plan: EpisodePlan) -> None:
-        """Give the plan to an idle worker, or to a new one."""
+        """Pass the plan to an idle worker, or to a new one."""
         worker = next((w for w in self._live if w.plan is None), None)
         if worker is None:
             worker = self._start()
         worker.plan = plan
         worker.given += 1
-        # A worker that died while idle shows at the next wait: the plan is then reported as lost.
+        # A worker that died while idle is detected at the next wait: the plan is then reported as lost.
         with suppress(OSError):
             worker.pipe.send(plan)
 
     def wait(self, timeout_s: float) -> list[Report]:
-        """What has ended; waits up to `timeout_s` for the first."""
+        """Return the attempts that have ended; waits up to `timeout_s` for the first."""
         reports: list[Report] = []
         by_pipe = {worker.pipe: worker for worker in self._live}
         for pipe in connection.wait(list(by_pipe), timeout_s):
@@ -97,13 +97,13 @@ class LocalExecutor(Executor):
         return reports
 
     def interrupt(self) -> None:
-        """Ask every worker to leave its attempt where it is and end."""
+        """Ask every worker to abandon its attempt and end."""
         for worker in self._live:
             if worker.process.pid is not None and worker.process.is_alive():
                 os.kill(worker.process.pid, _LEAVE)
 
     def close(self) -> None:
-        """End every worker: idle ones by word, busy ones by SIGKILL (their part files stay)."""
+        """End every worker: idle ones by message, busy ones by SIGKILL (their part files stay)."""
         for worker in list(self._live):
             if worker.plan is None:
                 self._retire(worker)
@@ -125,7 +125,7 @@ class LocalExecutor(Executor):
         )
         with environment(SINGLE_THREADED), blocked(*_OF_THE_GROUP):
             process.start()
-        theirs.close()  # else the pipe would never report that the worker is gone
+        theirs.close()  # otherwise the pipe would never report that the worker is gone
         worker = _Worker(process=process, pipe=ours)
         self._live.append(worker)
         return worker
@@ -139,8 +139,8 @@ class LocalExecutor(Executor):
 
 
 def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folder: Path) -> None:
-    """Life of a worker: plans in, reports out, until None, the signal to leave, or the driver's death."""
-    # Both may reach the whole process group (Ctrl-C, timeout); it is the driver who decides what they mean.
+    """Run a worker: plans in, reports out, until None, the signal to abandon, or the driver's death."""
+    # Both may reach the whole process group (Ctrl-C, timeout); the driver decides their meaning.
     for number in _OF_THE_GROUP:
         signal.signal(number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _OF_THE_GROUP)
@@ -150,7 +150,7 @@ def _worker_main(pipe: Connection[Report, EpisodePlan | None], maker: str, folde
             pipe.send(attempt_episode(maker, plan, folder))
     except (EOFError, OSError, _Interrupted):
         pass
-    # Nothing is left to be flushed, and native libraries may crash or dawdle while they are torn down.
+    # Nothing is left to flush, and native libraries may crash or stall during teardown.
     sys.stderr.flush()
     os._exit(0)
 

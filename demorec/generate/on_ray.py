@@ -1,8 +1,8 @@
-"""Workers on a Ray cluster: the same worker function, one Ray task an attempt, over a folder that all nodes share.
+"""Workers on a Ray cluster: the same worker function, one Ray task per attempt, over a folder that all nodes share.
 
-Tasks, not actors: Ray places them wherever a CPU is free, also on nodes that join later, and keeps its worker
-processes warm between tasks of one function. Lost tasks come back to the driver, which gives them out again; so
-the bound and the words are those of the local executor.
+Tasks, not actors: Ray places them on any free CPU, including nodes that join later, and keeps its worker processes warm
+between tasks of one function. Lost tasks return to the driver, which submits them again, so that limits and messages
+are those of the local executor.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ except ImportError as error:
     raise MissingDependencyError("The Ray executor", "ray", "pip install 'demorec[ray]'") from error
 
 _QUEUED_PER_WORKER = 0.25
-"""Attempts submitted beyond those that can run: Ray hands a freed CPU the next one without asking the driver."""
+"""Attempts submitted beyond the running ones: Ray gives a freed CPU the next one without asking the driver."""
 _STORE_BYTES = 100 << 20
-"""Object store of a cluster of our own: only lines of run.json pass through it."""
+"""Object store of a cluster started here: only lines of run.json pass through it."""
 _KNOCK_S = 10.0
-"""How long a cluster may take to answer the first time."""
+"""Maximum time for a cluster's first answer, s."""
 _RECOUNT_S = 5.0
-"""How often the cluster is asked for its size."""
+"""Interval at which the cluster's size is queried, s."""
 
 
 class RayExecutor(Executor):
     """Attempts as Ray tasks on the cluster of `connected`.
 
-    Bounded in flight by the size of the cluster, which may change while the run works.
+    The number of running attempts is bounded by the size of the cluster, which may change during the run.
 
     Args:
-        maker: What a worker does with a plan, as "module:function".
-        folder: Of the run; the workers must see it under the same path.
-        options: How many attempts at the same time, what each of them reserves, and after how many of them Ray replaces
-            a worker process.
+        maker: Function that runs a plan, as "module:function".
+        folder: Folder of the run; the workers must see it under the same path.
+        options: Number of simultaneous attempts, resources reserved by each, and number of attempts after which Ray
+            replaces a worker process.
 
     Raises:
         ConfigError: The cluster has no room for a worker.
@@ -81,10 +81,10 @@ class RayExecutor(Executor):
 
     @property
     def workers(self) -> int:
-        """Attempts that the cluster has room for now, or as many as were asked for.
+        """Number of attempts that the cluster has room for now, or the requested number.
 
         Raises:
-            GenerationError: The node that we are connected to has ended: whatever comes back, we cannot reach it.
+            GenerationError: The node of this connection has ended, so that the cluster is out of reach.
         """
         if time.monotonic() - self._counted_at > _RECOUNT_S:
             self._counted_at = time.monotonic()
@@ -100,20 +100,20 @@ class RayExecutor(Executor):
 
     @property
     def has_room(self) -> bool:
-        """Whether less is in flight than the cluster can take."""
+        """Whether fewer attempts are running than the cluster can take."""
         return self.pending < self.workers + int(self.workers * _QUEUED_PER_WORKER * (self._asked is None))
 
     @property
     def pending(self) -> int:
-        """Attempts in flight."""
+        """Number of running attempts."""
         return len(self._pending)
 
     def submit(self, plan: EpisodePlan) -> None:
-        """Hand an attempt to Ray."""
+        """Submit an attempt to Ray."""
         self._pending[self._task.remote(self._maker, plan, self._folder)] = plan
 
     def wait(self, timeout_s: float) -> list[Report]:
-        """What has ended; waits up to `timeout_s` for the first."""
+        """Return the attempts that have ended; waits up to `timeout_s` for the first."""
         waiting = list(self._pending)
         done, _ = ray.wait(waiting, num_returns=1, timeout=timeout_s)
         if done:
@@ -126,11 +126,11 @@ class RayExecutor(Executor):
             except ray.exceptions.TaskCancelledError:
                 reports.append(lost(plan, "it was cancelled"))
             except ray.exceptions.RayTaskError as error:
-                # What the maker raises comes back as a report; this is the worker that cannot even begin.
+                # The maker's exceptions arrive as reports; this is a worker that cannot even start.
                 raise GenerationError(f"A Ray worker cannot work: {_last_line(error)}") from error
             except ray.exceptions.RuntimeEnvSetupError as error:
                 raise GenerationError(f"A Ray worker cannot be set up: {_last_line(error)}") from error
-            except ray.exceptions.LocalRayletDiedError:  # reported when the other reports have been taken in
+            except ray.exceptions.LocalRayletDiedError:  # raised after the other reports have been processed
                 self._pending[reference], self._is_cut_off = plan, True
             except ray.exceptions.RayError as error:
                 self._counted_at = -math.inf  # it may have been a whole node
@@ -138,12 +138,12 @@ class RayExecutor(Executor):
         return reports
 
     def interrupt(self) -> None:
-        """Ask every worker to leave its attempt where it is."""
+        """Ask every worker to abandon its attempt."""
         for reference in self._pending:
             ray.cancel(reference, force=False)
 
     def close(self) -> None:
-        """Cancel what is in flight."""
+        """Cancel the running attempts."""
         if not ray.is_initialized():
             return
         for reference in self._pending:
@@ -152,7 +152,7 @@ class RayExecutor(Executor):
 
 
 def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
-    """What runs on a node."""
+    """Run an attempt on a node."""
     path = Path(folder)
     if not (path / RUN_NAME).exists():
         raise FileNotFoundError(
@@ -164,14 +164,15 @@ def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
 
 @contextmanager
 def connected(address: str, workers: int | None) -> Iterator[None]:
-    """Be connected to a cluster, unless this process is already, and leave it in the end (which ends one of our own).
+    """Connect to a cluster unless this process is connected, and disconnect at exit (which ends a cluster started
+    here).
 
     Args:
-        address: Of the cluster; "local" starts one on this machine.
-        workers: CPUs of that one; None: every core.
+        address: Address of the cluster; "local" starts one on this machine.
+        workers: CPUs of a local cluster; None: every core.
 
     Raises:
-        ConfigError: It cannot be reached.
+        ConfigError: The cluster cannot be reached.
     """
     if ray.is_initialized():
         yield
@@ -183,7 +184,7 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
     _knock(address)
     try:
         ray.init(address=address, **options)
-    except Exception as error:  # Ray raises a bare Exception when a node of its own does not come up in time
+    except Exception as error:  # Ray raises a bare Exception if its own node does not start in time
         ray.shutdown()
         place = "on this machine cannot be started" if address == "local" else f"at {address!r} cannot be reached"
         raise ConfigError(f"The Ray cluster {place}: {_last_line(error)}") from error
@@ -194,10 +195,10 @@ def connected(address: str, workers: int | None) -> Iterator[None]:
 
 
 def _knock(address: str) -> None:
-    """See whether anybody listens at HOST:PORT: Ray itself would try for minutes before it gives up."""
+    """Check that HOST:PORT accepts connections: Ray itself would try for minutes before giving up."""
     host, _, port = address.rpartition(":")
     if not host or "/" in host or not port.isdecimal():
-        return  # "local", "auto", ray://...: Ray knows where to look
+        return  # "local", "auto", ray://...: resolved by Ray
     try:
         with socket.create_connection((host.strip("[]"), int(port)), timeout=_KNOCK_S):
             pass

@@ -1,6 +1,6 @@
-"""How a run is carried out (where, how many, by whom), who watches it, and what it comes to.
+"""Options of a run's execution (place, number, executor), its observer and its result.
 
-None of it decides what an episode contains.
+None of them affects the content of an episode.
 """
 
 from __future__ import annotations
@@ -17,25 +17,24 @@ from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile
 
 @dataclass(frozen=True, kw_only=True)
 class RunOptions:
-    """Everything about a run that leaves the data alone."""
+    """Options of a run that do not affect the data."""
 
     out: OptionalTarget = None
     """Folder of the run (auto: recordings/TASK). Run the same command again to continue where it stopped."""
     num_episodes: int = 50
-    """How many successful episodes to make; a larger number extends the run, a smaller one leaves the rest out."""
+    """Number of successful episodes to make; a larger one extends the run, a smaller one excludes the rest."""
     workers: int | None = None
-    """Processes that simulate (auto: one per core; with Ray, as many as the cluster has room for)."""
+    """Number of simulating processes (auto: one per core; with Ray, as many as the cluster has room for)."""
     executor: Literal["local", "ray"] = "local"
     """Processes on this machine, or tasks on a Ray cluster."""
     address: str = "local"
-    """Ray: the cluster, for example auto (the one that this machine belongs to) or HOST:6379; local: this machine
-    only."""
+    """Ray: address of the cluster, such as auto (that of this machine) or HOST:6379; local: only this machine."""
     cpus_per_worker: float = 1.0
     """Ray: CPUs that each worker reserves."""
     gpus_per_worker: float = 0.0
     """Ray: GPUs that each worker reserves (for --renderer egl)."""
     recycle_after: int = 500
-    """Replace a worker process by a fresh one after this many episodes."""
+    """Replace a worker process after this many episodes."""
     export: bool = True
     """Export the successful episodes to a LeRobot dataset in OUT/dataset."""
     repo_id: str | None = None
@@ -44,7 +43,7 @@ class RunOptions:
     """Delete the run in the output folder and start again."""
 
     def validate(self) -> None:
-        """Raise ConfigError for impossible values."""
+        """Raise ConfigError for invalid values."""
         check_option("num_episodes", self.num_episodes, 1, MAX_EPISODES)
         check_option("workers", self.workers, 1, 100_000)
         check_option("recycle_after", self.recycle_after, 1, 1_000_000)
@@ -57,33 +56,33 @@ class RunOptions:
         if self.repo_id is not None:
             check_repo_id(self.repo_id)
             if not self.export:
-                raise ConfigError("--repo-id names the exported dataset, but --no-export leaves it out: drop one.")
+                raise ConfigError("--repo-id names the exported dataset, but --no-export omits it: remove one of them.")
 
 
 class RunObserver:
-    """Told how a run goes; does nothing itself."""
+    """Receives the progress of a run; this base class ignores it."""
 
     def verifying(self, done: int, total: int) -> None:
-        """Recordings of an earlier session are being verified."""
+        """Handle the verification of recordings from an earlier session."""
 
     def started(self, run: RunFile, workers: int) -> None:
-        """The work begins; `run` knows what is there already."""
+        """Handle the start of the work; `run` contains everything already made."""
 
     def ended(self, attempt: Attempt) -> None:
-        """An attempt has come to its end."""
+        """Handle the end of an attempt."""
 
     def says(self, message: str) -> None:
-        """Something that a person should know."""
+        """Handle a message for the user."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunResult:
-    """What a session has come to.
+    """Result of a session.
 
     Attributes:
-        folder: Of the run.
-        run: All that is known now; where something was made, its last session is this one.
-        made: The attempts of it.
+        folder: Folder of the run.
+        run: Known state of the run; if anything was made, its last session is this one.
+        made: Attempts made in this session.
         interrupted: Whether Ctrl-C or SIGTERM ended it.
     """
 

@@ -1,7 +1,7 @@
-"""Compare a run with what it was to make again: a run, a recording or a dataset.
+"""Comparison of a run with the original that it reproduces: a run, a recording or a dataset.
 
-The recordings of a run are read again, whatever run.json says of them. A dataset is exported again with its own options
-and compared episode by episode, by the content of its tables and videos.
+The recordings of a run are read again, independent of run.json. A dataset is exported again with its own options and
+compared episode by episode, by the content of its tables and videos.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from demorec.runs.run_file import DATASET, RUN_NAME, load_run_file
 Key = tuple[int, int]
 """(episode of the run, attempt)."""
 _COLUMNS = ("run_episode_index", "attempt", "origin", "episode_info")
-"""Columns of the sidecar that tell what made a dataset."""
+"""Columns of the sidecar that describe how a dataset was made."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Original:
-    """What is to be made again.
+    """The original to reproduce.
 
     Attributes:
         source: The run's folder, the recording or the dataset.
-        config: That decided the data.
-        num_episodes: Of the run, as many as are needed to have all that is compared.
-        versions: package -> version that episodes were made with, each such set once.
-        digests: (episode, attempt) -> digest of the content that is there now; "" where `faults` tells of it.
-        faults: One line for each recording that is missing, cannot be read, or is not what run.json says of it.
+        config: Config that determined the data.
+        num_episodes: Number of episodes of the run that are needed for the comparison.
+        versions: package -> version that episodes were made with; each distinct set once.
+        digests: (episode, attempt) -> digest of the current content; "" if it is in `faults`.
+        faults: One line for each recording that is missing, unreadable, or inconsistent with run.json.
         export: Options of the dataset; None for a run or a recording.
     """
 
@@ -57,7 +57,7 @@ class Original:
 
 
 def compare(original: Original, result: RunResult) -> dict[Key, bool]:
-    """Compare a finished run with the original; episode and attempt -> whether it has the same content bit for bit."""
+    """Compare a finished run with the original; returns episode and attempt -> whether its content is bit-exact."""
     made = {(a.episode_index, a.attempt): a.digest for a in result.run.attempts}
     if original.export is not None:
         made = _digests(LeRobotFolder(result.folder / DATASET))
@@ -68,25 +68,25 @@ def export_as_original(original: Original, result: RunResult) -> None:
     """Export a run to its dataset with the options of the original dataset.
 
     Raises:
-        ConfigError: Something else is where the dataset would be.
+        ConfigError: The dataset's place is taken.
         ExportError: The export failed.
     """
     assert original.export is not None
     target = result.folder / DATASET
     there = os.path.lexists(target)
     if there and not is_dataset_of_run(target, result.run.config_digest):
-        raise ConfigError(f"Something else is where the copy of the dataset would be, choose another --out: {target}")
+        raise ConfigError(f"The place for the copy of the dataset is taken; choose another --out: {target}")
     export_lerobot([result.folder], target, replace(original.export, overwrite=there))
 
 
 def read_original(path: Path) -> Original:
-    """Read what a run, a recording or a dataset says about itself.
+    """Read the description of a run, a recording or a dataset.
 
     Args:
         path: A run's folder or its run.json, a recording, or a dataset.
 
     Raises:
-        ConfigError: It is none of these, or says too little to be made again.
+        ConfigError: The path is something else, or lacks information to reproduce it.
         RecordingError: The recording is damaged.
     """
     source = path.parent if path.name == RUN_NAME else path
@@ -96,7 +96,7 @@ def read_original(path: Path) -> Original:
     if kind == "recording":
         return _read_recording(source)
     if not os.path.lexists(source / CONFIGS_PATH):
-        raise ConfigError(f"The dataset does not say what it was made with ({CONFIGS_PATH} is missing): {source}")
+        raise ConfigError(f"The dataset has no record of its configs ({CONFIGS_PATH} is missing): {source}")
     return _read_dataset(source)
 
 
@@ -110,7 +110,7 @@ def _read_run(source: Path) -> Original:
     for attempt in run.attempts:
         key, path = (attempt.episode_index, attempt.attempt), source / attempt.file
         digests[key] = attempt.digest
-        if not attempt.file:  # no scene could be laid out, so that nothing was recorded
+        if not attempt.file:  # no scene was found, so nothing was recorded
             continue
         try:
             with open_simulated(path) as recording:
@@ -121,7 +121,7 @@ def _read_run(source: Path) -> Original:
             continue
         if (info.episode_index, info.attempt, found) != (*key, attempt.digest):
             digests[key] = ""
-            faults.append(f"The recording is not the one that {RUN_NAME} lists: {path}")
+            faults.append(f"The recording differs from the one in {RUN_NAME}: {path}")
         if info.versions not in versions:
             versions.append(info.versions)
     return Original(
@@ -180,13 +180,13 @@ def _read_dataset(source: Path) -> Original:
         )
     except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise ConfigError(
-            f"The dataset does not say enough about itself ({describe_error(error)}): {source}"
+            f"The dataset lacks information to reproduce it ({describe_error(error)}): {source}"
         ) from error
 
 
 def _digests(folder: LeRobotFolder) -> dict[Key, str]:
-    """Digests of what the tables and videos of a dataset hold."""
+    """Compute digests of the content of a dataset's tables and videos."""
     rows, digests = folder.sidecar(_COLUMNS), episode_digests(folder)
     if len(digests) != len(rows):
-        raise ConfigError(f"The dataset has {len(digests)} episodes, its sidecar tells of {len(rows)}: {folder.root}")
+        raise ConfigError(f"The dataset has {len(digests)} episodes, but its sidecar lists {len(rows)}: {folder.root}")
     return {(row["run_episode_index"], row["attempt"]): found for row, found in zip(rows, digests, strict=True)}

@@ -1,7 +1,7 @@
-"""Carries a run out: plans to an executor, lines into run.json, until the asked successes are there.
+"""Driver of a run: plans to an executor, lines into run.json, until the requested successes exist.
 
-The driver holds one line per episode and never an image. Everything that can go wrong ends in one sentence with
-all finished episodes kept; the same command goes on from there.
+The driver holds one line per episode and never an image. Every failure ends in one sentence with all finished episodes
+kept; the same command continues from there.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from demorec.runs.recorded import inspect_recording
 from demorec.runs.run_file import UNFINISHED, Attempt, RunFile
 
 MAX_LOSSES = 5
-"""How often one attempt may lose its worker before the run stops: chance takes few, too little memory takes all."""
+"""Number of workers that one attempt may lose before the run stops: chance takes few, too little memory takes all."""
 GRACE_S = 3.0
-"""How long current episodes may go on after the first Ctrl-C."""
+"""Time, s, that current episodes may continue after the first Ctrl-C."""
 _MORE_MEMORY = "try fewer --workers or a machine with more memory"
-_SOUND_STORAGE = "see whether the storage of the output folder is sound, then run the same command again"
+_SOUND_STORAGE = "check the storage of the output folder, then run the same command again"
 _REFUSED = {
     errno.ENOSPC: "the disk is full",
     errno.EDQUOT: "the quota is used up",
@@ -44,7 +44,7 @@ _REFUSED = {
     errno.EPERM: "permission is denied",
 }
 _MISSING_FILE = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR)
-"""What the user's own code meets where it names a file wrongly."""
+"""Errors of the user's code when it names a file wrongly."""
 
 
 def generate(
@@ -56,21 +56,21 @@ def generate(
     inspect: Inspector = inspect_recording,
     episodes: Iterable[int] | None = None,
 ) -> RunResult:
-    """Make the episodes that the run still lacks.
+    """Make the missing episodes of a run.
 
     Args:
-        config: What decides the data.
-        options: How it is carried out; `out` must be set.
-        progress: Hears how it goes.
+        config: Config that determines the data.
+        options: Options of the execution; `out` must be set.
+        progress: Receives the progress.
         maker: "module:function" that makes an attempt, imported in the workers.
-        inspect: Reads a recording that run.json does not know.
+        inspect: Reads a recording that run.json does not list.
         episodes: Order in which episodes are begun (default: ascending); the result does not depend on it.
 
     Raises:
         MissingDependencyError: Ray is not installed.
         ConfigError: The task cannot be loaded, the robot does not fit its URDF, the Ray cluster cannot be reached,
-            or the folder is in use, holds another run or cannot be written to.
-        GenerationError: The run cannot go on; everything finished is kept.
+            or the folder is in use, contains another run or is not writable.
+        GenerationError: The run cannot continue; everything finished is kept.
         KeyboardInterrupt: At the second Ctrl-C.
     """
     progress = progress or RunObserver()
@@ -87,7 +87,7 @@ def generate(
             return folder.result(interrupted=False)
         schedule.give_back(first)
         if config.cameras and options.executor != "ray":
-            RENDERERS.load(config.renderer)().close()  # compiles what it needs, before several processes would
+            RENDERERS.load(config.renderer)().close()  # compiles the renderer before several processes would
         executor = stack.enter_context(make_executor(options, folder.path, folder.run, maker))
         folder.begin_session(executor=options.executor, workers=executor.workers)
         progress.started(folder.run, executor.workers)
@@ -98,15 +98,16 @@ def generate(
             raise
         folder.end_session("interrupted" if interrupted else "ended")
         result = folder.result(interrupted=interrupted)
-        if not interrupted and not result.run.is_complete:  # whatever the executor was: no run ends well with less
+        # Whatever the executor, an incomplete run must not end as complete.
+        if not interrupted and not result.run.is_complete:
             raise GenerationError(
-                f"The run has ended before it had all that was asked for: run the same command again. {folder.kept}"
+                f"The run has ended before it was complete: run the same command again. {folder.kept}"
             )
         return result
 
 
 def _check_code(config: GenerateConfig) -> None:
-    """Raise what the first worker would raise about the task and the robot, before anything is written."""
+    """Raise the first worker's errors about the task and the robot, before anything is written."""
     from demorec.loop import load_task
     from demorec.tasks.robot_check import check_robot
 
@@ -117,7 +118,7 @@ def _check_code(config: GenerateConfig) -> None:
 
 
 def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
-    """The executor that the options name; a context manager."""
+    """Create the executor named by the options; a context manager."""
     if options.executor == "ray":
         from demorec.generate.on_ray import RayExecutor
 
@@ -128,12 +129,12 @@ def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -
 
 
 class Schedule:
-    """Which attempts are due, in which order; nothing else decides them than the run's config and what is known.
+    """Due attempts and their order, determined only by the run's config and its known attempts.
 
-    An episode's attempts follow each other (attempt n + 1 when n failed), episodes do not wait for each other.
+    An episode's attempts are sequential (attempt n + 1 if n failed); episodes do not wait for each other.
 
     Args:
-        run: What is known.
+        run: Known state of the run.
         episodes: Order in which episodes are begun; the result does not depend on it.
     """
 
@@ -145,7 +146,7 @@ class Schedule:
         self._waiting: deque[EpisodePlan] = deque()
 
     def take(self) -> EpisodePlan | None:
-        """The next attempt, or None when none is due now (one may be after another has failed)."""
+        """Return the next attempt, or None if none is due now (one may become due after a failure)."""
         while not self._waiting:
             index = next(self._episodes, None)
             if index is None:
@@ -154,18 +155,18 @@ class Schedule:
         return self._waiting.popleft()
 
     def give_back(self, plan: EpisodePlan) -> None:
-        """This attempt was not carried out: it comes next."""
+        """Return an attempt that was not run: it comes next."""
         self._waiting.appendleft(plan)
 
     def report(self, attempt: Attempt) -> None:
-        """An attempt has ended; after a failure the next one is due, up to the bound."""
+        """Record the end of an attempt; after a failure the next one is due, up to the limit."""
         index = attempt.episode_index
         self._known[index, attempt.attempt] = attempt.success
         if not attempt.success and index not in self._success:
             self._waiting.extend(self._due(index))
 
     def _due(self, index: int) -> Iterator[EpisodePlan]:
-        """Attempts that must be made now: the first unknown one, or those missing before a known success."""
+        """Yield the attempts to make now: the first unknown one, or those missing before a known success."""
         success = self._success.get(index)
         config, versions = self._run.config, self._run.versions
         for number in range(config.max_attempts if success is None else success):
@@ -186,7 +187,7 @@ class _Driver:
         self._losses: Counter[tuple[int, int]] = Counter()
 
     def work(self) -> bool:
-        """Until nothing is due any more; returns whether the user has interrupted it."""
+        """Work until nothing is due; returns whether the user has interrupted it."""
         with _catch_interrupts() as interrupts:
             for reports in self._reports():
                 for report in reports:
@@ -209,7 +210,7 @@ class _Driver:
     def _reports(self) -> Iterator[list[Report]]:
         try:
             yield from self._executor.carry_out(self._schedule.take, says=self._progress.says)
-        except GenerationError as error:  # the executor knows nothing of the run
+        except GenerationError as error:  # the executor does not know the run
             raise GenerationError(f"{error} {self._folder.kept}") from error
 
     def _drain(self, seconds: float) -> None:
@@ -240,7 +241,7 @@ class _Driver:
         self._folder.check_alive()
         if report.errno in _REFUSED:
             raise GenerationError(
-                f"The output folder cannot take another episode: {_REFUSED[report.errno]}; mend that and run the same "
+                f"The output folder cannot take another episode: {_REFUSED[report.errno]}; fix that and run the same "
                 f"command again. {self._folder.kept}"
             )
         is_own_bug = bool(report.own_line) and report.errno in _MISSING_FILE
@@ -257,13 +258,13 @@ class _Driver:
         raise GenerationError(
             f"Episode {report.plan.episode_index} raised {report.kind}: {report.message or 'no message'} "
             f"(the traceback is in {place}). {self._folder.kept}"
-            + (f"; it came up at {report.own_line}" if report.own_line else "")
+            + (f"; raised at {report.own_line}" if report.own_line else "")
         )
 
 
 @contextmanager
 def _catch_interrupts() -> Iterator[list[int]]:
-    """Catch SIGINT and SIGTERM inside: the first is listed, the second raises KeyboardInterrupt."""
+    """Catch SIGINT and SIGTERM in the context: the first is listed, the second raises KeyboardInterrupt."""
     caught: list[int] = []
 
     def handle(number: int, frame: FrameType | None) -> None:

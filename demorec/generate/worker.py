@@ -1,8 +1,8 @@
-"""What a worker does with a plan: simulate, record, read back, put in place. The same for every executor.
+"""Worker of every executor: simulate, record, verify, and move into place.
 
-An attempt is a pure function of its plan. It is recorded in a folder of this process's own below unfinished/ and
-gets its name in episodes/ or failed/ in one step, when it is complete and has been read back. So what a crash
-leaves is set aside already, and two workers on one plan (a lost one that was not dead) cannot mix.
+An attempt is a pure function of its plan. It is recorded in a separate folder of this process below unfinished/. It is
+moved to episodes/ or failed/ atomically, when it is complete and has been read back. So the remains of a crash are
+already set aside, and two workers on one plan (a lost one that was still alive) cannot mix.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attemp
 
 SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
 STAGES = (SIMULATION, RENDERING, RECORDING)
-"""Of every attempt; the first one of a worker also has STARTING."""
+"""Stages of every attempt; a worker's first one also has STARTING."""
 
 
 def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
     """Make one attempt in the run's folder and return its line of run.json.
 
-    No scene within the task's ranges is a failed attempt without a recording.
+    If the task's ranges contain no scene, the attempt failed without a recording.
 
     Raises:
-        DemorecError: No trustworthy recording could be made, for a reason that another attempt would not mend.
+        DemorecError: No trustworthy recording could be made, for a reason that another attempt would not fix.
         OSError: The folder cannot be written to.
     """
     began, seconds = time.process_time(), dict.fromkeys(STAGES, 0.0)
@@ -80,7 +80,7 @@ def _record(plan: EpisodePlan, path: Path, began: float, seconds: dict[str, floa
     with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
         recording = _Timed(writer, seconds, RECORDING)
         for frame in session.run(ScriptAgent(episode)):
-            if starts:  # the first frame's images included: a worker's first drawing compiles
+            if starts:  # including the first frame's images: a worker's first drawing compiles
                 seconds |= {STARTING: time.process_time() - began, RENDERING: 0.0}
                 starts = False
             recording.write(frame)
@@ -88,19 +88,19 @@ def _record(plan: EpisodePlan, path: Path, began: float, seconds: dict[str, floa
 
 
 def _check_versions(plan: EpisodePlan, here: Mapping[str, str]) -> None:
-    """A module of the user's own that was edited while the run goes on would be mixed into it by a fresh worker."""
+    """Raise if the user's modules were edited during the run: a fresh worker would mix versions."""
     different = () if plan.versions is None else version_differences(plan.versions, here)
     if different:
-        raise ConfigError(f"What decides the run's episodes is not what it was at its start: {'; '.join(different)}")
+        raise ConfigError(f"The inputs of the run's episodes have changed since its start: {'; '.join(different)}")
 
 
 _simulators = SimulatorCache()
-"""Of this process."""
+"""Simulators of this process."""
 
 
 @contextmanager
 def _counted(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Count the CPU seconds of what is done within for a stage."""
+    """Count the CPU seconds of the context for a stage."""
     began = time.process_time()
     try:
         yield
@@ -109,12 +109,12 @@ def _counted(seconds: dict[str, float], stage: str) -> Iterator[None]:
 
 
 def _with_rest(seconds: dict[str, float], began: float) -> dict[str, float]:
-    """Stage -> CPU seconds of an attempt that ends now; what no other stage has counted is simulation."""
+    """Compute stage -> CPU seconds of an attempt that ends now; time outside other stages is simulation."""
     return seconds | {SIMULATION: time.process_time() - began - sum(seconds.values())}
 
 
 class _Timed:
-    """A renderer or writer whose methods count for a stage."""
+    """A renderer or writer with its methods' time counted for a stage."""
 
     def __init__(self, timed: object, seconds: dict[str, float], stage: str) -> None:
         self._timed, self._counted = timed, _counted(seconds, stage)
@@ -123,12 +123,12 @@ class _Timed:
         return self._counted(getattr(self._timed, name))
 
     def close(self) -> None:
-        """Nothing: whoever made it does that."""
+        """Do nothing; the owner closes the wrapped object."""
 
 
 @contextmanager
 def _scratch_folder(folder: Path) -> Iterator[Path]:
-    """A folder that no other attempt uses; taken away when it is empty in the end."""
+    """Create a folder that no other attempt uses; removed at the end if empty."""
     for number in count():
         scratch = folder / UNFINISHED / f"{platform.node()}-{os.getpid()}-{number}"
         with suppress(FileExistsError):  # left by a dead process of the same number

@@ -70,7 +70,7 @@ def test_a_bug_in_a_task_is_named_by_its_line(
     assert exit_code(*flags, "--out", tmp_path / "run", program=generate_dataset_main) == 1
     told = capsys.readouterr().err
     assert f"Episode 0 raised {says}" in told
-    assert re.search(rf"; it came up at left_tasks\.py:{line}: {re.escape(code)}[^\n]*\n$", told), told
+    assert re.search(rf"; raised at left_tasks\.py:{line}: {re.escape(code)}[^\n]*\n$", told), told
 
 
 @pytest.mark.slow
@@ -81,7 +81,7 @@ def test_the_line_may_be_in_a_module_beside_it(
     (tmp_path / "left_helpers.py").write_text("def half(x):\n    return 1 / x\n")
     flags = ["--task", "left_tasks:ToTheLeft", "--num-episodes", "1", "--workers", "1", "--cameras", "none"]
     assert exit_code(*flags, "--out", tmp_path / "run", program=generate_dataset_main) == 1
-    assert capsys.readouterr().err.endswith("; it came up at left_helpers.py:2: return 1 / x\n")
+    assert capsys.readouterr().err.endswith("; raised at left_helpers.py:2: return 1 / x\n")
 
 
 @pytest.mark.parametrize(
@@ -117,7 +117,7 @@ def test_other_commands_name_the_line_too(
     assert exit_code("replay", recording, "--allow", "left_tasks") == 1
     told = capsys.readouterr().err
     assert "demorec replay: KeyError: 'no such body' (the traceback is in " in told
-    assert re.search(r"; it came up at left_tasks\.py:\d+: return \(world\.pose\(\"no such body\"\),\)\n$", told)
+    assert re.search(r"; raised at left_tasks\.py:\d+: return \(world\.pose\(\"no such body\"\),\)\n$", told)
 
 
 @pytest.mark.slow

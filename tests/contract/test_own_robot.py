@@ -268,7 +268,7 @@ def test_a_fresh_worker_does_not_mix_an_edited_module_in(folder: Path, tmp_path:
     forget("my_robots")
     for place in ("episodes", "failed", "unfinished"):
         (tmp_path / "run" / place).mkdir(parents=True)
-    with pytest.raises(ConfigError, match="not what it was at its start: the source of my_robots has changed"):
+    with pytest.raises(ConfigError, match="have changed since its start: the source of my_robots has changed"):
         make_episode(plan, tmp_path / "run")
 
 

@@ -98,7 +98,7 @@ def test_another_digest_in_run_json(run: Path, tmp_path: Path) -> None:
     assert not read_original(spoilt).faults
     edit_json(spoilt / "run.json", lambda data: data["episodes"][0].update(digest="0" * 64))
     (fault,) = read_original(spoilt).faults
-    assert "is not the one that run.json lists" in fault
+    assert "differs from the one in run.json" in fault
 
 
 @pytest.mark.slow
@@ -110,7 +110,7 @@ def test_renderings_of_a_run_are_no_copy_of_it(run: Path, tmp_path: Path, capsys
     for words in (("--config", run), ("--num-episodes", 5, "--seed", 3, "--fps", 10)):
         assert exit_code("generate", *words, "--out", out) == 2
         assert (
-            "Nothing in the output folder was generated, choose another --out: The recording is a render of"
+            "Nothing in the output folder was generated; choose another --out: The recording is a render of"
             in capsys.readouterr().err
         )
     assert {path.name: path.read_bytes() for path in out.rglob("*") if path.is_file()} == there

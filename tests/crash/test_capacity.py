@@ -105,7 +105,7 @@ def test_workers_that_do_not_come_back_end_the_run_with_an_error(
         if ended:
             lost += 1
             done = len(list((out / "episodes").iterdir()))
-            assert "There has been no room for any worker" in ended
+            assert "has had no room for any worker" in ended
             assert f"{done} of {NUM_EPISODES} episodes are complete and kept" in ended
             assert sum("no room for any worker now" in line for line in heard.said) == 1
         assert run_fake(out, num_episodes=NUM_EPISODES).run.digest == reference
@@ -142,5 +142,5 @@ def test_an_executor_that_forgets_a_plan_does_not_end_the_run_well(
                 return []
             return super().wait(timeout_s)
 
-    with pytest.raises(GenerationError, match=r"ended before it had all .* 3 of 4 episodes are complete and kept"):
+    with pytest.raises(GenerationError, match=r"ended before it was complete.* 3 of 4 episodes are complete and kept"):
         run_on(Forgetful(tmp_path / "run", 10_000), tmp_path / "run", monkeypatch, Remembers())

@@ -118,7 +118,7 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
     assert attempts_of(shrunk) == expected_attempts(3)
     assert num_finished(out) == num_finished(reference.folder), "what exists stays"
     (said,) = heard.said
-    assert "asked for now (3), the folder holds recordings of later episodes (5): they stay, outside of" in said
+    assert "requested episodes (3), the folder contains recordings of later ones (5): they stay, but are not in" in said
     again = run_fake(out, num_episodes=8)
     assert again.made == ()
     assert again.run.digest == reference.run.digest
@@ -233,9 +233,9 @@ def test_a_bad_moment_of_the_file_system_is_survived(tmp_path: Path, reference: 
 @pytest.mark.parametrize(
     ("maker", "error", "message"),
     [
-        ("fill_the_disk", GenerationError, "the disk is full; mend that and run the same command again"),
-        ("write_too_much", GenerationError, r"larger than files may be there \(ulimit -f\); mend that"),
-        ("break_the_disk", GenerationError, r"failed to be made 5 times.*Input/output error: see whether the storage"),
+        ("fill_the_disk", GenerationError, "the disk is full; fix that and run the same command again"),
+        ("write_too_much", GenerationError, r"larger than files may be there \(ulimit -f\); fix that"),
+        ("break_the_disk", GenerationError, r"failed to be made 5 times.*Input/output error: check the storage"),
         ("raise_a_bug", GenerationError, r"Episode 2 raised LocalError: the cube is a sphere \(the traceback is in"),
         ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),
     ],

@@ -64,7 +64,7 @@ def test_too_little_memory_says_nothing_about_the_dataset(
     assert exit_code("check", tmp_path / "d", "--lerobot", "--only", "lerobot_opens") == 1
     out, err = capsys.readouterr()
     assert "failed" not in out
-    assert "is there too little memory?" in err
+    assert "free memory or raise its limit" in err
     assert len(err.splitlines()) == 1
 
 

@@ -102,7 +102,7 @@ def test_a_run_has_an_environment_state_if_its_scenes_have_as_many_objects(
             ),
             [
                 "1 recording not of this run, or damaged",
-                "1 unfinished recording (demorec recover keeps what is whole)",
+                "1 unfinished recording (demorec recover keeps the complete frames)",
                 "1 unfinished recording in which nothing was written",
                 "1 error report",
             ],

@@ -176,6 +176,6 @@ def test_a_dataset_that_was_moved_away_is_made_again_and_that_is_said(run: Path,
     before = files_of(tmp_path / "mine")
     said: list[str] = []
     assert export_run(run, repo_id="me/cubes", says=said.append)[1] is not None
-    assert said == ["dataset/ is no longer there; it is made again."]
+    assert said == ["dataset/ is missing; it is made again."]
     assert files_of(tmp_path / "mine") == before
     assert not (run / "unfinished" / "dataset").exists()

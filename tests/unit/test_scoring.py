@@ -132,7 +132,7 @@ def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Call
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (hesitates, "stands still for"),
+        (hesitates, "pauses for"),
         (goes_aside, "takes a detour of"),
         (shakes, "the action shakes"),
         (is_late, "the state follows the action"),

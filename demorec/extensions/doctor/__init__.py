@@ -1,1 +1,1 @@
-"""The doctor: what to know about a dataset before training on it, whoever recorded it."""
+"""The doctor: checks of a dataset from any source before training on it."""

@@ -1,4 +1,4 @@
-"""The joint tree of the robot, as far as the checks need it."""
+"""The joint tree of the robot, for the checks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class StateJoints:
     Attributes:
         urdf: The joint tree.
         joints: (D,) names in it, "" for an element that is not the position of a joint.
-        lower, upper: (D,) limits, rad or m; infinite where they are not known.
+        lower, upper: (D,) limits, rad or m; infinite if unknown.
     """
 
     urdf: Urdf

@@ -1,7 +1,7 @@
-"""A check of the doctor: one fault that people report, the evidence that shows it, and what to do about it.
+"""A check of the doctor: one commonly reported fault, the evidence that shows it, and the fix.
 
-A check is a generator of `Fault`s with the decorator `check`. It reads an `Evidence`, asks for the roles that it needs,
-and raises `NotMeasuredError` with the reason where it cannot judge. Its docstring is its page in `demorec explain`.
+A check is a generator of `Fault`s with the decorator `check`. It reads an `Evidence`, requests the roles that it needs,
+and raises `NotMeasuredError` with the reason if it cannot judge. Its docstring is its page in `demorec explain`.
 """
 
 from __future__ import annotations
@@ -19,24 +19,24 @@ if TYPE_CHECKING:
     from demorec.extensions.doctor.evidence import Evidence
 
 Severity = Literal["look", "broken"]
-"""broken: training on it goes wrong or is impossible. look: unusual, a person should look at it."""
+"""broken: training fails or gives wrong results. look: unusual, to be examined by a person."""
 Verdict = Literal["good", "look", "broken"]
 Family = Literal["files", "time", "numbers", "alignment", "images", "set"]
 RANK: Mapping[str, int] = {"good": 0, "look": 1, "broken": 2}
-"""How bad a verdict is."""
+"""Severity rank of a verdict."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """What a check found in one place.
+    """One finding of a check in one place.
 
     Attributes:
-        severity: How bad it is.
+        severity: Severity of the fault.
         episode: Number of the episode; None for the whole set.
         frames: First and last frame; None for the whole episode.
-        value: What was measured, with its unit.
-        message: One sentence: what is wrong.
-        do: What to do, where that differs from the check's own advice.
+        value: Measured value, with its unit.
+        message: One sentence that describes the fault.
+        do: The fix, if it differs from the check's own advice.
     """
 
     severity: Severity
@@ -66,10 +66,10 @@ class FaultCheck:
 
     Attributes:
         name, family: A noun, and its group.
-        needs: What it needs by role, in few words.
-        measures: What it finds, in at most 50 characters.
-        unit: Of its values.
-        why, do: Why a fault matters, and what to do; `{path}` and `{episode}` are filled in.
+        needs: Required roles, in a few words.
+        measures: Its finding in at most 50 characters.
+        unit: Unit of its values.
+        why, do: Why a fault matters, and the fix; `{path}` and `{episode}` are filled in.
         find: The generator.
     """
 
@@ -84,14 +84,14 @@ class FaultCheck:
 
     @property
     def page(self) -> str:
-        """Its explanation, for people."""
+        """Explanation for users."""
         return inspect.cleandoc(self.find.__doc__ or "")
 
     def run(self, evidence: Evidence) -> tuple[list[DiagnosedFault], str | None]:
-        """Return what it finds, and why it could not be made: "" if it could, None if it does not apply.
+        """Return its findings, and the reason why it could not run: "" if it could, None if it does not apply.
 
         Raises:
-            ResourceError: This machine cannot measure it, which says nothing about the data.
+            ResourceError: This machine cannot measure it, which implies nothing about the data.
         """
         found: list[DiagnosedFault] = []
         try:
@@ -103,7 +103,7 @@ class FaultCheck:
         except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
-            if isinstance(error, ExportError) and self.family == "files":  # a file that cannot be read is a fault
+            if isinstance(error, ExportError) and self.family == "files":  # an unreadable file is a fault
                 return [*found, self._finding(Fault(severity="broken", message=str(error)), evidence)], ""
             if isinstance(error, DemorecError):
                 return found, str(error)
@@ -124,7 +124,7 @@ class FaultCheck:
 def check(
     *, family: Family, needs: str, measures: str, unit: str = "", why: str, do: str
 ) -> Callable[[Callable[[Evidence], Iterator[Fault]]], FaultCheck]:
-    """Make a `FaultCheck` of a generator; its name is the function's."""
+    """Make a `FaultCheck` from a generator; the function's name becomes the check's."""
 
     def wrap(function: Callable[[Evidence], Iterator[Fault]]) -> FaultCheck:
         return FaultCheck(

@@ -1,4 +1,4 @@
-"""`demorec check`: the integrity of files, the doctor, and what is made again."""
+"""`demorec check`: file integrity, the doctor, and remaking of episodes."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ if TYPE_CHECKING:
 
 
 _SHOWN = 12
-"""Differences of one recording that are printed: the first ones tell the most."""
+"""Number of printed differences of one recording: the first ones are the most informative."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckCommand:
     """Judge datasets, runs and recordings before training: files, times, numbers, alignment, images, episodes.
 
-    Prints what each column was taken for, a verdict (good, look, broken), the worst findings with what to do, and the
-    episodes, worst first. Of several datasets, shared episodes are found too. Exit code 1: something is broken.
+    Prints the role of each column, a verdict (good, look, broken), the worst findings with fixes, and the episodes,
+    worst first. With several datasets, shared episodes are found too. Exit code 1: something is broken.
 
     Examples:
       demorec check datasets/cups
@@ -53,25 +53,25 @@ class CheckCommand:
     only: tuple[str, ...] = ()
     """Names of the checks to run (default: all)."""
     urdf: Path | None = None
-    """The robot's description, for recordings and datasets that lack one: its joints are the state's elements by
-    their names, or by their order."""
+    """URDF of the robot, for recordings and datasets without one: joints are matched to the state's elements by name,
+    or by order."""
     motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     strict: bool = False
-    """Exit with 1 where something is worth a look, too."""
+    """Exit with 1 for findings worth a look, too."""
     lerobot: bool = False
-    """Also let the installed LeRobot open each dataset, which takes seconds."""
+    """Also open each dataset with the installed LeRobot, which takes seconds."""
     deep: bool = False
-    """Also make every recording, and every episode of a dataset, again from config and seed, and compare every number
-    and image; takes about as long as generating them."""
+    """Also remake every recording, and every episode of a dataset, from config and seed, and compare every number and
+    image; takes about as long as generating them."""
     workers: int | None = None
-    """Processes that check the files of recordings (auto: one for each core, or one where starting them would take
+    """Number of processes that check the files of recordings (auto: one per core, or one if starting them would take
     longer than the checks)."""
     all: bool = False
     """Print all findings and all episodes."""
     allow: Allow = ()
-    """With --deep: a module or package of your own that may be imported for the tasks, robots and cameras that the
-    files name, and beside which their models may be read."""
+    """With --deep: user module or package that may be imported for tasks, robots and cameras named in the files, and
+    next to which their models may be read."""
     json: bool = False
     """Print JSON."""
 
@@ -146,7 +146,7 @@ class CheckCommand:
             say_json({"paths": [as_json(path, diagnosis) for path, diagnosis in both], **deep})
 
     def _description(self) -> str:
-        """Text of the URDF that the user names, "" for none; ConfigError for what is none."""
+        """Read the URDF named by the user, "" for none; ConfigError if it is invalid."""
         if self.urdf is None:
             return ""
         from demorec.core.files import read_text_limited
@@ -156,7 +156,7 @@ class CheckCommand:
             text = read_text_limited(self.urdf, MAX_BYTES)
             Urdf.parse(text)
         except (OSError, ValueError) as error:
-            raise ConfigError(f"--urdf is no robot's description ({describe_error(error)}): {self.urdf}") from error
+            raise ConfigError(f"--urdf is not a robot description ({describe_error(error)}): {self.urdf}") from error
         return text
 
     def _remade(self, subjects: Sequence[Subject], workers: int) -> Iterator[DeepReport]:
@@ -164,7 +164,8 @@ class CheckCommand:
 
         allowed = allowed_modules(self.allow)
         paths = [subject.path for subject in subjects if subject.kind == "recording"]
-        runs = [subject.path for subject in subjects if subject.kind == "run"]  # whose datasets hold the same episodes
+        # Their datasets contain the same episodes.
+        runs = [subject.path for subject in subjects if subject.kind == "run"]
         datasets = [s.path for s in subjects if s.kind == "dataset" and s.path.parent not in runs]
         found = [deep_checks(paths, workers=workers, allowed=allowed)]
         found += [deep_dataset_checks(path, allowed=allowed) for path in datasets]
@@ -177,7 +178,7 @@ class CheckCommand:
 
 
 def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
-    """One line about a recording, below it the versions that differ, then what differs, the first frames first."""
+    """Yield one line about a recording, then the versions that differ, then the differences, first frames first."""
     yield f"{report.level:<4}  made again {report.path}: {_verdict(report)}"
     details = [f"Not provable here: {line}" for line in report.versions]
     if report.error:
@@ -204,11 +205,11 @@ def _verdict(report: DeepReport) -> str:
 
 
 def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) -> str:
-    """The end of the last line: how many were made again, how many of them differ, how many cannot be; "" for none.
+    """Summarise how many recordings were made again, differ, or cannot be made again; "" if none was tried.
 
     Args:
-        remade: All that were tried.
-        different: Those among them that count as failed; what cannot be made again is one of them.
+        remade: All attempted ones.
+        different: Those that count as failed, including those that cannot be made again.
     """
     impossible = sum(bool(report.error) for report in remade)
     made, differ = len(remade) - impossible, sum(not report.error for report in different)
@@ -219,7 +220,7 @@ def deep_summary(remade: Sequence[DeepReport], different: Sequence[DeepReport]) 
 
 
 def plain_deep(report: DeepReport) -> dict[str, Any]:
-    """The same as plain data for JSON, with every frame that differs."""
+    """Convert the report to plain data for JSON, with every different frame."""
     from demorec.core.plain import to_plain
 
     plain = to_plain(report)

@@ -1,4 +1,4 @@
-"""Verdict and score of episodes, as columns to choose and sort them by, and as an order to view them in."""
+"""Verdict and score of episodes, as columns for selection and sorting, and as a viewing order."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from demorec.view.sources import RankedEpisode
 def judged_columns(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:
     """Judge each episode: the "verdict", the "score", or both.
 
-    The verdict needs the images, which takes as long as `demorec check`; the score is from the tables alone.
+    The verdict needs the images, which takes as long as `demorec check`; the score needs only the tables.
     """
     evidence = evidence_of_dataset(folder.root, ReadOptions(images="verdict" in names))
     found = {each.episode: each for each in diagnose(evidence).episodes}

@@ -1,4 +1,4 @@
-"""The diagnosis of a set of episodes: findings, a verdict and a score for each episode, and what was not measured."""
+"""The diagnosis of a set of episodes: findings, verdict and score of each episode, and unmeasured checks."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ class EpisodeVerdict:
 
     Attributes:
         episode: Its number.
-        verdict: The worst of its findings.
-        score: 1 where nothing is unusual; 0 where it is broken.
-        reasons: Sentences, the worst first.
+        verdict: Worst severity of its findings.
+        score: 1 if nothing is unusual; 0 if it is broken.
+        reasons: Sentences, worst first.
     """
 
     episode: int
@@ -32,23 +32,23 @@ class EpisodeVerdict:
 
     @property
     def rank(self) -> tuple[int, float, int]:
-        """Key that sorts the worst first."""
+        """Sort key, worst first."""
         return -RANK[self.verdict], self.score, self.episode
 
 
 @dataclass(frozen=True, kw_only=True)
 class Diagnosis:
-    """What the doctor found.
+    """Result of the doctor.
 
     Attributes:
-        path: Of the set.
-        taken: Column -> the role that it was taken for.
-        findings: The worst first.
-        episodes: The worst first.
-        not_measured: Check -> why it could not be made.
-        num_checks: Checks that were made.
-        num_frames: Frames that were read.
-        cameras: Names of the cameras whose images were decoded.
+        path: Path of the set.
+        taken: Column -> its role.
+        findings: Findings, worst first.
+        episodes: Verdicts, worst first.
+        not_measured: Check -> reason why it could not run.
+        num_checks: Number of checks made.
+        num_frames: Number of frames read.
+        cameras: Names of the cameras with decoded images.
     """
 
     path: Path
@@ -62,11 +62,11 @@ class Diagnosis:
 
     @property
     def verdict(self) -> Verdict:
-        """The worst of the findings."""
+        """Worst severity of the findings."""
         return max((finding.severity for finding in self.findings), key=RANK.__getitem__, default="good")
 
     def to_json(self) -> dict[str, Any]:
-        """As docs/checks.md describes it."""
+        """Convert to JSON data as described in docs/checks.md."""
         return {
             "verdict": self.verdict,
             "taken": dict(self.taken),
@@ -99,15 +99,15 @@ class Diagnosis:
 def diagnose(
     evidence: Evidence, checks: Sequence[FaultCheck] | None = None, extra: Sequence[DiagnosedFault] = ()
 ) -> Diagnosis:
-    """Make all checks, or some.
+    """Run all checks, or some.
 
     Args:
         evidence: The set.
-        checks: Which ones are made; all by default.
-        extra: Findings of others about the same set, such as those of its files' integrity.
+        checks: Checks to run; all by default.
+        extra: Other findings about the same set, such as those of its files' integrity.
 
     Raises:
-        ResourceError: This machine cannot make one.
+        ResourceError: This machine cannot run one of them.
     """
     findings = list(extra)
     not_measured: dict[str, str] = {}
@@ -135,7 +135,7 @@ def diagnose(
 
 
 def _verdicts(evidence: Evidence, findings: Sequence[DiagnosedFault]) -> tuple[EpisodeVerdict, ...]:
-    """The verdict on each episode, the worst first."""
+    """Build the verdict on each episode, worst first."""
     found = []
     for number, score in score_episodes(evidence).items():
         own = [finding for finding in findings if finding.episode == number]

@@ -1,4 +1,4 @@
-"""What the checks look at: every episode read once, its numbers by role, its images as small grey thumbnails."""
+"""Input of the checks: every episode read once, its numbers by role, its images as small grey thumbnails."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Flags = NDArray[np.bool_]
 _HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
-"""How the joints of a hand with fingers are called."""
+"""Joint names of a hand with fingers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -37,10 +37,10 @@ class EpisodeEvidence:
         instruction: Its task; several are joined.
         columns: Feature -> (T, D) as recorded.
         state: (T, D) elements of the state without gaps, quaternions without changes of sign; None without a state.
-        action: (T, K) elements of the action, likewise; None without an action.
-        time_s: (T,) measured timestamps of the frames; None where they are not known.
-        image_ages_s: Camera or feature -> (T,) how much older than its frame each image or sample is.
-        drops: What was lost while recording, in words.
+        action: (T, K) elements of the action, processed likewise; None without an action.
+        time_s: (T,) measured timestamps of the frames; None if unknown.
+        image_ages_s: Camera or feature -> (T,) age of each image or sample relative to its frame.
+        drops: Losses while recording, in words.
     """
 
     number: int
@@ -54,12 +54,12 @@ class EpisodeEvidence:
 
     @property
     def length(self) -> int:
-        """T."""
+        """Number of frames, T."""
         return len(next(iter(self.columns.values()), ()))
 
     @cached_property
     def speed(self) -> Array:
-        """(T - 1,) speed of the state, each element in units of its usual step; zeros without a state."""
+        """Compute the (T - 1,) speed of the state, each element in units of its usual step; zeros without a state."""
         if self.state is None or len(self.state) < 2:
             return np.zeros(max(self.length - 1, 0))
         steps = np.diff(self.state, axis=0)
@@ -72,20 +72,20 @@ class Evidence:
     """A set of episodes, read.
 
     Attributes:
-        path: As the user named it.
+        path: Path given by the user.
         fps: Frames per second.
-        roles: Of its features.
-        episodes: Those that can be read, in order.
-        unreadable: Number of an episode -> why it cannot be read.
+        roles: Roles of its features.
+        episodes: Readable episodes, in order.
+        unreadable: Number of an episode -> reason why it cannot be read.
         folder: The open LeRobot dataset; None for recordings.
-        cameras: Camera -> its images; empty where they are not looked at.
-        images_missing: Why no image is looked at, "" if they are.
-        urdf: Text of the robot's description, "" where it is not known.
-        robot_problem: Why the description of the robot that belongs to the dataset cannot be read, "" if it can.
+        cameras: Camera -> its images; empty if images are not examined.
+        images_missing: Reason why images are not examined, "" if they are.
+        urdf: Text of the robot's description, "" if unknown.
+        robot_problem: Reason why the dataset's robot description cannot be read, "" if it can.
         arm_joints: Joint of the URDF for each element of the state, "" for others.
-        opens_lerobot: Whether the installed LeRobot opens the dataset too.
+        opens_lerobot: Whether to open the dataset with the installed LeRobot too.
         names: Number of an episode -> its file, for recordings.
-        earlier: The sets that the user named before this one.
+        earlier: The sets named before this one.
     """
 
     path: Path
@@ -106,7 +106,7 @@ class Evidence:
 
     @property
     def quoted_path(self) -> str:
-        """The path for a shell, with braces doubled for `str.format`."""
+        """Path quoted for a shell, with braces doubled for `str.format`."""
         return shlex.quote(str(self.path))
 
     def without_images(self) -> Evidence:
@@ -125,7 +125,7 @@ class Evidence:
 
     @cached_property
     def is_gripper(self) -> Flags:
-        """(D,) which elements of the state are grippers or their fingers."""
+        """Flags (D,) of the state's elements that are grippers or their fingers."""
         if not self.roles.state:
             return np.zeros(0, dtype=np.bool_)
         hands = np.array([_HAND.search(name) is not None for name in self.elements], dtype=np.bool_)
@@ -133,7 +133,7 @@ class Evidence:
 
     @cached_property
     def action_of(self) -> list[int | None]:
-        """For each element of the state its place in the action; None where it has none."""
+        """Index in the action of each element of the state; None if missing."""
         if not (self.roles.state and self.roles.action):
             return [None] * len(self.elements)
         return self.roles.in_state(self.roles.action)
@@ -145,7 +145,7 @@ class Evidence:
 
     @cached_property
     def ranges(self) -> Array:
-        """(D,) usual range of each element of the state within an episode: the median of the episodes'."""
+        """Usual range (D,) of each element of the state within an episode: the median over the episodes."""
         if not self.with_state():
             return np.zeros(0)
         spans = [np.ptp(state, axis=0) for _, state in self.with_state()]
@@ -158,7 +158,7 @@ class Evidence:
         ]
 
     def need_state(self, min_frames: int = 2) -> list[tuple[EpisodeEvidence, Array]]:
-        """As `with_state`. Raises NotMeasuredError if there are none."""
+        """Return `with_state`. Raises NotMeasuredError if it is empty."""
         if not self.roles.state:
             raise NotMeasuredError("no column is known to be the state (name it: --state COLUMN)")
         if not (found := self.with_state(min_frames)):
@@ -166,11 +166,11 @@ class Evidence:
         return found
 
     def need_images(self) -> Mapping[str, CameraThumbnails]:
-        """Return the cameras. Raises NotMeasuredError if there are none."""
+        """Return the cameras. Raises NotMeasuredError without cameras."""
         if self.images_missing:
             raise NotMeasuredError(self.images_missing)
         if not self.cameras:
-            raise NotMeasuredError("there are no cameras")
+            raise NotMeasuredError("cameras are missing")
         return self.cameras
 
     def once[T](self, derive: Callable[..., T], *arguments: object) -> T:
@@ -187,16 +187,16 @@ class Evidence:
         return cast("T", found)
 
     def seconds(self, frames: float) -> float:
-        """Duration of frames."""
+        """Convert a number of frames to a duration."""
         return frames / self.fps
 
     def taken(self) -> Iterator[tuple[str, Role | None]]:
-        """Yield (column, role) of every feature but counters."""
+        """Yield (column, role) of every feature except counters."""
         yield from self.roles.of.items()
 
 
 def joined(parts: Sequence[str], columns: Mapping[str, NDArray[Any]]) -> Array | None:
-    """Return (T, D) of features one behind the other, without gaps; None if there are none or one is missing."""
+    """Concatenate features to (T, D), without gaps; None if the list is empty or one is missing."""
     if not parts or any(part not in columns for part in parts):
         return None
     values = np.hstack([columns[part].reshape(len(columns[part]), -1) for part in parts])
@@ -204,7 +204,7 @@ def joined(parts: Sequence[str], columns: Mapping[str, NDArray[Any]]) -> Array |
 
 
 def quaternion_places(names: Sequence[str]) -> list[int]:
-    """Return the first of each four adjacent elements that are x, y, z and w of one rotation, in either order."""
+    """Find the first of each four adjacent elements that are x, y, z and w of one rotation, in either order."""
     fours = [(start, names[start : start + 4]) for start in range(len(names) - 3)]
     return [
         start
@@ -214,7 +214,7 @@ def quaternion_places(names: Sequence[str]) -> list[int]:
 
 
 def continuous(values: Array | None, names: Sequence[str]) -> Array | None:
-    """Return (T, D) values whose quaternions keep their sign: both signs mean the same rotation."""
+    """Make quaternions in (T, D) values keep their sign: both signs mean the same rotation."""
     if values is None or not len(values):
         return values
     for place in quaternion_places(names):
@@ -223,5 +223,5 @@ def continuous(values: Array | None, names: Sequence[str]) -> Array | None:
 
 
 def number_in_words(value: float) -> str:
-    """Return three digits of a number, for people."""
+    """Format a number with three digits."""
     return f"{value:.3g}" if math.isfinite(value) else str(value)

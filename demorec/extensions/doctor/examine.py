@@ -1,4 +1,4 @@
-"""Examination of a path: the sets that it holds, how each is read, and the diagnosis in words."""
+"""Examination of a path: its sets, how each is read, and the diagnosis in words."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from demorec.extensions.doctor.from_dataset import ReadOptions
 
 MAX_FINDINGS = 10
-"""Findings that are printed: the worst ones come first."""
+"""Maximum number of printed findings, worst first."""
 MAX_EPISODES = 20
 _MAX_NUMBERS = 12
-"""Episodes of one finding that are listed by number."""
+"""Maximum number of episodes listed by number in one finding."""
 _WIDTH = 110
 
 
@@ -34,14 +34,14 @@ def examine(
     checks: Sequence[FaultCheck] | None = None,
     earlier: Sequence[Evidence] = (),
 ) -> tuple[Diagnosis, Evidence | None]:
-    """Diagnose a dataset, a run, or recordings; returns the evidence too, None where nothing can be opened.
+    """Diagnose a dataset, a run, or recordings; also returns the evidence, None if nothing can be opened.
 
     Args:
-        path: What the user named.
-        options: How it is read.
-        reports: The integrity of its files, which becomes findings.
-        checks: Which ones are made; all by default.
-        earlier: Sets that the user named before it.
+        path: Path given by the user.
+        options: Options for reading.
+        reports: Integrity of its files, which becomes findings.
+        checks: Checks to run; all by default.
+        earlier: Sets named before it.
     """
     from demorec.core.errors import ExportError
     from demorec.extensions.doctor.checks import all_checks
@@ -76,7 +76,7 @@ def _evidence(path: Path, options: ReadOptions) -> Evidence:
     found = find(path)
     if found.kind == "dataset":
         return evidence_of_dataset(path, options)
-    rollouts = found.failed if found.kind == "evaluation" else ()  # whose failures are results, not rejects
+    rollouts = found.failed if found.kind == "evaluation" else ()  # failed rollouts are results, not rejects
     return evidence_of_recordings(path, (*found.recordings, *rollouts), open_recording, options)
 
 
@@ -120,7 +120,7 @@ def _unopened(error: Exception, path: Path) -> DiagnosedFault:
 
 
 def _integrity_findings(reports: Iterable[SubjectReport]) -> Iterator[DiagnosedFault]:
-    """What the checks of files found, as findings; those of a recording belong to its episode."""
+    """Convert results of the file checks to findings; those of a recording belong to its episode."""
     from demorec.extensions.doctor.base import DiagnosedFault
 
     recordings = [report.path for report in reports if report.kind == "recording"]
@@ -148,7 +148,7 @@ def _is_unmade(result: Result) -> bool:
 
 
 def lines_of(diagnosis: Diagnosis, *, everything: bool = False) -> Iterator[str]:
-    """The diagnosis for people: roles, verdict, the worst findings with what to do, and the episodes, worst first."""
+    """Yield the diagnosis in words: roles, verdict, the worst findings with fixes, and the episodes, worst first."""
     yield f"{diagnosis.path}: {_taken(diagnosis)}"
     yield _verdict(diagnosis)
     if diagnosis.not_measured:
@@ -164,7 +164,7 @@ def lines_of(diagnosis: Diagnosis, *, everything: bool = False) -> Iterator[str]
 
 
 def _taken(diagnosis: Diagnosis) -> str:
-    """Which column was taken for what."""
+    """Describe the role of each column."""
     roles: dict[str, list[str]] = {}
     for column, role in diagnosis.taken.items():
         roles.setdefault(role or "no role", []).append(column)
@@ -193,7 +193,7 @@ def _by_reason(not_measured: Mapping[str, str]) -> dict[str, list[str]]:
 
 
 def _folded(findings: Sequence[DiagnosedFault]) -> Iterator[list[DiagnosedFault]]:
-    """Findings of one check and severity together, in order; those of the whole set by themselves."""
+    """Group findings of one check and severity, in order; those of the whole set stay separate."""
     groups: dict[tuple[str, str, str], list[DiagnosedFault]] = {}
     for finding in findings:
         own = finding.message if finding.episode is None else ""
@@ -228,5 +228,5 @@ def _episodes(diagnosis: Diagnosis, *, everything: bool) -> Iterator[str]:
 
 
 def as_json(path: Path, diagnosis: Diagnosis) -> dict[str, Any]:
-    """As docs/checks.md describes it, with the path."""
+    """Convert to JSON data as described in docs/checks.md, with the path."""
     return {"path": str(path), **diagnosis.to_json()}

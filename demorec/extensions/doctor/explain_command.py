@@ -1,4 +1,4 @@
-"""`demorec explain`: what one check looks at, why it matters, and what to do about its findings."""
+"""`demorec explain`: input of one check, why it matters, and the fix for its findings."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Explain:
-    """Explain a check: what it looks at, its limits, why it matters, and what to do.
+    """Explain a check: its input, its limits, why it matters, and the fix.
 
     Examples:
       demorec explain action_lag
@@ -29,7 +29,7 @@ class Explain:
     """Name of the check, as demorec check prints it and demorec list checks lists it."""
 
     def run(self) -> int:
-        """Print its page."""
+        """Print the page of the check."""
         from demorec.core.tables import FILE_CHECKS
 
         _, doctors = split_checks((self.check,))
@@ -50,10 +50,10 @@ def _row(name: str, text: str, width: int) -> Iterator[str]:
 
 
 def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[FaultCheck, ...]]:
-    """Find the named checks: names of those of files' integrity, and those of the doctor; all of them without names.
+    """Find the named checks: names of file integrity checks, and checks of the doctor; all of them without names.
 
     Raises:
-        ConfigError: There is no such check.
+        ConfigError: Unknown check.
     """
     from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
@@ -64,12 +64,12 @@ def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[FaultChec
     for name in names:
         if name not in doctors and name not in FILE_CHECKS.names():
             near = nearest_match(name, [*doctors, *FILE_CHECKS.names()])
-            raise ConfigError(f"There is no check {name!r}.{near} demorec list checks prints them.")
+            raise ConfigError(f"Unknown check {name!r}.{near} demorec list checks prints them.")
     return tuple(n for n in names if n not in doctors), tuple(doctors[n] for n in names if n in doctors)
 
 
 def check_rows() -> Iterator[tuple[str, str]]:
-    """Yield (name, what it finds) of every check, the doctor's first."""
+    """Yield (name, summary) of every check, the doctor's first."""
     from demorec.core.tables import FILE_CHECKS
     from demorec.extensions.doctor.checks import all_checks
 

@@ -26,14 +26,14 @@ from demorec.robots.motors import Motors
 
 @dataclass(frozen=True, kw_only=True)
 class ReadOptions:
-    """How evidence is read.
+    """Options for reading evidence.
 
     Attributes:
         images: Whether images are decoded.
-        named: Features whose role the user names.
-        motors: The servos whose values state and action are, if the user says so.
-        urdf: Text of the robot's description that the user names, "" for none.
-        lerobot: Whether the installed LeRobot opens the dataset.
+        named: Features with a role named by the user.
+        motors: Servos that state and action belong to, if given by the user.
+        urdf: Text of the robot's description given by the user, "" for none.
+        lerobot: Whether to open the dataset with the installed LeRobot.
     """
 
     images: bool = True
@@ -44,10 +44,10 @@ class ReadOptions:
 
 
 def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
-    """Read a dataset; what cannot be read of an episode spoils that episode alone.
+    """Read a dataset; unreadable data excludes only its episode.
 
     Raises:
-        ConfigError: The dataset lacks a feature that the user names.
+        ConfigError: The dataset lacks a feature that the user named.
         ExportError: info.json or the table of episodes cannot be read.
     """
     folder = LeRobotFolder(root, named=options.named)
@@ -100,7 +100,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
 
 
 def _refuse_empty(place: EpisodePlace, columns: Mapping[str, NDArray[Any]], folder: LeRobotFolder) -> None:
-    """Raise ExportError for an episode without frames, or without whole numbers where info.json has them."""
+    """Raise ExportError for an episode without frames, or without integers where info.json has them."""
     if place.length == 0:
         raise ExportError(f"Episode {place.episode_index} has no frames: {folder.root}")
     for name, values in columns.items():
@@ -109,7 +109,7 @@ def _refuse_empty(place: EpisodePlace, columns: Mapping[str, NDArray[Any]], fold
 
 
 def _robot(folder: LeRobotFolder, options: ReadOptions, elements: tuple[str, ...]) -> DatasetRobot | None:
-    """The robot that the user names by its servos, the sidecar describes, or the elements' names imply."""
+    """Determine the robot from the user's servos, the sidecar, or the elements' names."""
     if options.motors is not None and elements == options.motors.names:
         return robot_of_motors(options.motors)
     digests = {row["robot_digest"] for row in folder.sidecar(["robot_digest"])} - {None}
@@ -129,7 +129,7 @@ def _joints(robot: DatasetRobot | None, folder: LeRobotFolder, elements: tuple[s
 def _in_si(
     columns: Mapping[str, NDArray[Any]], robot: DatasetRobot | None, *parts: tuple[str, ...]
 ) -> Mapping[str, NDArray[Any]]:
-    """The columns with state and action in rad and m, by the units that the robot's record states."""
+    """Convert state and action columns to rad and m, by the units in the robot's record."""
     assert robot is not None
     from demorec.episode.info import Feature
 
@@ -143,12 +143,12 @@ def _in_si(
 
 
 def _is_absent(folder: LeRobotFolder, key: str) -> bool:
-    """Whether none of a camera's video files is here, as after a download of the tables alone."""
+    """Check whether all of a camera's video files are missing, as after a download of the tables alone."""
     return not any(place.videos[key][0].exists() for place in folder.listed)
 
 
 def _why_no_images(folder: LeRobotFolder) -> str:
-    """Why no image is looked at: no video file is here; "" if there are some, or no cameras."""
+    """Explain why no image is examined because all video files are missing; "" if some exist, or no cameras."""
     keys = folder.info.video_keys
     if keys and all(_is_absent(folder, key) for key in keys):
         return f"no video of {', '.join(keys)} is here; download them"
@@ -202,7 +202,7 @@ def _read_stored(
 
 
 def why_unreadable(root: Path, named: NamedRoles) -> str:
-    """Why a dataset cannot be opened at all, "" if it can."""
+    """Explain why a dataset cannot be opened at all; "" if it can."""
     try:
         folder = LeRobotFolder(root, named=named)
         folder.roles  # noqa: B018

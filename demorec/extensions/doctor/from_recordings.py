@@ -23,11 +23,11 @@ _NANOSECONDS = 1e9
 
 
 class ReadableEpisode(Protocol):
-    """What is read of a recording."""
+    """Interface of a recording for the doctor."""
 
     @property
     def info(self) -> EpisodeInfo:
-        """What was known before its first frame."""
+        """Description before its first frame."""
 
     @property
     def cameras(self) -> Sequence[str]:
@@ -35,32 +35,32 @@ class ReadableEpisode(Protocol):
 
     @property
     def outcome(self) -> Outcome | None:
-        """How it ended; None where a crash cut it off."""
+        """Outcome; None if a crash cut it off."""
 
     def table(self) -> Table:
-        """Its numbers, and which images its frames show."""
+        """Read its numbers, and the images of its frames."""
 
     def description(self) -> str:
-        """Text of the URDF of a simulated robot."""
+        """Read the URDF of a simulated robot."""
 
     def images(self, camera: str) -> Iterator[NDArray[np.uint8]]:
-        """The (H, W, 3) images of a camera, in order."""
+        """Yield the (H, W, 3) images of a camera, in order."""
 
 
 Opener = Callable[[Path], AbstractContextManager[ReadableEpisode]]
 
 
 def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, options: ReadOptions) -> Evidence:
-    """Read recordings as one set; one that cannot be read spoils itself alone.
+    """Read recordings as one set; an unreadable one is excluded alone.
 
     Args:
-        path: As the user named the set.
-        files: The recordings, in order; their numbers are those of their places here.
+        path: Path given by the user.
+        files: The recordings, in order; they are numbered by their index here.
         opened: Opens a recording.
-        options: How they are read.
+        options: Options for reading.
 
     Raises:
-        ConfigError: The user names a feature that a recording lacks, or one of a simulated recording.
+        ConfigError: The user named a feature that a recording lacks, or one of a simulated recording.
     """
     episodes: list[EpisodeEvidence] = []
     unreadable: dict[int, str] = {}
@@ -102,7 +102,7 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, op
 
 
 def _with_cameras(roles: Roles | None, images: Mapping[str, Any]) -> Roles:
-    """The roles with those of the cameras, which recordings keep apart."""
+    """Add the roles of the cameras, which recordings store separately."""
     if roles is None:
         return find_roles({}, NamedRoles())
     of = {**roles.of, **dict.fromkeys(images, "camera")}

@@ -1,4 +1,4 @@
-"""How the state follows the action: as a target or an increment, by how many frames, and which element by which."""
+"""Relation of state and action: target or increment, delay in frames, and matching elements."""
 
 from __future__ import annotations
 
@@ -15,24 +15,24 @@ from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.extensions.doctor.robust import finest
 
 MAX_LAG_S = 0.7
-"""Range of the lags that are tried, to both sides: a hobby servo under teleoperation needs 0.1 to 0.3 s."""
+"""Range of tried lags, s, in both directions: a hobby servo under teleoperation needs 0.1 to 0.3 s."""
 MIN_LAGS = 3
-"""Frames to each side, at least."""
+"""Minimum number of tried frames in each direction."""
 MAX_UNEXPLAINED = 0.4
-"""Share of an element's variance that its action leaves unexplained, up to which the lag can be judged by it."""
+"""Maximum ratio of an element's variance left unexplained by its action, for the lag to be judged by it."""
 MIN_MOTION = 0.2
-"""Share of its usual range by which an element moves in an episode that is judged by it."""
+"""Minimum motion of an element in an episode judged by it, as a ratio of its usual range."""
 _SMALL = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeLag:
-    """How an episode's state follows its action.
+    """Delay of an episode's state after its action.
 
     Attributes:
-        lag: Frames by which it follows; fractions are interpolated.
+        lag: Delay in frames; fractions are interpolated.
         curve: (L,) mean logarithm of the unexplained variance at each lag, over the judged elements.
-        element_lags: (J,) the lag of each judged element.
+        element_lags: (J,) lag of each judged element.
     """
 
     lag: float
@@ -42,13 +42,13 @@ class EpisodeLag:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ActionRelation:
-    """How the state follows the action in a set of episodes.
+    """Relation of state and action in a set of episodes.
 
     Attributes:
-        kind: "target": the action is where the state goes; "increment": by how much it changes until the next frame.
+        kind: "target": the action is the position to reach; "increment": the change until the next frame.
         lags: (L,) tried lags, frames.
-        elements, columns: (K,) elements of the arm in the state, and the same ones in the action.
-        episodes: Number of an episode -> its lag, of those that move enough.
+        elements, columns: (K,) elements of the arm in the state, and the matching ones in the action.
+        episodes: Number of an episode -> its lag, for those that move enough.
     """
 
     kind: Literal["target", "increment"]
@@ -64,7 +64,7 @@ class ActionRelation:
 
 
 def relation_of(evidence: Evidence) -> ActionRelation:
-    """Find how the state follows the action. Raises NotMeasuredError where it follows in no known way."""
+    """Find how the state follows the action. Raises NotMeasuredError if neither relation applies."""
     episodes = [each for each, _ in evidence.need_state() if each.action is not None]
     if not evidence.roles.action or not episodes:
         raise NotMeasuredError("no column is known to be the action (name it: --action COLUMN)")
@@ -79,7 +79,7 @@ def relation_of(evidence: Evidence) -> ActionRelation:
     reach = max(MIN_LAGS, round(MAX_LAG_S * evidence.fps))
     long = [each for each in episodes if each.length >= 3 * reach + 4]
     if not long:
-        raise NotMeasuredError("the episodes are too short to tell whether state or action is first")
+        raise NotMeasuredError("the episodes are too short to determine whether state or action comes first")
     lags = np.arange(-reach, reach + 1)  # not before: a stated rate of 2**31 would fill the memory
     best: ActionRelation | None = None
     fit = MAX_UNEXPLAINED
@@ -104,7 +104,7 @@ def _curves(
     lags: NDArray[np.intp],
     evidence: Evidence,
 ) -> Array:
-    """(L, K) share of each element's variance that its action leaves unexplained at each lag; NaN where it rests."""
+    """Compute (L, K) ratio of each element's variance left unexplained by its action at each lag; NaN if it rests."""
     assert episode.state is not None
     assert episode.action is not None
     state = episode.state[:, elements]
@@ -118,7 +118,7 @@ def _curves(
 
 
 def _unexplained(values: Array, others: Array) -> Array:
-    """(K,) one minus the squared correlation of columns, 1 where one of them rests."""
+    """Compute (K,) one minus the squared correlation of columns, 1 if one of them rests."""
     one, two = values - values.mean(axis=0), others - others.mean(axis=0)
     size = (one**2).sum(axis=0) * (two**2).sum(axis=0)
     squared = (one * two).sum(axis=0) ** 2 / np.where(size > 0, size, 1.0)
@@ -126,7 +126,7 @@ def _unexplained(values: Array, others: Array) -> Array:
 
 
 def _usual_minimum(curves: list[Array]) -> float:
-    """Median over episodes and moving elements of the least unexplained share."""
+    """Compute the median over episodes and moving elements of the minimum unexplained ratio."""
     lowest = np.concatenate([curve.min(axis=0) for curve in curves])
     known = lowest[np.isfinite(lowest)]
     return float(np.median(known)) if len(known) else 1.0

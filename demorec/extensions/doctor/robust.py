@@ -1,4 +1,4 @@
-"""Robust figures: medians instead of means, so that a bad episode does not decide what is usual."""
+"""Robust figures: medians instead of means, so that a bad episode does not change the usual values."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ NORMAL = 1.4826
 
 
 def usual(values: Sequence[float] | NDArray[np.floating], floor: float = 0.0) -> tuple[float, float]:
-    """Return the median and the robust standard deviation, at least `floor`; NaN are left out."""
+    """Return the median and the robust standard deviation, at least `floor`; NaN are ignored."""
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known)]
     if not len(known):
@@ -24,7 +24,7 @@ def usual(values: Sequence[float] | NDArray[np.floating], floor: float = 0.0) ->
 
 
 def without_gaps(values: NDArray[np.floating]) -> Array:
-    """(T, D) values with the last number before each gap in its place; gaps at the start take the first number.
+    """Fill gaps in (T, D) values with the preceding number; gaps at the start take the first number.
 
     A column without any number becomes zero.
     """
@@ -45,7 +45,7 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def finest(lags: Sequence[int], errors: NDArray[np.floating]) -> float:
-    """Return the lag of the least error: the best of whole lags, refined by a parabola through its neighbours."""
+    """Return the lag of the minimum error: the best of integer lags, refined by a parabola through its neighbours."""
     best = int(np.argmin(errors))
     if best in (0, len(errors) - 1):
         return float(lags[best])

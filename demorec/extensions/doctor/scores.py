@@ -1,8 +1,8 @@
-"""Score each episode by how far its quantities are from those of the other episodes of its instruction.
+"""Scores of episodes by the distance of their quantities from those of other episodes with the same instruction.
 
-The distance counts in usual spreads: a robust standard deviation over these episodes, at least the least spread of
-`_QUANTITIES`, below which differences do not matter. Most episodes lose nothing. Elements of state and action count in
-units of their range in the set, so that radians, degrees and per cent are equal.
+The distance is in usual spreads: a robust standard deviation over these episodes, at least the minimum spread of
+`_QUANTITIES`, below which differences do not matter. Most episodes lose nothing. Elements of state and action are
+scaled by their range in the set, so that radians, degrees and per cent are equivalent.
 """
 
 from __future__ import annotations
@@ -22,37 +22,38 @@ from demorec.extensions.doctor.evidence import Evidence
 from demorec.extensions.doctor.robust import NORMAL
 
 MIN_EPISODES = 12
-"""Episodes of one instruction that are compared among themselves; fewer are compared with the whole set."""
+"""Minimum number of episodes with one instruction to compare them with each other; fewer are compared with the whole
+set."""
 _HALF = 7.0
-"""Usual spreads at which about two thirds are taken off."""
+"""Number of usual spreads that costs about two thirds of the score."""
 _STEEPNESS = 4
 _MIN_LOSS = 0.05
-"""Loss of score from which a reason is given."""
+"""Minimum loss of score for a reason to be given."""
 _QUANTITIES: Mapping[str, tuple[float, str]] = {
-    "pause": (0.1, "stands still for {value:.1f} s amid the motion, usual are {usual:.1f} s"),
-    "path": (0.1, "takes a detour of {value:.0%} of the range, usual are {usual:.0%}"),
+    "pause": (0.1, "pauses for {value:.1f} s during the motion (usually {usual:.1f} s)"),
+    "path": (0.1, "takes a detour of {value:.0%} of the range (usually {usual:.0%})"),
     "noise": (0.2, "the action shakes {ratio:.1f} times as much as usual"),
     "duration": (0.1, "takes {ratio:.2f} times as long as usual"),
-    "lag": (0.3, "the state follows the action by {value:+.0f} frames, usual are {usual:+.0f}"),
-    "switches": (0.12, "the gripper is switched {value:.0f} times, usual are {usual:.0f}"),
+    "lag": (0.3, "the state follows the action by {value:+.0f} frames (usually {usual:+.0f})"),
+    "switches": (0.12, "the gripper is switched {value:.0f} times (usually {usual:.0f})"),
 }
-"""Quantity -> its least spread, and the reason in words; {ratio} is that of logarithms."""
+"""Quantity -> its minimum spread, and the reason in words; {ratio} is that of logarithms."""
 _TWO_SIDED = ("duration", "lag", "switches")
-"""Quantities of which less than usual is odd as well."""
+"""Quantities for which less than usual is unusual as well."""
 _MIN_FRAMES = 8
 _HIGH = 0.65
-"""Share of its range above which a gripper's command counts as high."""
+"""Minimum of a gripper's high command, as a ratio of its range."""
 _LOW = 0.35
-"""Share of its range below which a gripper's command counts as low again."""
+"""Maximum of a gripper's low command, as a ratio of its range."""
 _STILL_RATIO = 0.08
-"""Share of the episode's fast speed (its 90 % quantile) below which an arm stands still."""
+"""Maximum speed of an arm at rest, relative to the episode's fast speed (its 90 % quantile)."""
 _STEADY = 0.02
-"""Share of its range by which a gripper that stands still may move."""
+"""Maximum motion of a gripper at rest, as a ratio of its range."""
 _MAX_LAG_S = 0.5
 
 
 class Reason(NamedTuple):
-    """One loss of score: the factor that is left, in words, the first and the last frame."""
+    """One loss of score: the remaining factor, the reason in words, the first and the last frame."""
 
     kind: str
     factor: float
@@ -64,7 +65,7 @@ class Reason(NamedTuple):
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeScore:
-    """Score of one episode; reasons begin with the heaviest."""
+    """Score of one episode; the largest loss comes first."""
 
     episode: int
     score: float
@@ -72,7 +73,7 @@ class EpisodeScore:
 
 
 class QuantityReading(NamedTuple):
-    """A number, and the first and last frame that it comes from."""
+    """A number, and its first and last frame."""
 
     value: float
     first: int
@@ -80,14 +81,14 @@ class QuantityReading(NamedTuple):
 
 
 class ArmMotion(NamedTuple):
-    """State and action (T, D) of the same elements; without an action the state stands for it."""
+    """State and action (T, D) of the same elements; without an action the state replaces it."""
 
     state: Array
     action: Array
 
 
 def score_episodes(evidence: Evidence) -> dict[int, EpisodeScore]:
-    """Episode number -> its score: 1 where nothing is unusual; 0 where it cannot be read or is too short."""
+    """Compute episode number -> its score: 1 if nothing is unusual; 0 if it is unreadable or too short."""
     flaws = dict.fromkeys(evidence.unreadable, "cannot be read")
     flaws |= {e.number: f"has {e.length} frames" for e in evidence.episodes if e.length < _MIN_FRAMES}
     readings = measure(evidence)
@@ -133,7 +134,7 @@ def _judged(name: str, readings: Mapping[int, QuantityReading]) -> Iterator[tupl
 
 
 def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
-    """Episode number -> quantity -> its number, of all episodes that are long enough; empty without a state."""
+    """Compute episode number -> quantity -> its number, for episodes that are long enough; empty without a state."""
     columns = [column for column in evidence.action_of if column is not None]
     has_action = len(columns) == len(evidence.elements) > 0
     motions: dict[int, ArmMotion] = {}
@@ -146,7 +147,7 @@ def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
 
 
 def _range(values: Sequence[Array]) -> Array:
-    """Return the least and the largest value (2, D) of all episodes without the outermost tenth of them."""
+    """Return the minimum and maximum value (2, D) of all episodes, excluding the outermost tenth of them."""
     if not values:
         return np.zeros((2, 0))
     low = np.quantile([part.min(axis=0) for part in values], 0.1, axis=0)
@@ -155,7 +156,7 @@ def _range(values: Sequence[Array]) -> Array:
 
 
 def _shares(values: Array, ranges: Array) -> Array:
-    """Return values (T, K) in units of their ranges (2, K); an element that hardly moves counts less than others."""
+    """Return values (T, K) in units of their ranges (2, K); an element that hardly moves has less weight."""
     width = ranges[1] - ranges[0]
     floor = max(0.2 * float(np.median(width)), 1e-9) if len(width) else 1.0
     return np.asarray((values - ranges[0]) / np.maximum(width, floor), dtype=np.float64)
@@ -182,7 +183,7 @@ def _readings(
 
 
 def _pause(state: Array, openings: Array, fps: float) -> QuantityReading:
-    """Return the longest time for which arm (T, K) and grippers (T, G) stand still amid the motion."""
+    """Return the longest time for which arm (T, K) and grippers (T, G) rest between motions."""
     steps = np.linalg.norm(np.diff(state, axis=0), axis=1)
     is_still = steps < _STILL_RATIO * max(float(np.quantile(steps, 0.9)), 1e-9)
     is_still &= (np.abs(np.diff(openings, axis=0)) < _STEADY).all(axis=1)
@@ -195,7 +196,7 @@ def _pause(state: Array, openings: Array, fps: float) -> QuantityReading:
 
 
 def _detour(state: Array, bounds: Sequence[int]) -> QuantityReading:
-    """Return how much longer the path is than straight lines between the bounds, and the stretch with most of it."""
+    """Return the excess of the path over straight lines between the bounds, and the segment with most of it."""
     excess = []
     for first, last in pairwise(bounds):
         path = float(np.linalg.norm(np.diff(state[first : last + 1], axis=0), axis=1).sum())
@@ -205,13 +206,13 @@ def _detour(state: Array, bounds: Sequence[int]) -> QuantityReading:
 
 
 def _roughness(values: Array) -> QuantityReading:
-    """Return the logarithm of the third differences: smooth motion has hardly any, white noise has most."""
+    """Return the logarithm of the third differences: small for smooth motion, maximal for white noise."""
     third = np.linalg.norm(np.diff(values, 3, axis=0), axis=1)
     return QuantityReading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
 
 
 def _lag(state: Array, action: Array, fps: float) -> float | None:
-    """Return by how many frames the state follows the action, a target or an increment; None if it does not."""
+    """Return the frames by which the state follows the action, a target or an increment; None if it does not."""
     reach = max(2, round(_MAX_LAG_S * fps))
     if len(state) < 4 * reach:
         return None

@@ -1,4 +1,4 @@
-"""Images of a camera, decoded once and kept as grey thumbnails with the change from each to the next."""
+"""Images of a camera, decoded once and kept as grey thumbnails with the change between consecutive ones."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demorec.core.geometry import Array
 SIDE = 16
 """Pixels along each side of a thumbnail."""
 _MAX_SAMPLES = 96
-"""Pixels along each side, at most, that are compared from one image to the next."""
+"""Maximum number of pixels along each side for the comparison of consecutive images."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -25,10 +25,10 @@ class EpisodeThumbnails:
 
     Attributes:
         thumbnails: (N, 16, 16) grey, 0 to 255.
-        change: (N,) mean difference of each image's pixels from the one before, of 255; 0 for the first.
+        change: (N,) mean difference of each image's pixels from the previous one, of 255; 0 for the first.
         detail: (N,) mean difference of adjacent pixels, of 255.
         colour: (3,) mean red, green and blue, 0 to 1.
-        frames: (N,) frame that each image belongs to.
+        frames: (N,) frame of each image.
     """
 
     thumbnails: NDArray[np.uint8]
@@ -38,7 +38,7 @@ class EpisodeThumbnails:
     frames: NDArray[np.intp]
 
     def taken(self, numbers: NDArray[np.intp], frames: NDArray[np.intp]) -> EpisodeThumbnails:
-        """Take some of the images, for these frames."""
+        """Select some of the images, for these frames."""
         return EpisodeThumbnails(
             thumbnails=self.thumbnails[numbers],
             change=self.change[numbers],
@@ -49,13 +49,13 @@ class EpisodeThumbnails:
 
     @property
     def steps(self) -> Array:
-        """(N - 1,) mean difference of each thumbnail from the one before, of 255."""
+        """Mean difference (N - 1,) of each thumbnail from the previous one, of 255."""
         later, earlier = self.thumbnails[1:].astype(np.int16), self.thumbnails[:-1].astype(np.int16)
         return np.asarray(np.abs(later - earlier).mean(axis=(1, 2), dtype=np.float64))
 
     @property
     def mean(self) -> Array:
-        """(16, 16) mean thumbnail."""
+        """Mean thumbnail (16, 16)."""
         return np.asarray(self.thumbnails.mean(axis=0, dtype=np.float64))
 
 
@@ -64,8 +64,8 @@ class CameraThumbnails:
     """The images of one camera.
 
     Attributes:
-        episodes: Number of an episode -> its images, of those that decode.
-        errors: Number of an episode -> why its images do not decode.
+        episodes: Number of an episode -> its images, if they decode.
+        errors: Number of an episode -> reason why its images do not decode.
     """
 
     episodes: Mapping[int, EpisodeThumbnails] = field(default_factory=dict)
@@ -73,14 +73,14 @@ class CameraThumbnails:
 
 
 class Shrinker:
-    """Shrinks the images of one camera; a frame's own converter would be set up again for each."""
+    """Shrinks the images of one camera with a shared converter; a frame's own would be set up again each time."""
 
     def __init__(self) -> None:
         self._reformatter = VideoReformatter()
         self._colours = VideoReformatter()
 
     def shrink(self, images: Iterable[av.VideoFrame], frames: NDArray[np.intp] | None = None) -> EpisodeThumbnails:
-        """Read all images of an episode; `frames` are those that they belong to, by default one after the other."""
+        """Read all images of an episode; `frames` are the frames of the images, by default consecutive."""
         thumbnails: list[NDArray[np.uint8]] = []
         changes: list[float] = []
         details: list[float] = []
@@ -107,7 +107,7 @@ class Shrinker:
 
 
 def _sampled(image: av.VideoFrame) -> NDArray[np.int16]:
-    """Every n-th pixel of the brightness of an image."""
+    """Take every n-th pixel of the brightness of an image."""
     if image.format.name == "rgb24":
         pixels = image.to_ndarray()[:, :, 1]
     else:

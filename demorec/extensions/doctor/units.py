@@ -1,4 +1,4 @@
-"""Episodes whose numbers have another size than those of the others, as another unit makes them."""
+"""Episodes with numbers of a different magnitude than those of the others, as caused by another unit."""
 
 from __future__ import annotations
 
@@ -11,16 +11,16 @@ from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import Evidence
 
 MIN_OTHERS = 3
-"""Episodes, at least, that one is compared with."""
+"""Minimum number of episodes to compare one with."""
 MIN_UNIT_RATIO = 7.0
-"""Ratio of sizes from which an episode has another unit: demonstrations of one task differ by a factor of two or three,
-the nearest confusion of units is 11."""
+"""Minimum ratio of magnitudes of an episode in another unit: demonstrations of one task differ by a factor of two or
+three, the nearest confusion of units is 11."""
 BOUND_QUANTILES = (0.005, 0.995)
-"""Share of the frames below and above the bounds of the whole set: a single wrong reading widens none."""
+"""Quantiles that bound the whole set: a single wrong reading does not widen them."""
 
 
 def other_units(evidence: Evidence) -> dict[int, dict[str, float]]:
-    """Episode -> "state" or "action" -> ratio of its size to the others', of those that have another unit."""
+    """Find episode -> "state" or "action" -> ratio of its magnitude to the others', for episodes in another unit."""
     found: dict[int, dict[str, float]] = {}
     for role in ("state", "action"):
         values = {e.number: v for e in evidence.episodes if (v := getattr(e, role)) is not None and len(v)}
@@ -31,7 +31,7 @@ def other_units(evidence: Evidence) -> dict[int, dict[str, float]]:
 
 
 def state_bounds(evidence: Evidence) -> tuple[Array, Array]:
-    """(D,) lowest and highest value of each element of the state in the whole set but episodes in another unit."""
+    """Compute the (D,) minimum and maximum of each element of the state, excluding episodes in another unit."""
     others = evidence.once(other_units)
     states = [state for episode, state in evidence.with_state() if episode.number not in others]
     if not states:
@@ -41,7 +41,7 @@ def state_bounds(evidence: Evidence) -> tuple[Array, Array]:
 
 
 def _other_sizes(values: Mapping[int, Array]) -> dict[int, float]:
-    """Episode -> ratio of its size to that of the others, of those in which most elements agree on a large one."""
+    """Find episode -> ratio of its magnitude to that of the others, if most of its elements agree on a large one."""
     sizes = {number: np.sqrt((each**2).mean(axis=0)) for number, each in values.items()}
     spans = {number: np.ptp(each, axis=0) for number, each in values.items()}
     usual_size, usual_span = (np.median(np.stack(list(part.values())), axis=0) for part in (sizes, spans))

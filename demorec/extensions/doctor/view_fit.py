@@ -1,4 +1,4 @@
-"""How well the state explains the images: the thumbnails, predicted by ridge regression on the other episodes."""
+"""Prediction of thumbnails from the state, by ridge regression on the other episodes."""
 
 from __future__ import annotations
 
@@ -15,28 +15,28 @@ from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbn
 from demorec.extensions.doctor.units import other_units
 
 MIN_EPISODES = 5
-"""Episodes, at least: each is predicted from the others."""
+"""Minimum number of episodes: each is predicted from the others."""
 MIN_FRAMES = 20
 MAX_LAG_S = 1.0
 MAX_UNRELATED_RATIO = 0.25
-"""Share of what the state usually explains, up to which the states of other episodes are tried."""
+"""Maximum explained variance, relative to the usual one, at which the states of other episodes are tried."""
 MAX_COMPARED = 5
-"""Episodes, at most, that are compared with all others."""
+"""Maximum number of episodes that are compared with all others."""
 _COMPONENTS = 8
 _MAX_PAIRED = 8
-"""Elements of the state up to which products of two are features too."""
+"""Maximum number of state elements for which products of two are features too."""
 _RIDGE = 1e-2
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ViewFit:
-    """How well the state explains a camera's images in one episode.
+    """Prediction of a camera's images from the state in one episode.
 
     Attributes:
-        lags: (L,) frames by which the images come later than the state.
-        explained: (L,) share of the images' variance that the state explains at each lag.
-        by_another: Largest share that the state of another episode explains; 0 where it was not computed, as the own
-            state explains enough.
+        lags: (L,) delays of the images after the state, frames.
+        explained: (L,) ratio of the images' variance explained by the state at each lag.
+        by_another: Maximum ratio explained by another episode's state; 0 if not computed, because its own state
+            explains enough.
     """
 
     lags: NDArray[np.intp]
@@ -45,17 +45,17 @@ class ViewFit:
 
     @property
     def best(self) -> float:
-        """Share that it explains at the best lag."""
+        """Explained ratio at the best lag."""
         return float(self.explained.max())
 
     @property
     def lag(self) -> float:
-        """The lag at which it explains most."""
+        """Lag with the largest explained ratio."""
         return finest(self.lags.tolist(), -self.explained)
 
 
 def view_fits(evidence: Evidence) -> Mapping[str, Mapping[int, ViewFit]]:
-    """Camera -> episode -> how well the state explains its images, by a fit on the other episodes."""
+    """Fit camera -> episode -> prediction of its images from the state, by the other episodes."""
     return {camera: _fits(evidence, images) for camera, images in evidence.cameras.items()}
 
 
@@ -70,7 +70,7 @@ def _fits(evidence: Evidence, images: CameraThumbnails) -> Mapping[int, ViewFit]
     reach = max(3, round(MAX_LAG_S * evidence.fps))
 
     def fit(shown: int, stated: int) -> ViewFit:
-        """Fit the images of one episode to the state of one, by what the episodes but the first show."""
+        """Predict the images of one episode from the state of another, by a fit on the episodes except the first."""
         others = [state for number, state in states.items() if number != shown]
         predicted = _features(_within(states[stated], others)) @ weights[shown]
         length = min(len(predicted), len(outputs[shown]))
@@ -87,14 +87,14 @@ def _fits(evidence: Evidence, images: CameraThumbnails) -> Mapping[int, ViewFit]
 
 
 def _unexplained(fits: Mapping[int, ViewFit]) -> list[int]:
-    """Few episodes whose images the state explains least, and less than usual."""
+    """Select a few episodes with the least explained images, less than usual."""
     limit = MAX_UNRELATED_RATIO * float(np.median([fit.best for fit in fits.values()]))
     found = [number for number, fit in fits.items() if fit.best < limit]
     return sorted(found, key=lambda number: fits[number].best)[:MAX_COMPARED]
 
 
 def _weights(states: Mapping[int, Array], outputs: Mapping[int, Array]) -> dict[int, Array]:
-    """Episode -> (F, 8) weights that predict images from features, fitted to all other episodes."""
+    """Compute episode -> (F, 8) weights that predict images from features, fitted to all other episodes."""
     inputs = {number: _features(state) for number, state in states.items()}
     products = {number: (x.T @ x, x.T @ outputs[number]) for number, x in inputs.items()}
     squares, crossed = (sum(pair[k] for pair in products.values()) for k in (0, 1))
@@ -107,7 +107,7 @@ def _weights(states: Mapping[int, Array], outputs: Mapping[int, Array]) -> dict[
 
 
 def _scaled(evidence: Evidence, episodes: Mapping[int, EpisodeEvidence]) -> dict[int, Array]:
-    """Episode -> (T, E) moving elements of the state in units of their range."""
+    """Compute episode -> (T, E) moving elements of the state in units of their range."""
     states = {number: episode.state for number, episode in episodes.items() if episode.state is not None}
     alive = evidence.ranges > 0
     middle = np.median(np.stack([np.median(state, axis=0) for state in states.values()]), axis=0)[alive]
@@ -115,14 +115,14 @@ def _scaled(evidence: Evidence, episodes: Mapping[int, EpisodeEvidence]) -> dict
 
 
 def _within(state: Array, others: Sequence[Array]) -> Array:
-    """(T, E) state, no further out than the others: a fit of squares and products says nothing beyond its data."""
+    """Clip the state (T, E) to the range of the others: a fit of squares and products does not extrapolate."""
     lowest = np.min([other.min(axis=0) for other in others], axis=0)
     highest = np.max([other.max(axis=0) for other in others], axis=0)
     return np.clip(state, lowest, highest)
 
 
 def _features(state: Array) -> Array:
-    """(T, F) elements, their squares and products."""
+    """Compute (T, F) elements, their squares and products."""
     parts = [np.ones((len(state), 1)), state, state**2]
     if state.shape[1] <= _MAX_PAIRED:
         first, second = np.triu_indices(state.shape[1], 1)
@@ -131,7 +131,7 @@ def _features(state: Array) -> Array:
 
 
 def _outputs(images: Mapping[int, EpisodeThumbnails]) -> dict[int, Array]:
-    """Episode -> (T, 8) principal components of the thumbnails, each episode around its own mean."""
+    """Compute episode -> (T, 8) principal components of the thumbnails, each episode around its own mean."""
     flat = {n: each.thumbnails.reshape(len(each.thumbnails), -1).astype(np.float32) for n, each in images.items()}
     centred = {number: each - each.mean(axis=0) for number, each in flat.items()}
     covariance = sum((each.T @ each) / max(float((each**2).sum()), 1e-9) for each in centred.values())
@@ -140,7 +140,7 @@ def _outputs(images: Mapping[int, EpisodeThumbnails]) -> dict[int, Array]:
 
 
 def _explained(predicted: Array, shown: Array, lags: NDArray[np.intp]) -> Array:
-    """(L,) share of the variance of what is shown that the prediction explains when it is that many frames earlier."""
+    """Compute the (L,) ratio of the shown variance explained by the prediction at each lag."""
     reach = int(lags[-1])
     core = predicted[reach : len(predicted) - reach]
     core = core - core.mean(axis=0)
@@ -154,7 +154,7 @@ def _explained(predicted: Array, shown: Array, lags: NDArray[np.intp]) -> Array:
 
 
 def _known(evidence: Evidence, camera: CameraThumbnails) -> Mapping[int, tuple[EpisodeEvidence, EpisodeThumbnails]]:
-    """Episodes that have both numbers and images of every frame."""
+    """Select the episodes that have both numbers and images of every frame."""
     return {
         number: (episode, images)
         for number, images in camera.episodes.items()

@@ -1,4 +1,4 @@
-"""How much the motion of each joint changes the images of a camera, fitted to all frames."""
+"""Effect of each joint's motion on the images of a camera, fitted to all frames."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbn
 from demorec.extensions.doctor.units import other_units
 
 MIN_FRAMES = 20
-"""Frames, at least, from which the change is learned."""
+"""Minimum number of frames for the fit."""
 _SWEEPS = 100
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VisibleMotion:
-    """What motion changes in the images of a camera.
+    """Effect of motion on the images of a camera.
 
     Attributes:
         weights: (D,) change of an image, of 255, for a step of each element by its usual range.
@@ -29,12 +29,12 @@ class VisibleMotion:
     usual_change: float
 
     def expected(self, evidence: Evidence, episode: EpisodeEvidence, images: EpisodeThumbnails) -> Array:
-        """(N - 1,) change from each image to the next that the motion lets expect, at most the usual one."""
+        """Compute (N - 1,) change between consecutive images expected from the motion, at most the usual one."""
         return np.asarray(np.minimum(_steps(evidence, episode, images) @ self.weights, 2 * self.usual_change))
 
 
 def visible_motion(evidence: Evidence, camera: CameraThumbnails) -> VisibleMotion | None:
-    """Fit the change of a camera's images to the joints' steps; None where nothing moves or changes."""
+    """Fit the change of a camera's images to the joints' steps; None if nothing moves or changes."""
     steps: list[Array] = []
     changes: list[Array] = []
     for number, images in camera.episodes.items():
@@ -54,7 +54,7 @@ def visible_motion(evidence: Evidence, camera: CameraThumbnails) -> VisibleMotio
 
 
 def _non_negative_fit(squares: Array, products: Array) -> Array:
-    """(D,) weights of least squares, none below zero, by coordinate descent on the normal equations."""
+    """Solve (D,) non-negative least squares weights by coordinate descent on the normal equations."""
     weights = np.zeros(len(products))
     for _ in range(_SWEEPS):
         for place in np.flatnonzero(np.diag(squares) > 0):
@@ -64,7 +64,7 @@ def _non_negative_fit(squares: Array, products: Array) -> Array:
 
 
 def _steps(evidence: Evidence, episode: EpisodeEvidence, images: EpisodeThumbnails) -> Array:
-    """(N - 1, D) size of each element's step between images, in units of its usual range."""
+    """Compute (N - 1, D) size of each element's step between images, in units of its usual range."""
     assert episode.state is not None
     position = episode.state[np.minimum(images.frames, len(episode.state) - 1)]
     ranges = evidence.ranges

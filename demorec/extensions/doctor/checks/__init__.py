@@ -1,4 +1,4 @@
-"""The checks: those that the modules of this folder define, and rows `checks` of other extensions."""
+"""The checks of this folder's modules, and rows `checks` of other extensions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ FAMILIES: tuple[Family, ...] = ("files", "time", "numbers", "alignment", "images
 
 @cache
 def all_checks() -> tuple[FaultCheck, ...]:
-    """All checks by family, in the order of their modules and of their lines."""
+    """List all checks by family, in the order of their modules and lines."""
     modules = sorted(module.name for module in pkgutil.iter_modules(__path__))
     loaded = [importlib.import_module(f"{__name__}.{name}") for name in modules]
     found = [value for module in loaded for value in vars(module).values() if isinstance(value, FaultCheck)]

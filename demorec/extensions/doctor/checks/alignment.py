@@ -1,4 +1,4 @@
-"""Checks of alignment: does the action belong to the state of its frame?"""
+"""Checks of alignment between the action and the state of its frame."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ from demorec.extensions.doctor.relation import ActionRelation, EpisodeLag, relat
 from demorec.extensions.doctor.robust import usual
 
 MIN_OTHERS = 3
-"""Episodes, at least, that one is compared with."""
+"""Minimum number of episodes to compare one with."""
 MIN_SHIFT = 0.7
-"""Frames by which the lag of an episode differs, at least: whole frames are lost or doubled, not parts."""
+"""Minimum difference, frames, of an episode's lag: frames are lost or doubled as a whole, not in part."""
 MIN_GAIN = 0.7
-"""Natural logarithm of the factor by which an episode's own lag leaves less variance unexplained: two."""
+"""Minimum natural logarithm of the factor by which an episode's own lag reduces the unexplained variance: two."""
 MIN_LEAD = 0.25
-"""Frames by which the state is ahead of its action from which the two are misaligned: a command is never late."""
+"""Minimum lead, frames, of the state over its action that indicates misalignment: a command is never late."""
 MAX_LAG_S = 0.35
-"""Time by which a state usually follows at most: hobby servos under teleoperation need 0.1 to 0.2 s."""
+"""Maximum usual delay of the state: hobby servos under teleoperation need 0.1 to 0.2 s."""
 EQUAL_RATIO = 1e-4
-"""Difference of action and state, as a share of the range, up to which they are the same number."""
+"""Maximum difference of action and state, as a ratio of the range, that counts as equal."""
 MIN_EQUAL_SHARE = 0.95
-"""Share of the moving frames with equal numbers from which the action is the state."""
+"""Minimum ratio of moving frames with equal numbers at which the action is the state."""
 MIN_PAIR_GAIN = 4.0
-"""Times by which the other element explains an element's motion better where the two are exchanged."""
+"""Minimum factor by which the other element explains an element's motion better if the two are exchanged."""
 
 
 @check(
@@ -40,10 +40,10 @@ MIN_PAIR_GAIN = 4.0
     do="shift the action in the program that recorded it, or drop the episodes: " + DROP,
 )
 def action_lag(evidence: Evidence) -> Iterator[Fault]:
-    """Compare how far the state follows the action: over the whole set, and in each episode against the others.
+    """Compare the delay of the state after the action: over the whole set, and in each episode with the others.
 
     The lag is where the action explains most of the state's motion, as a target or as an increment. The state may
-    follow by up to 0.35 s; it cannot be ahead. An episode is judged by the difference from the usual lag.
+    follow by up to 0.35 s, but cannot lead. An episode is judged by its difference from the usual lag.
     """
     relation = evidence.once(relation_of)
     usual_lag = relation.usual_lag
@@ -76,7 +76,7 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _prefers(episode: EpisodeLag, relation: ActionRelation, shift: float) -> bool:
-    """Whether the episode's own lag explains clearly more than the usual one, in most of its elements."""
+    """Check whether the episode's own lag explains clearly more than the usual one, in most of its elements."""
     usual_place = int(np.argmin(np.abs(relation.lags - relation.usual_lag)))
     gain = float(episode.curve[usual_place] - episode.curve.min())
     same_side = np.sign(episode.element_lags - relation.usual_lag) == np.sign(shift)
@@ -89,13 +89,13 @@ def _prefers(episode: EpisodeLag, relation: ActionRelation, shift: float) -> boo
     needs="state, action",
     measures="actions that are the state of the same frame",
     unit="% of frames",
-    why="A policy learns to command where the arm already is: it stands still.",
+    why="A policy learns to command the arm's current position: the arm does not move.",
     do="record the command that was sent, or take the state of a later frame as the action",
 )
 def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
-    """Count the moving frames in which the action is the number of the state of the same frame.
+    """Count the moving frames in which the action equals the state of the same frame.
 
-    Elements are paired by name. The arm alone counts: grippers rest on what they hold.
+    Elements are paired by name. Grippers are excluded, since they rest on objects.
     """
     pairs = [
         (element, column)
@@ -115,7 +115,7 @@ def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
         if moves.sum() >= 10:
             shares[episode.number] = float(equal[moves].mean())
     if not shares:
-        raise NotMeasuredError("nothing moves, or there is no action")
+        raise NotMeasuredError("nothing moves, or the action is missing")
     bad = [number for number, share in shares.items() if share > MIN_EQUAL_SHARE]
     if len(bad) > len(shares) / 2:
         share = float(np.median(list(shares.values())))
@@ -138,12 +138,12 @@ def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
 @check(
     family="alignment",
     needs="state, action",
-    measures="elements of the action in another's place",
+    measures="elements of the action that are exchanged",
     why="The policy moves one joint where it should move another.",
     do="give the columns their order in the program that wrote them, or drop the episodes: " + DROP,
 )
 def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
-    """Find two elements whose actions explain each other's motion several times better than their own."""
+    """Find two elements with actions that explain the other's motion several times better than their own."""
     relation = evidence.once(relation_of)
     if len(relation.elements) < 2:
         raise NotMeasuredError("it needs two moving elements with actions")
@@ -174,7 +174,7 @@ def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _unexplained_by_any(evidence: Evidence, relation: ActionRelation, number: int, lag: int) -> Array:
-    """(K, K) share of the variance of state i that action j leaves unexplained, NaN where one of them rests."""
+    """Compute (K, K) ratio of the variance of state i that action j leaves unexplained; NaN if one of them rests."""
     episode = evidence.by_number[number]
     assert episode.state is not None
     assert episode.action is not None
@@ -189,7 +189,7 @@ def _unexplained_by_any(evidence: Evidence, relation: ActionRelation, number: in
 
 
 def _swaps(matrix: Array) -> list[tuple[int, int]]:
-    """Pairs of elements that explain each other and not themselves."""
+    """Find pairs of elements that explain each other and not themselves."""
     count = len(matrix)
     return [
         (one, two)
@@ -207,14 +207,14 @@ def _swaps(matrix: Array) -> list[tuple[int, int]]:
     needs="gripper, action",
     measures="grippers that ignore or invert their action",
     unit="correlation",
-    why="A policy learns to open the hand where it must close it, or that commands do nothing.",
+    why="A policy learns to open the hand when it must close it, or that commands have no effect.",
     do=DROP,
 )
 def gripper_action(evidence: Evidence) -> Iterator[Fault]:
-    """Compare the correlation of each gripper with its action in an episode with that in the others.
+    """Compare each gripper's correlation with its action in an episode with that in the others.
 
-    Conventions differ (1 may mean open or closed): the usual sign counts. A gripper that never follows in any episode
-    is a fault of the whole set.
+    Conventions differ (1 may mean open or closed), so the usual sign is the reference. A gripper that never follows in
+    any episode is a fault of the whole set.
     """
     grippers = [
         (element, column)
@@ -269,7 +269,7 @@ def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[F
 
 
 def _best_correlation(values: Array, others: Array, reach: int) -> float:
-    """The correlation of largest size with the action some frames before."""
+    """Find the correlation of largest magnitude with the action some frames before."""
     found = []
     for lag in range(min(reach, len(values) - 8) + 1):
         one, two = values[lag:], others[: len(others) - lag]

@@ -1,4 +1,4 @@
-"""Checks of copies: whole episodes and pieces that occur twice, within a set and between two."""
+"""Checks of copies: whole episodes and segments that occur twice, within a set and across two."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredErro
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
 
 PIECE_S = 1.0
-"""Duration of a shared piece, at least."""
+"""Minimum duration of a shared segment, s."""
 MIN_PIECE = 8
-"""Frames of a shared piece, at least: as many moving readings of all elements do not repeat by chance."""
+"""Minimum frames of a shared segment: that many moving readings of all elements do not repeat by chance."""
 _MOMENTS = 32
 MAX_DISTANCE = 1e-3
-"""Root mean square difference of two motions, as a share of the usual range, up to which one is a copy: encoders have
-steps of this size, people never repeat a motion so closely."""
+"""Maximum root mean square difference of two motions, as a ratio of the usual range, at which one is a copy: it is the
+size of an encoder step, and people never repeat a motion so closely."""
 
 
 @check(
@@ -34,7 +34,7 @@ steps of this size, people never repeat a motion so closely."""
     do=DROP,
 )
 def copied_episodes(evidence: Evidence) -> Iterator[Fault]:
-    """Compare the states of all episodes of equal length at 32 moments each; all copies are named."""
+    """Compare the states of all episodes of equal length at 32 instants each; all copies are listed."""
     episodes = evidence.need_state(MIN_PIECE)
     if len(episodes) < 2:
         raise NotMeasuredError("it needs two episodes")
@@ -50,7 +50,7 @@ def copied_episodes(evidence: Evidence) -> Iterator[Fault]:
 def copies(
     later: Sequence[tuple[EpisodeEvidence, Array]], earlier: Sequence[tuple[EpisodeEvidence, Array]], ranges: Array
 ) -> Iterator[tuple[EpisodeEvidence, EpisodeEvidence]]:
-    """Yield (episode, the first one that it is a copy of); of one set, each is compared with those before it."""
+    """Yield (episode, the first one that it is a copy of); within one set, each is compared with earlier ones."""
     alive = ranges > 0
     by_length: dict[int, list[tuple[EpisodeEvidence, Array]]] = defaultdict(list)
     for episode, state in earlier:
@@ -58,7 +58,7 @@ def copies(
     same = later is earlier
     for episode, state in later:
         if not np.ptp(state, axis=0).any():
-            continue  # one that rests has no motion to copy
+            continue  # an episode at rest has no motion to copy
         own = _moments(state, ranges, alive)
         for other, vector in by_length.get(len(state), ()):
             if same and other.number >= episode.number:
@@ -76,13 +76,13 @@ def _moments(state: Array, ranges: Array, alive: NDArray[np.bool_]) -> Array:
 @check(
     family="set",
     needs="state",
-    measures="pieces that two episodes share",
+    measures="segments that two episodes share",
     unit="frames",
-    why="A piece was written twice: one of the episodes has frames that are not its own.",
+    why="A segment was written twice: one of the episodes has frames of the other.",
     do=DROP,
 )
 def shared_pieces(evidence: Evidence) -> Iterator[Fault]:
-    """Find runs of moving frames whose state and action are equal to the last bit in two episodes, or twice in one."""
+    """Find runs of moving frames with bit-exact state and action in two episodes, or twice in one."""
     episodes = evidence.need_state(MIN_PIECE)
     size = max(MIN_PIECE, round(PIECE_S * evidence.fps / 2))
     whole = {later.number for later, _ in copies(episodes, episodes, evidence.ranges)}
@@ -105,7 +105,7 @@ def shared_pieces(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _shared(episode: EpisodeEvidence, size: int, first_seen: dict[bytes, tuple[int, int]]) -> Mapping[int, list[int]]:
-    """Earlier episode, or this one -> first frames of the windows that both have; new windows are noted."""
+    """Find earlier episode, or this one -> first frames of the shared windows; also registers new windows."""
     rows = _digests(episode)
     found: dict[int, list[int]] = defaultdict(list)
     moving = np.flatnonzero([one != two for one, two in pairwise(rows)])
@@ -124,7 +124,7 @@ def _shared(episode: EpisodeEvidence, size: int, first_seen: dict[bytes, tuple[i
 
 
 def _digests(episode: EpisodeEvidence) -> list[bytes]:
-    """The bytes of state and action of each frame."""
+    """Return the bytes of state and action of each frame."""
     assert episode.state is not None
     parts = [episode.state] if episode.action is None else [episode.state, episode.action]
     table = np.ascontiguousarray(np.hstack(parts).astype(np.float32))
@@ -136,11 +136,11 @@ def _digests(episode: EpisodeEvidence) -> list[bytes]:
     needs="two datasets with states",
     measures="episodes that two datasets share (check A B)",
     unit="episodes",
-    why="What was trained on cannot validate: the score looks better than the policy is.",
+    why="Training data cannot validate a policy: its score is too good.",
     do="drop them from one of the two: " + DROP,
 )
 def leakage(evidence: Evidence) -> Iterator[Fault]:
-    """Find the episodes and pieces of every dataset of the command in those that were named before it."""
+    """Find the episodes and segments of every dataset of the command in the datasets named before it."""
     if not evidence.earlier:
         raise NotApplicableError("it compares two datasets: demorec check TRAIN VAL")
     for other in evidence.earlier:

@@ -16,28 +16,28 @@ from demorec.extensions.doctor.scores import score_episodes
 from demorec.extensions.doctor.units import other_units
 
 MIN_OTHERS = 7
-"""Episodes, at least, that one is compared with: with fewer, "usual" says little."""
+"""Minimum number of episodes to compare one with: with fewer, "usual" means little."""
 MAX_UNUSUAL_SPREADS = 10.0
-"""Usual spreads from which a quantity of an episode is worth a look."""
+"""Minimum number of usual spreads at which a quantity of an episode is worth a look."""
 MAX_UNUSUAL_SHARE = 0.1
-"""Share of episodes up to which a quantity far from the median is unusual, not another way to do the task."""
+"""Maximum ratio of episodes with a quantity far from the median: more are another way to do the task."""
 MIN_END_SPEED = 0.8
-"""Speed at the end, as a share of the episode's root mean square, from which it ends amid the motion."""
+"""Minimum final speed, relative to the episode's root mean square, of an episode that ends during a motion."""
 MAX_REST_SPEED = 0.3
-"""The same share up to which an episode ends at rest."""
+"""Maximum final speed, relative to the same, of an episode that ends at rest."""
 MIN_RESTING_SHARE = 0.8
-"""Share of the other episodes that end at rest, from which one that does not is cut off."""
+"""Minimum ratio of other episodes that end at rest, so that one that does not counts as cut off."""
 END_S = 0.2
 MIN_IDLE_S = 3.0
-"""Idle time at an end, seconds, from which it is worth trimming."""
+"""Minimum idle time at an end, seconds, that is worth trimming."""
 IDLE_TIMES = 4.0
-"""Times the usual idle time."""
+"""Minimum factor over the usual idle time."""
 IDLE_RATIO = 0.02
-"""Step of an element, as a share of its usual range, up to which it rests."""
+"""Maximum step of an element at rest, as a ratio of its usual range."""
 MIN_RETURN = 0.08
-"""Share of the range by which an arm is away from its start before it jumps back."""
+"""Minimum distance of an arm from its start, as a ratio of the range, before it jumps back."""
 MIN_LENGTH_TIMES = 3.0
-"""Times the usual length from which an episode holds several."""
+"""Minimum factor over the usual length at which an episode contains several."""
 
 
 @check(
@@ -49,7 +49,7 @@ MIN_LENGTH_TIMES = 3.0
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
 )
 def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes that end amid the motion, where nearly all others end at rest."""
+    """Find episodes that end during a motion, where nearly all others end at rest."""
     speeds: dict[int, float] = {}
     count = max(2, round(END_S * evidence.fps))
     for episode, state in evidence.need_state(3 * count):
@@ -71,7 +71,7 @@ def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _arm_speed(evidence: Evidence, state: Array) -> Array:
-    """(T - 1,) speed of the arm in units of the elements' ranges."""
+    """Compute the (T - 1,) speed of the arm in units of the elements' ranges."""
     arm = ~evidence.is_gripper & (evidence.ranges > 0)
     return np.asarray(np.linalg.norm(np.diff(state[:, arm], axis=0) / evidence.ranges[arm], axis=1))
 
@@ -85,7 +85,7 @@ def _arm_speed(evidence: Evidence, state: Array) -> Array:
     do="split it where the arm returns to its start, in the program that recorded it, or drop it: " + DROP,
 )
 def joined_episodes(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes several times as long as the others that return to their start again and again."""
+    """Find episodes several times as long as the others that repeatedly return to their start."""
     episodes = evidence.need_state(8)
     lengths = [len(state) for _, state in episodes]
     length, _ = usual(lengths)
@@ -102,7 +102,7 @@ def joined_episodes(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _returns(evidence: Evidence, state: Array) -> int:
-    """How often the arm is back at its first position within one frame, and rests before and after it."""
+    """Count how often the arm returns to its first position within one frame, at rest before and after."""
     span = np.ptp(state, axis=0)
     alive = (span > 0) & ~evidence.is_gripper
     if not alive.any():
@@ -118,7 +118,7 @@ def _returns(evidence: Evidence, state: Array) -> int:
     needs="state",
     measures="idle time at the start or the end",
     unit="s",
-    why="The policy learns to do nothing at the start, and may never begin.",
+    why="The policy learns to do nothing at the start, and may never begin to move.",
     do="demorec dataset trim {path} --idle --out NEW",
 )
 def idle_ends(evidence: Evidence) -> Iterator[Fault]:
@@ -142,7 +142,7 @@ def idle_ends(evidence: Evidence) -> Iterator[Fault]:
                     severity="look",
                     episode=number,
                     value=f"{idle:.1f} s",
-                    message=f"it {words} with {idle:.1f} s in which nothing moves, usual are {typical:.1f} s",
+                    message=f"it {words} with {idle:.1f} s without motion (usually {typical:.1f} s)",
                 )
 
 
@@ -157,7 +157,7 @@ def idle_ends(evidence: Evidence) -> Iterator[Fault]:
 def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
     """Compare duration, pauses, detours, shaking and switches of the gripper with those of the other episodes.
 
-    These are the reasons of the score; one is worth a look from ten usual spreads on.
+    These are the reasons of the score; one is worth a look at ten usual spreads or more.
     """
     evidence.need_state(8)
     if len(evidence.episodes) <= MIN_OTHERS:

@@ -25,26 +25,26 @@ _TYPES = {
 _PRECISE = ("timestamp", "float64")
 """A counter that may be more precise than LeRobot's own."""
 _RATE_TOLERANCE = 0.01
-"""Files that were put together have rates that are a little different."""
+"""Relative tolerance of rates: concatenated files have slightly different ones."""
 
 
 def folder_of(evidence: Evidence) -> LeRobotFolder:
     """Return the open dataset. Raises NotMeasuredError for recordings."""
     if evidence.folder is None:
-        raise NotApplicableError("recordings have files of another kind, whose integrity is checked by itself")
+        raise NotApplicableError("recordings have separate checks of their files' integrity")
     return evidence.folder
 
 
 @check(
     family="files",
     needs="a LeRobot dataset",
-    measures="episodes whose rows cannot be read",
+    measures="episodes with unreadable rows",
     unit="episodes",
     why="Training ends with an error, or the rows of another episode are taken.",
     do="download or record it again, or drop the episode: " + DROP,
 )
 def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
-    """Read every row of every episode, and prove by its own numbers that it belongs there."""
+    """Read every row of every episode, and verify by its own numbers that it belongs there."""
     folder = folder_of(evidence)
     reasons: dict[str, list[int]] = {}
     for number, reason in evidence.unreadable.items():
@@ -55,7 +55,7 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     if evidence.robot_problem:
         yield Fault(severity="broken", message=evidence.robot_problem, do="restore the folder demorec/robots")
     for number, note in enumerate(folder.notes):
-        # Without the table of episodes LeRobot opens nothing, by a wrong one it takes other rows.
+        # Without the table of episodes LeRobot opens nothing; with a wrong one it reads other rows.
         severity: Severity = "broken" if number == 0 and folder.is_found_by_rows else "look"
         yield Fault(severity=severity, message=note, do="demorec dataset repair {path} --out NEW")
     if missing := folder.missing:
@@ -75,7 +75,7 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     do="demorec dataset select {path} --where 'num_frames > 0' --out NEW numbers them again; otherwise record it again",
 )
 def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
-    """Compare totals with the tables; indices count up without a gap, and tasks are those of the episodes' table."""
+    """Compare totals with the tables; indices must be consecutive, and tasks must match the episodes' table."""
     folder = folder_of(evidence)
     info = folder.info
     totals = {
@@ -106,7 +106,7 @@ def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
         start += place.length
     if not info.is_old:
         numbers = read_table(evidence.path / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
-        if numbers != list(range(len(numbers))):  # LeRobot takes the row of a number, whatever number is in it
+        if numbers != list(range(len(numbers))):  # LeRobot takes the row at this index, regardless of its number
             yield Fault(severity="broken", message="the tasks' numbers do not count up in meta/tasks.parquet")
         yield from _wrong_ranges(folder)
         yield from _surplus_rows(folder)
@@ -139,7 +139,7 @@ def _wrong_task(folder: LeRobotFolder, tasks: tuple[str, ...], columns: Mapping[
 
 
 def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
-    """Where the episodes' table says that things are: rows of the dataset, and seconds of each video."""
+    """Check the ranges in the episodes' table: rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in folder.info.video_keys]
     for path in tables_in(folder.root, "meta/episodes"):
         columns = open_table(path).schema_arrow.names
@@ -157,7 +157,7 @@ def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
 
 
 def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
-    """Rows of the data files that belong to no episode."""
+    """Find rows of the data files that belong to no episode."""
     for file in tables_in(folder.root, "data"):
         found, listed = open_table(file).metadata.num_rows, folder.num_rows.get(file, 0)
         if listed != found:
@@ -174,7 +174,7 @@ def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
     needs="a LeRobot dataset",
     measures="columns that differ from info.json",
     unit="columns",
-    why="Readers convert or refuse what is not as stated: numbers lose digits, or training does not begin.",
+    why="Readers convert or refuse other types: numbers lose digits, or training does not start.",
     do="correct meta/info.json, or write the column in the stated type",
 )
 def table_schema(evidence: Evidence) -> Iterator[Fault]:
@@ -211,9 +211,9 @@ def _column_faults(path: Path, features: Mapping[str, DatasetFeature]) -> Iterat
 
 
 def _fits(found: pa.DataType, feature: DatasetFeature) -> str:
-    """ "equal", "converts" if readers convert it without loss of meaning, or "other"."""
+    """Return "equal", "converts" if readers convert it without loss of meaning, or "other"."""
     if feature.dtype not in _TYPES:
-        return "equal"  # images in tables, which other writers have
+        return "equal"  # images in tables, as other writers store them
     size = None
     while pa.types.is_list(found) or pa.types.is_fixed_size_list(found) or pa.types.is_large_list(found):
         if pa.types.is_fixed_size_list(found):
@@ -269,7 +269,7 @@ def _stated_format(feature: DatasetFeature) -> dict[str, Any]:
 
 
 def _found_format(path: Path, folder: LeRobotFolder) -> dict[str, Any]:
-    """Quantity -> value of a video file; empty for one that cannot be read, which `undecodable_images` finds."""
+    """Read quantity -> value of a video file; empty if it is unreadable, which `undecodable_images` finds."""
     found: dict[str, Any] = {}
     with noted([], folder.root), opened_video(path) as (container, stream):
         context = stream.codec_context
@@ -301,13 +301,13 @@ def _info_against_itself(key: str, feature: DatasetFeature, folder: LeRobotFolde
     needs="videos",
     measures="images before, between or after episodes",
     unit="images",
-    why="Rows and images are counted by different hands: one of the two is shifted against the other.",
+    why="Row and image counts disagree: one of the two is shifted against the other.",
     do="encode the videos of the episodes again from their images",
 )
 def video_places(evidence: Evidence) -> Iterator[Fault]:
-    """Find the encoded images of every episode in every camera's file, one after the other.
+    """Check that every episode's encoded images are consecutive in every camera's file.
 
-    In front of an episode there may be images from the keyframe on that its first one needs.
+    An episode may be preceded by images since the keyframe that its first one needs.
     """
     folder = folder_of(evidence)
     if not folder.info.video_keys:
@@ -340,7 +340,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
     measures="files that nothing refers to",
     unit="files",
     why="They fill the disk and the download; merges, deleted episodes and renamed cameras leave them.",
-    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW copies what is used",
+    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW copies only used files",
 )
 def unused_files(evidence: Evidence) -> Iterator[Fault]:
     """Find video and data files that no episode uses."""
@@ -361,7 +361,7 @@ def unused_files(evidence: Evidence) -> Iterator[Fault]:
     do="demorec dataset select {path} --where 'num_frames > 0' --out NEW writes them",
 )
 def missing_statistics(evidence: Evidence) -> Iterator[Fault]:
-    """Look for meta/stats.json."""
+    """Check that meta/stats.json exists."""
     folder = folder_of(evidence)
     if folder.info.is_old:
         raise NotMeasuredError("before v3.0 each episode has its own statistics")

@@ -19,14 +19,14 @@ from demorec.extensions.doctor.units import state_bounds
 
 MIN_FROZEN_S = 0.4
 MIN_FROZEN_FRAMES = 5
-"""Frames, at least, of a frozen state."""
+"""Minimum number of frames of a frozen state."""
 MIN_FROZEN_RANGE = 0.3
-"""Share of the usual range that the action covers while an element of the state keeps one value to the last bit."""
+"""Minimum range of the action, as a ratio of the usual one, while an element of the state is constant, bit-exact."""
 MIN_FROZEN_ERRORS = 2.0
-"""Times the usual distance between action and state, at least, by which the action leaves a frozen element: a hobby
-servo holds its joint for seconds while the difference is within its dead band and load."""
+"""Minimum factor of the distance between action and a frozen element over the usual one: a hobby servo holds its joint
+for seconds while the difference is within its dead band and load."""
 MAX_END_STOP_RANGE = 0.02
-"""Share of the range of the whole set within which an element is at an end stop: further out it cannot follow."""
+"""Maximum distance from an end stop, as a ratio of the range in the whole set, at which an element counts as there."""
 
 
 @check(
@@ -38,11 +38,11 @@ MAX_END_STOP_RANGE = 0.02
     do=DROP,
 )
 def frozen_state(evidence: Evidence) -> Iterator[Fault]:
-    """Find elements that keep their value to the last bit while their action moves on, and whole states that do.
+    """Find elements with a bit-exact constant value while their action moves on, and whole states of this kind.
 
-    The action must leave the element by more than twice the distance that it usually has: servos hold a joint within
-    their dead band, under load, and at end stops. Without an action, a whole state counts as frozen where it continues
-    with a jump. An element that never changes in any episode while its action does is a fault of the whole set.
+    The action must be more than twice its usual distance away from the element: servos hold a joint within their dead
+    band, under load, and at end stops. Without an action, a whole state counts as frozen if it continues with a jump.
+    An element that never changes in any episode while its action does is a fault of the whole set.
     """
     episodes = evidence.need_state(8)
     yield from _never_moving(evidence, episodes)
@@ -86,13 +86,13 @@ def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class _ElementTarget:
-    """Where the action wants one element of the state, frame by frame.
+    """Target of one element of the state, frame by frame, according to the action.
 
     Attributes:
-        element: Its place in the state.
+        element: Its index in the state.
         kind: "increment": only changes of the target are known.
         wanted: Episode number -> (T,) target, at the frames at which the state usually reaches it.
-        min_distance: Distance from the state that shows that the state does not follow.
+        min_distance: Minimum distance of a state that does not follow.
         offset: Usual difference between target and state.
     """
 
@@ -103,11 +103,11 @@ class _ElementTarget:
     offset: float
 
     def unfollowed(self, evidence: Evidence, number: int, held: float, first: int, end: int) -> Array:
-        """(N,) distance from the held state to its target in some frames, without what is beyond an end stop."""
+        """Compute (N,) distance of the held state from its target in some frames, excluding end stops."""
         wanted = self.wanted[number][first : end + 1]
         found = wanted - (wanted[0] if self.kind == "increment" else held + self.offset)
         if len(self.wanted) <= MIN_OTHERS:
-            return found  # too few to tell an end stop from the place where the reading froze
+            return found  # too few to distinguish an end stop from the position where the reading froze
         lowest, highest = (bound[self.element] for bound in evidence.once(state_bounds))
         margin = MAX_END_STOP_RANGE * (highest - lowest)
         if held <= lowest + margin:
@@ -118,7 +118,7 @@ class _ElementTarget:
 
 
 def _targets(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> list[_ElementTarget]:
-    """The targets of the elements of the arm; none where the state follows its action in no known way."""
+    """Compute the targets of the arm's elements; empty if the state does not follow its action."""
     try:
         relation = evidence.once(relation_of)
     except NotMeasuredError:
@@ -153,7 +153,7 @@ def _targets(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array
 def _moving_errors(
     wanted: Mapping[int, Array], episodes: Sequence[tuple[EpisodeEvidence, Array]], element: int
 ) -> list[Array]:
-    """Difference between target and state in each episode, in the frames from which the element moves on."""
+    """Compute the difference between target and state in each episode, in frames in which the element moves."""
     found = []
     for episode, state in episodes:
         values = state[:, element]
@@ -171,7 +171,7 @@ def _usual_sum(evidence: Evidence, column: int) -> float:
 def _frozen_element(
     evidence: Evidence, targets: Sequence[_ElementTarget], episode: EpisodeEvidence, state: Array, needed: int
 ) -> Fault | None:
-    """The longest rest of an element of the arm that its action leaves further than usual."""
+    """Find the longest rest of an element of the arm while its action is unusually far away."""
     worst: Fault | None = None
     longest = needed
     for target in targets if episode.action is not None else ():
@@ -197,7 +197,7 @@ def _frozen_element(
 
 
 def _frozen_whole(evidence: Evidence, episode: EpisodeEvidence, state: Array, needed: int) -> Fault | None:
-    """A rest of the whole state that ends with a jump, or in which the whole action moves."""
+    """Find a rest of the whole state that ends with a jump, or during which the whole action moves."""
     same = (state[1:] == state[:-1]).all(axis=1)
     rests = [(first, end) for first, end in runs(np.asarray(same)) if end - first >= needed]
     alive = evidence.ranges > 0

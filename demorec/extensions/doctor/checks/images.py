@@ -1,4 +1,4 @@
-"""Checks of images: they decode, show something, change with the robot, and belong to this camera and episode."""
+"""Checks of images: they decode, show content, change with the robot, and belong to this camera and episode."""
 
 from __future__ import annotations
 
@@ -16,39 +16,38 @@ from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbn
 from demorec.extensions.doctor.visible_motion import visible_motion
 
 MIN_OTHERS = 3
-"""Episodes, at least, that one is compared with."""
+"""Minimum number of episodes to compare one with."""
 MAX_BLANK_SPREAD = 3.0
-"""Standard deviation of a thumbnail, of 255, up to which it shows nothing: noise alone averages out in it."""
+"""Maximum standard deviation, of 255, of a blank thumbnail, in which noise averages out."""
 MIN_SHOWN_SPREAD = 10.0
-"""Usual standard deviation from which a camera shows something."""
+"""Minimum usual standard deviation of a camera that shows content."""
 MAX_COVERED_RATIO = 0.3
-"""Contrast, as a share of the camera's usual one, up to which something is in front of it."""
+"""Maximum contrast, relative to the camera's usual one, of a covered camera."""
 MIN_COVERED_S = 0.3
 FROZEN_RATIO = 0.08
-"""Change of an image, as a share of the usual change while the robot moves, up to which it repeats the one before."""
+"""Maximum change of a repeated image, relative to the usual change while the robot moves."""
 MIN_MISSING_CHANGE = 4.0
-"""Change that the motion of the joints lets expect while images repeat, at least, in images that change as usual."""
+"""Minimum change expected from the joints' motion while images repeat, in multiples of an image's usual change."""
 MIN_FROZEN_FRAMES = 3
 FROZEN_TIMES = 4.0
-"""Times the longest usual missing change: cameras that see the arm only now and then repeat images for long."""
+"""Minimum factor over the longest usual missing change: cameras that rarely see the arm repeat images for long."""
 MIN_VISIBLE = 0.25
-"""Share of the usual change from which motion is visible in every new image."""
+"""Minimum change, relative to the usual one, at which motion is visible in every new image."""
 MIN_GAPS = 8
-"""Times from one new image to the next, at least, by which the rate of a camera is judged."""
+"""Minimum number of intervals between new images that determine the rate of a camera."""
 MIN_REGULAR = 0.95
-"""Share of these times that are one frame or less from their mean where a camera has a rate of its own."""
+"""Minimum ratio of these intervals within one frame of their mean for a camera with its own rate."""
 MIN_RATE_CHANGE = 1.5
-"""Usual change of images, of 255, from which they are judged closely: codecs leave smaller ones out of every second
-image."""
+"""Minimum usual change of images, of 255, for a close examination: codecs skip smaller ones in every second image."""
 MIN_REPEATED = 0.3
-"""Share of repeated images from which a camera is slower than the frames."""
+"""Minimum ratio of repeated images of a camera that is slower than the frames."""
 MIN_FIT = 0.8
-"""Correlation of an episode's mean image with that of another camera, or with it turned, from which they are the same
-view."""
+"""Minimum correlation of an episode's mean image with that of another camera, or with its rotated own, that implies the
+same view."""
 MIN_FIT_GAIN = 0.3
-"""By how much it is larger than the correlation with its own."""
+"""Minimum excess over the correlation with its own."""
 MAX_TWIN_DIFFERENCE = 1.0
-"""Mean difference of thumbnails, of 255, up to which two cameras show the same."""
+"""Maximum mean difference of thumbnails, of 255, of two cameras with the same view."""
 
 
 @check(
@@ -60,7 +59,7 @@ MAX_TWIN_DIFFERENCE = 1.0
     do="download or record them again, or drop the episode: " + DROP,
 )
 def undecodable_images(evidence: Evidence) -> Iterator[Fault]:
-    """Decode every image of every camera, depth left out."""
+    """Decode every image of every colour camera."""
     for camera, images in evidence.need_images().items():
         if images.errors and not images.episodes:
             number, error = next(iter(images.errors.items()))
@@ -84,7 +83,7 @@ def undecodable_images(evidence: Evidence) -> Iterator[Fault]:
     do=DROP,
 )
 def blank_images(evidence: Evidence) -> Iterator[Fault]:
-    """Find images of one brightness: black, grey, or of a lost signal."""
+    """Find images of uniform brightness: black, grey, or from a lost signal."""
     for camera, images in evidence.need_images().items():
         blank = {number: _spread(each) < MAX_BLANK_SPREAD for number, each in images.episodes.items()}
         if blank and np.mean([flags.mean() for flags in blank.values()]) > 0.9:
@@ -108,7 +107,7 @@ def blank_images(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _spread(images: EpisodeThumbnails) -> Array:
-    """(N,) standard deviation of each thumbnail."""
+    """Compute (N,) standard deviation of each thumbnail."""
     return np.asarray(images.thumbnails.std(axis=(1, 2), dtype=np.float64))
 
 
@@ -126,7 +125,7 @@ def _bounds(flags: NDArray[np.bool_]) -> tuple[int, int]:
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
 )
 def covered_camera(evidence: Evidence) -> Iterator[Fault]:
-    """Find stretches whose contrast is far below that of the camera's other images, without being blank."""
+    """Find segments with far lower contrast than the camera's other images, without being blank."""
     for camera, images in evidence.need_images().items():
         spreads = {number: _spread(each) for number, each in images.episodes.items()}
         if not spreads:
@@ -153,15 +152,15 @@ def covered_camera(evidence: Evidence) -> Iterator[Fault]:
 @check(
     family="images",
     needs="images, state",
-    measures="images that stay the same while the robot moves",
+    measures="images that do not change while the robot moves",
     unit="s",
     why="The policy learns actions for a scene that it does not see.",
     do=DROP,
 )
 def frozen_images(evidence: Evidence) -> Iterator[Fault]:
-    """Find images that repeat while joints move whose motion usually changes them.
+    """Find images that repeat while joints move in a way that usually changes them.
 
-    How much each joint changes a camera's images is fitted to all episodes. A camera that often shows the same while
+    The effect of each joint on a camera's images is fitted to all episodes. A camera that often shows the same while
     the robot moves is judged by its own longest rests.
     """
     evidence.need_state()
@@ -191,7 +190,7 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
 def _rests(
     evidence: Evidence, number: int, images: EpisodeThumbnails, camera: CameraThumbnails
 ) -> list[tuple[float, int, int]]:
-    """(images' worth of change that is missing, first frame, last frame) of each run of repeated images."""
+    """Find (missing change, in images; first frame, last frame) of each run of repeated images."""
     visible = evidence.once(visible_motion, camera)
     episode = evidence.by_number.get(number)
     if visible is None or episode is None or episode.state is None or len(images.frames) < 2:
@@ -209,7 +208,7 @@ def _rests(
 
 
 def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_]:
-    """(N - 1,) whether each image repeats the one before: neither its pixels nor its thumbnail change."""
+    """Find (N - 1,) whether each image repeats the previous one: neither its pixels nor its thumbnail change."""
     pixels = images.change[1:] <= FROZEN_RATIO * usual_change
     return np.asarray(pixels | ((images.steps == 0) & (images.change[1:] <= 3 * FROZEN_RATIO * usual_change)))
 
@@ -219,11 +218,11 @@ def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_
     needs="images, state",
     measures="cameras slower than the frames",
     unit="% of moving frames",
-    why="Every second image is old; the policy cannot see how fast things move.",
+    why="Repeated images are old; the policy cannot see the speed of motion.",
     do="record at the camera's own rate, or accept it: the images are late by up to a period",
 )
 def repeated_images(evidence: Evidence) -> Iterator[Fault]:
-    """Find cameras whose images repeat regularly: short repeats in a third of the moving frames or more."""
+    """Find cameras with regularly repeated images: short repeats in at least a third of the moving frames."""
     evidence.need_state()
     for camera, images in evidence.need_images().items():
         shares: dict[int, float] = {}
@@ -246,7 +245,7 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
             yield Fault(
                 severity="look",
                 value=f"{share:.0%} of moving frames",
-                message=f"{camera} repeats {share:.0%} of its images: it gives about {rate:.0f} images a second, not "
+                message=f"{camera} repeats {share:.0%} of its images: its rate is {rate:.0f} images per second, not "
                 f"{evidence.fps:g}",
             )
         elif float(np.median(list(shares.values()))) == 0:
@@ -261,9 +260,9 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _share_repeated(gaps: NDArray[np.intp]) -> float:
-    """Share of repeated images where new ones come regularly, after n or n + 1 frames; 0 where they do not.
+    """Compute the ratio of repeated images if new ones come regularly, after n or n + 1 frames; else 0.
 
-    Slow motion, too, changes an image only now and then, but not regularly.
+    Slow motion also changes an image only occasionally, but not regularly.
     """
     mean = float(np.mean(gaps))
     regular = np.abs(gaps - mean) < 1.0
@@ -279,9 +278,9 @@ def _share_repeated(gaps: NDArray[np.intp]) -> float:
     do=DROP,
 )
 def camera_views(evidence: Evidence) -> Iterator[Fault]:
-    """Compare the mean image of each episode with the usual ones of all cameras, upright, mirrored and turned.
+    """Compare the mean image of each episode with the usual ones of all cameras, upright, mirrored and rotated.
 
-    The view of a camera that moves much from one episode to the next is not judged.
+    Cameras with views that vary much between episodes are not judged.
     """
     views = {camera: _view(images) for camera, images in evidence.need_images().items()}
     if not any(len(images.episodes) > MIN_OTHERS - 1 for images in evidence.cameras.values()):
@@ -309,7 +308,7 @@ def camera_views(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _view(images: CameraThumbnails) -> Array:
-    """(16, 16) median over the episodes of their mean images."""
+    """Compute the (16, 16) median of the episodes' mean images."""
     means = [each.mean for each in images.episodes.values() if len(each.thumbnails)]
     return np.asarray(np.median(np.stack(means), axis=0)) if means else np.zeros((16, 16))
 
@@ -333,11 +332,11 @@ def _turned(image: Array) -> Iterator[tuple[str, Array]]:
     needs="two cameras",
     measures="two cameras that show the same",
     unit="of 255",
-    why="One of the two views is lost; the policy has one eye where it believes to have two.",
+    why="One of the two views is lost; the policy gets the same image twice.",
     do=DROP,
 )
 def doubled_cameras(evidence: Evidence) -> Iterator[Fault]:
-    """Compare the thumbnails of each two cameras, frame by frame."""
+    """Compare the thumbnails of each pair of cameras, frame by frame."""
     cameras = list(evidence.need_images().items())
     if len(cameras) < 2:
         raise NotApplicableError("there is one camera")

@@ -13,9 +13,9 @@ from demorec.extensions.doctor.evidence import Evidence
 
 _PLACEHOLDERS = frozenset(("", "none", "null", "nan", "task", "todo", "test", "unknown", "n/a", "default"))
 MIN_COMMON = 5
-"""Episodes of the common instruction from which a single other one is asked about."""
+"""Minimum number of episodes with the common instruction for a single other one to be questioned."""
 MIN_SIMILARITY = 0.8
-"""Share of equal letters from which two words are one with a typing error."""
+"""Minimum ratio of equal letters of two words that differ by a typing error."""
 
 
 @check(
@@ -27,7 +27,7 @@ MIN_SIMILARITY = 0.8
     do="demorec dataset set-task {path} --task 'WORDS' --out NEW",
 )
 def empty_instructions(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes whose instruction is empty or a placeholder."""
+    """Find episodes with an empty instruction or a placeholder."""
     words = {episode.number: episode.instruction.strip() for episode in evidence.episodes}
     empty = [number for number, text in words.items() if text.lower() in _PLACEHOLDERS]
     if not words:
@@ -57,7 +57,7 @@ def empty_instructions(evidence: Evidence) -> Iterator[Fault]:
     do="demorec dataset set-task {path} --task 'WORDS' --episodes {episode} --out NEW",
 )
 def odd_instructions(evidence: Evidence) -> Iterator[Fault]:
-    """Find instructions that differ by a typing error alone, and one that a single episode has."""
+    """Find instructions that differ only by a typing error, and one that only a single episode has."""
     counts = Counter(each.instruction for each in evidence.episodes if each.instruction.strip())
     if len(counts) < 2:
         return
@@ -79,7 +79,7 @@ def odd_instructions(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _is_misspelled(text: str, other: str) -> bool:
-    """Whether two instructions differ by letters' case, punctuation, or a letter within a word."""
+    """Check whether two instructions differ only in case, punctuation, or a letter within a word."""
     one, two = (re.sub(r"\W+", " ", each.lower()).split() for each in (text, other))
     if one == two:
         return True
@@ -90,7 +90,7 @@ def _is_misspelled(text: str, other: str) -> bool:
 
 
 def _is_one_word(one: str, two: str) -> bool:
-    """Whether two words of five letters or more are one with a typing error; "left1" and "left2" are two."""
+    """Check whether two words of five letters or more differ by a typing error; "left1" and "left2" do not."""
     if min(len(one), len(two)) < 5 or any(letter.isdigit() for letter in one + two):
         return False
     return difflib.SequenceMatcher(None, one, two).ratio() >= MIN_SIMILARITY

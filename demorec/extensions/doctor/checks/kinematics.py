@@ -1,6 +1,6 @@
 """The recorded EE pose against forward kinematics of the joints, of all frames at once.
 
-Independent of `demorec.robots.kinematics` on purpose: that code made the recorded poses, this one judges them.
+Deliberately independent of `demorec.robots.kinematics`, which made the recorded poses.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from demorec.extensions.doctor.evidence import Evidence
 from demorec.robots.urdf import Urdf, UrdfJoint
 
 KNOWN_ERROR_M = 0.05
-"""Error that hands and drivers have: they sag, and joints and pose are read at different times."""
+"""Usual error of hands and drivers, metres: they sag, and joints and pose are read at different times."""
 MIN_ORDER_ERROR_M = 0.002
 MAX_ORDER_RATIO = 0.2
-"""Error with the scalar first, as a share of that with the scalar last, from which it is first."""
+"""Maximum error with the scalar first, relative to that with the scalar last, at which it is first."""
 MAX_SIZE_RATIO = 2.0
-"""How many times as large as its model a robot may be built, or as small."""
+"""Maximum factor between a robot's size and its model's, in both directions."""
 MIN_FRAMES = 30
 MAX_FITTED_EPISODES = 20
 MAX_FITTED_FRAMES = 60
 LEVER_M = 0.1
-"""Lever at which a rotation counts beside a distance."""
+"""Lever, metres, that converts a rotation to a distance."""
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 @check(
     family="numbers",
     needs="state, EE pose, the robot's URDF",
-    measures="poses that are not those of the joints",
+    measures="poses that do not match the joints",
     unit="mm",
     why="Joints or pose are wrong: exchanged, in another unit, with another zero or order of the quaternion.",
     do="compare names, units and zero positions with the URDF",
@@ -46,8 +46,8 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
     """Compare the EE pose with forward kinematics of the joints, 0.1 m added for each rad of rotation.
 
-    A fixed base, a fixed tool and the robot's size are fitted to each episode, since nothing says which link the pose
-    is of; up to 20 episodes are judged. A hand may be 5 cm off.
+    A fixed base, a fixed tool and the robot's size are fitted to each episode, since the pose's link is unknown; up to
+    20 episodes are judged. A hand may be 5 cm off.
     """
     poses = _pose_columns(evidence)
     arm = evidence.once(arm_of)
@@ -92,7 +92,7 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _pose_columns(evidence: Evidence) -> tuple[str, list[int]]:
-    """The feature with the EE pose, and the places of x, y, z, qx, qy, qz, qw in it."""
+    """Find the feature with the EE pose, and the indices of x, y, z, qx, qy, qz, qw in it."""
     for feature in (EE_POSE, *evidence.roles.state):
         names = evidence.roles.columns[feature].elements if feature in evidence.roles.columns else ()
         words = [name.rpartition(".")[2].rpartition("_")[2] for name in names[-7:]]
@@ -107,7 +107,7 @@ def _pose(columns: Mapping[str, NDArray[Any]], place: tuple[str, list[int]]) -> 
 
 
 def _fitted_error(urdf: Urdf, joints: Mapping[str, Array], poses: Array) -> Array:
-    """(T,) metres that are left after the best fit of a base, a tool and a size to some frames."""
+    """Compute the (T,) residual in metres after the best fit of a base, a tool and a size to some frames."""
     last = [joint.child for joint in urdf.depth_first() if joint.name in joints][-1]
     count = len(poses)
     links = _LinkMatrices(urdf, joints, count)[last]
@@ -117,7 +117,7 @@ def _fitted_error(urdf: Urdf, joints: Mapping[str, Array], poses: Array) -> Arra
 
 
 def _transform(numbers: Array) -> Array:
-    """(4, 4) of a rotation vector and a position."""
+    """Build the (4, 4) matrix of a rotation vector and a position."""
     from scipy.spatial.transform import Rotation
 
     out = np.eye(4)
@@ -127,14 +127,14 @@ def _transform(numbers: Array) -> Array:
 
 
 def _placed(fit: Array, links: Array) -> Array:
-    """(N, 4, 4) poses of the hand by the links' (N, 4, 4): base, size, tool."""
+    """Compute (N, 4, 4) poses of the hand from the links' (N, 4, 4): base, size, tool."""
     sized = links.copy()
     sized[:, :3, 3] *= MAX_SIZE_RATIO ** math.tanh(fit[12])
     return np.asarray(_transform(fit[:6]) @ sized @ _transform(fit[6:12]))
 
 
 def _fit(links: Array, poses: Array) -> Array:
-    """(13,) the base X, the tool Y and the size that bring X @ links @ Y nearest to the poses, all (N, 4, 4)."""
+    """Fit (13,) base X, tool Y and size that bring X @ links @ Y nearest to the poses, all (N, 4, 4)."""
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
@@ -143,7 +143,7 @@ def _fit(links: Array, poses: Array) -> Array:
         return np.asarray((error[:, :3] * [LEVER_M, LEVER_M, LEVER_M, 1.0]).reshape(-1))
 
     best = None
-    for yaw in np.arange(4) * (math.pi / 2):  # from a base that is turned far away the fit may end elsewhere
+    for yaw in np.arange(4) * (math.pi / 2):  # from a base with a very different yaw the fit may end elsewhere
         base = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
         tool = np.linalg.inv(_transform(base) @ links[0]) @ poses[0]
         start = np.concatenate([base, Rotation.from_matrix(tool[:3, :3]).as_rotvec(), tool[:3, 3], [0.0]])
@@ -156,7 +156,7 @@ def _fit(links: Array, poses: Array) -> Array:
 
 
 def matrices(poses: Array) -> Array:
-    """(T, 4, 4) of poses (T, 7): position, quaternion xyzw (need not be of unit length)."""
+    """Convert poses (T, 7), position and quaternion xyzw of any length, to (T, 4, 4)."""
     quat = poses[:, 3:] / np.maximum(np.linalg.norm(poses[:, 3:], axis=1, keepdims=True), 1e-12)
     x, y, z, w = quat.T
     out = np.zeros((len(poses), 4, 4))
@@ -169,11 +169,11 @@ def matrices(poses: Array) -> Array:
 
 
 class _LinkMatrices:
-    """Forward kinematics of some joint positions: each link's poses are computed once, when they are asked for.
+    """Forward kinematics of some joint positions: each link's poses are computed once, on demand.
 
     Args:
         urdf: The joint tree.
-        joint_position: Joint name -> (T,) positions, rad or m; joints left out are at 0.
+        joint_position: Joint name -> (T,) positions, rad or m; missing joints are at 0.
         count: T.
     """
 
@@ -183,14 +183,14 @@ class _LinkMatrices:
         self._known = {urdf.root: np.broadcast_to(np.eye(4), (count, 4, 4))}
 
     def __getitem__(self, link: str) -> Array:
-        """(T, 4, 4) base_from_link; KeyError when there is no such link."""
+        """Compute (T, 4, 4) base_from_link; KeyError if the link does not exist."""
         if link not in self._known:
             joint = self._above[link]
             self._known[link] = self[joint.parent] @ self._parent_from_child(joint)
         return self._known[link]
 
     def _parent_from_child(self, joint: UrdfJoint) -> Array:
-        """(T, 4, 4), or (4, 4) where a joint does not move."""
+        """Compute (T, 4, 4), or (4, 4) if the joint does not move."""
         position = self._joint_position.get(joint.name)
         if position is None or joint.kind == "fixed":
             return joint.parent_from_joint.matrix()
@@ -198,7 +198,7 @@ class _LinkMatrices:
 
 
 def _joint_matrices(joint: UrdfJoint, position: Array) -> Array:
-    """(T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m); turns are by Rodrigues' formula."""
+    """Compute (T, 4, 4) parent_from_child of a moving joint at (T,) positions (rad, m), by Rodrigues' formula."""
     at_zero, along = joint.parent_from_joint.matrix(), position[:, None, None]
     x, y, z = joint.axis
     if joint.kind == "prismatic":
@@ -211,7 +211,7 @@ def _joint_matrices(joint: UrdfJoint, position: Array) -> Array:
 
 
 def _displacement(a: Array, b: Array) -> Array:
-    """(T,) metres between two transforms (T, 4, 4): of the origins, plus what the rotation moves at `LEVER_M`."""
+    """Compute (T,) metres between two transforms (T, 4, 4): of the origins, plus the rotation's effect at `LEVER_M`."""
     # |R - S| (Frobenius) = 2 sqrt(2) sin(angle / 2): exact for small angles, unlike the arc cosine of the trace.
     chord = np.sqrt(((a[:, :3, :3] - b[:, :3, :3]) ** 2).sum(axis=(1, 2)))
     angle = 2 * np.arcsin(np.minimum(chord / (2 * np.sqrt(2)), 1.0))

@@ -25,7 +25,7 @@ _NO_MEMORY = re.compile(
     r"|can't start new thread",
     re.IGNORECASE,
 )
-"""How Python, NumPy, PyTorch, Arrow and the dynamic linker report too little memory."""
+"""Phrases of Python, NumPy, PyTorch, Arrow and the dynamic linker for too little memory."""
 _OPEN = """
 import json, sys
 from lerobot.datasets.lerobot_dataset import LeRobotDataset
@@ -44,15 +44,15 @@ print(json.dumps({"episodes": dataset.num_episodes, "frames": len(dataset)}))
     needs="LeRobot, by --lerobot",
     measures="errors when LeRobot opens the dataset",
     why="Training begins by opening it.",
-    do="mend the other findings first; then ask for the error at github.com/huggingface/lerobot",
+    do="fix the other findings first; then report the error at github.com/huggingface/lerobot",
 )
 def lerobot_opens(evidence: Evidence) -> Iterator[Fault]:
-    """Let the installed LeRobot open the dataset and read the first, middle and last frame, images included."""
+    """Open the dataset with the installed LeRobot and read the first, middle and last frame, images included."""
     folder = folder_of(evidence)
     if not evidence.opens_lerobot:
-        raise NotApplicableError("LeRobot is started by --lerobot, which takes seconds")
+        raise NotApplicableError("LeRobot is started only with --lerobot, which takes seconds")
     if folder.info.is_old:
-        raise NotMeasuredError("LeRobot 0.6 reads v3.0 alone: demorec dataset select writes it")
+        raise NotMeasuredError("LeRobot 0.6 reads only v3.0: demorec dataset select writes it")
     if not lerobot_is_installed():
         raise MissingDependencyError("Opening a dataset as a training does", "lerobot", f"pip install '{LEROBOT}'")
     with tempfile.TemporaryDirectory(prefix="demorec-check-") as cache:
@@ -77,19 +77,19 @@ def lerobot_opens(evidence: Evidence) -> Iterator[Fault]:
     if (found["episodes"], found["frames"]) != (folder.info.total_episodes, folder.info.total_frames):
         yield Fault(
             severity="broken",
-            message=f"LeRobot finds {found['episodes']} episodes of {found['frames']} frames, info.json states others",
+            message=f"LeRobot finds {found['episodes']} episodes of {found['frames']} frames, unlike info.json",
         )
 
 
 def _reason(evidence: Evidence, done: subprocess.CompletedProcess[str]) -> str:
-    """Why LeRobot failed. Raises ResourceError if this machine is the reason."""
+    """Determine why LeRobot failed. Raises ResourceError if this machine is the reason."""
     lines = [line for line in done.stderr.splitlines() if line.strip()]
     said = re.sub(r"^[\w.]+: ", "", lines[-1])[:200] if lines else f"it ends with the exit status {done.returncode}"
     if not done.stdout.startswith("loaded") or done.returncode == -signal.SIGKILL or _NO_MEMORY.search(done.stderr):
         raise ResourceError(
-            f"LeRobot could not be tried ({said.strip().rstrip('.')}): is there too little memory? Free some, or "
-            f"raise the limit (ulimit -v); whether the dataset is sound is not known: {evidence.path}"
+            f"LeRobot could not be tried ({said.strip().rstrip('.')}): free memory or raise its limit "
+            f"(ulimit -v). Whether the dataset is sound is unknown: {evidence.path}"
         )
-    # It asks the Hub for files that are missing here, and complains that it may not.
+    # LeRobot asks the Hub for files that are missing here, and reports that it is not allowed to.
     problems = dataset_problems(folder_of(evidence))
     return problems[0] if problems else said

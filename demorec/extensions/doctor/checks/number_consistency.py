@@ -14,20 +14,20 @@ from demorec.extensions.doctor.evidence import Evidence, joined, quaternion_plac
 from demorec.extensions.doctor.robust import usual, without_gaps
 
 VELOCITY_WINDOW_S = 0.3
-"""Time over which velocities are integrated: filters of drivers are 20 to 100 ms late, which cancels over longer."""
+"""Integration time of velocities: drivers' filters delay them by 20 to 100 ms, which cancels over longer times."""
 MAX_VELOCITY_ERROR = 0.2
-"""Distance from one of the ratio of displacement and integrated velocity: filters and rounding change it by a
-tenth, 24 frames a second instead of 30 by a quarter."""
+"""Maximum distance from one of the ratio of displacement and integrated velocity: filters and rounding change it by a
+tenth, 24 frames per second instead of 30 by a quarter."""
 MIN_AGREED = 0.3
-"""Squared correlation of the two, at least: that of two other joints is lower."""
+"""Minimum squared correlation of the two: that of different joints is lower."""
 MAX_NORM_ERROR = 0.02
-"""Distance of a quaternion's length from one: float16 rounds to 0.001, interpolation loses 0.01."""
+"""Maximum distance of a quaternion's length from one: float16 rounds to 0.001, interpolation loses 0.01."""
 
 
 @check(
     family="numbers",
     needs="state, velocity",
-    measures="velocities that are not those of the state",
+    measures="velocities that do not match the state",
     unit="ratio",
     why="A policy that sees both learns a contradiction; a wrong ratio shows a wrong rate or unit.",
     do="compare units and rate of the two in the recorder",
@@ -35,7 +35,7 @@ MAX_NORM_ERROR = 0.02
 def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
     """Compare displacements with integrated velocities over 0.3 s: each element over all episodes, and each episode.
 
-    Elements that hardly move are left out, and grippers, which start and stop within a few frames.
+    Elements that hardly move are excluded, and grippers, which start and stop within a few frames.
     """
     parts = evidence.roles.having("velocity")
     columns = evidence.roles.in_state(parts) if parts and evidence.roles.state else []
@@ -77,12 +77,12 @@ def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _median_by_element(values: Sequence[Array]) -> Array:
-    """(K,) median of each element over episodes, from N times (K,); NaN where no episode has a number."""
+    """Compute the (K,) median of each element over episodes, from N times (K,); NaN if no episode has a number."""
     return np.array([usual(element)[0] for element in np.stack(values).T])
 
 
 def _velocity_ratios(state: Array, steps: Array, window: int) -> tuple[Array, Array]:
-    """(K,) ratio of displacement to integrated steps (T, K), and how well they agree; NaN where an element rests."""
+    """Compute (K,) ratio of displacement to integrated steps (T, K), and their agreement; NaN if an element rests."""
     course = np.cumsum((steps[1:] + steps[:-1]) / 2, axis=0)
     integrated = course[window:] - course[:-window]
     moved = state[1 + window :] - state[1:-window]
@@ -104,7 +104,7 @@ def _velocity_ratios(state: Array, steps: Array, window: int) -> tuple[Array, Ar
     do="compare the order of the elements in the recorder with their names",
 )
 def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
-    """Measure the length of each four elements that are named x, y, z and w of one rotation."""
+    """Measure the length of each group of four elements named x, y, z and w of one rotation."""
     places = [
         (name, place)
         for name, column in evidence.roles.columns.items()
@@ -150,8 +150,8 @@ def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
 def joint_limits(evidence: Evidence) -> Iterator[Fault]:
     """Compare the state with the limits of the robot's URDF.
 
-    The robot is that of the recording or the sidecar, the one named by --urdf or --motor-units, or a known one whose
-    joints have the names of the state's elements. Up to 0.1 rad or m beyond is calibration.
+    The robot is that of the recording or the sidecar, the one named by --urdf or --motor-units, or a known one with
+    joints named like the state's elements. Up to 0.1 rad or m beyond a limit is attributed to calibration.
     """
     arm = evidence.once(arm_of)
     known = np.flatnonzero(np.isfinite(arm.lower) | np.isfinite(arm.upper))

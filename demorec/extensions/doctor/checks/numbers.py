@@ -1,4 +1,4 @@
-"""Checks of numbers: missing ones, other units, jumps, sensors that stand still, velocities, quaternions."""
+"""Checks of numbers: missing ones, other units, jumps, and constant zeros."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.units import MIN_UNIT_RATIO, other_units, state_bounds
 
 MIN_OTHERS = 3
-"""Episodes, at least, that one is compared with."""
+"""Minimum number of episodes to compare one with."""
 UNIT_FACTORS: Mapping[str, float] = {
     "degrees instead of radians": math.degrees(1.0),
     "millimetres instead of metres": 1000.0,
@@ -26,12 +26,11 @@ UNIT_FACTORS: Mapping[str, float] = {
 }
 """Confusion of units -> factor of the values."""
 MIN_JUMP_RANGE = 0.15
-"""Share of an element's range, at least, that a jump covers."""
+"""Minimum size of a jump, as a ratio of an element's range."""
 MIN_JUMP_TICKS = 10.0
-"""Times the smallest difference that an element has, at least, that a jump is: a resting encoder flickers by a tick or
-two."""
+"""Minimum size of a jump in units of the element's smallest difference: a resting encoder flickers by a tick or two."""
 MIN_JUMP_STEPS = 6.0
-"""Times the largest usual step, and the steps before and after it, that a jump is: motors accelerate over frames."""
+"""Minimum factor of a jump over the largest usual step and over its neighbours: motors accelerate over frames."""
 
 
 @check(
@@ -45,7 +44,7 @@ MIN_JUMP_STEPS = 6.0
 def missing_numbers(evidence: Evidence) -> Iterator[Fault]:
     """Count NaN and infinite numbers in every column of every frame.
 
-    They spoil these frames alone: all other checks go on with the numbers before them.
+    They affect only these frames: all other checks continue with the preceding numbers.
     """
     for episode in evidence.episodes:
         counts: dict[str, int] = {}
@@ -76,9 +75,9 @@ def missing_numbers(evidence: Evidence) -> Iterator[Fault]:
     do="convert the episode in the program that recorded it, or drop it: " + DROP,
 )
 def unit_mismatch(evidence: Evidence) -> Iterator[Fault]:
-    """Compare the size of the numbers of each episode with that of the others, and of the state with its action.
+    """Compare the magnitude of each episode's numbers with that of the others, and of the state with its action.
 
-    Sizes are those of values and of ranges. Most elements must agree on a factor of at least seven.
+    Magnitudes are those of values and of ranges. Most elements must agree on a factor of at least seven.
     """
     evidence.need_state()
     for number, ratios in evidence.once(other_units).items():
@@ -97,7 +96,7 @@ def _in_words(ratio: float) -> str:
 
 
 def _confusion(ratio: float) -> str:
-    """The confusion of units whose factor is nearest, as words."""
+    """Name the confusion of units with the nearest factor."""
     size = max(ratio, 1 / ratio)
     name, factor = min(UNIT_FACTORS.items(), key=lambda item: abs(math.log(item[1] / size)))
     if abs(math.log(factor / size)) > math.log(1.2):
@@ -109,7 +108,7 @@ def _confusion(ratio: float) -> str:
 
 
 def _action_units(evidence: Evidence) -> Iterator[Fault]:
-    """Whether targets have another unit than the state that follows them."""
+    """Check whether targets have a different unit from the state that follows them."""
     try:
         relation = evidence.once(relation_of)
     except NotMeasuredError:
@@ -145,7 +144,7 @@ def _action_units(evidence: Evidence) -> Iterator[Fault]:
 def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     """Find steps several times as large as the largest usual one and as the steps before and after them.
 
-    Grippers are left out: they snap. A reading that jumps away and back counts too.
+    Grippers are excluded, because they snap. A reading that jumps away and back also counts.
     """
     episodes = evidence.need_state(8)
     arm = ~evidence.is_gripper
@@ -183,14 +182,14 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _ticks(episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Array:
-    """(D,) smallest difference between two frames of each element: the resolution of its encoder, or little."""
+    """Compute the (D,) smallest difference between two frames of each element: at most its encoder's resolution."""
     steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in episodes])
     smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
     return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
 def element_name(evidence: Evidence, element: int) -> str:
-    """Name of an element of the state, for people."""
+    """Name an element of the state in messages."""
     name = evidence.elements[element]
     return f"element {name} of the state" if name.isdigit() else name
 
@@ -203,9 +202,9 @@ def element_name(evidence: Evidence, element: int) -> str:
     do="compare the order of the joints in the recorder with the names in info.json",
 )
 def zero_elements(evidence: Evidence) -> Iterator[Fault]:
-    """Find elements of state and action that are exactly zero in all rows, beside others of the same arm that move.
+    """Find elements of state and action that are exactly zero in all rows while others of the same arm move.
 
-    An arm that rests as a whole is left out, and so are elements that rest at another value.
+    An arm that rests as a whole is excluded, and so are elements that rest at another value.
     """
     episodes = evidence.need_state()
     zero = np.all([~state.any(axis=0) for _, state in episodes], axis=0)
@@ -228,6 +227,6 @@ def zero_elements(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _group(name: str) -> str:
-    """The arm that an element belongs to: "left" or "right" if its name says so."""
+    """Determine the arm of an element: "left" or "right" if its name implies it."""
     words = joint_of(name).lower().replace(".", "_").replace("/", "_").split("_")
     return next((word for word in words if word in ("left", "right", "l", "r")), "")

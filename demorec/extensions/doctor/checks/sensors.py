@@ -13,11 +13,11 @@ from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.extensions.doctor.robust import runs
 
 MIN_LIVE_SHARE = 0.5
-"""Share of the moving frames outside the rest in which a sensor changes that is not allowed to rest."""
+"""Minimum ratio of moving frames in which a sensor changes, for its rests to be judged."""
 MIN_REST_S = 0.3
 MIN_BROKEN_S = 1.0
 MIN_SPEED = 0.3
-"""Share of the root mean square speed above which the robot counts as moving."""
+"""Minimum speed, relative to the root mean square, at which the robot counts as moving."""
 
 
 @check(
@@ -29,15 +29,15 @@ MIN_SPEED = 0.3
     do=DROP,
 )
 def frozen_sensors(evidence: Evidence) -> Iterator[Fault]:
-    """Find measured columns that repeat to the last bit while the robot moves, though they usually change.
+    """Find measured columns that repeat bit-exactly while the robot moves, though they usually change.
 
-    A sensor may rest at zero, as a contact sensor does, or where it rests in half of the moving frames.
+    A sensor may rest at zero, as a contact sensor does, or at a value that it keeps in half of the moving frames.
     """
     episodes = evidence.need_state(8)
     measured = evidence.roles.having("sensor", "velocity", "pose")
     names = [name for name in measured if name not in evidence.roles.state and evidence.roles.columns[name].is_vector]
     if not names:
-        raise NotMeasuredError("there are no measured columns beside the state")
+        raise NotMeasuredError("the state is the only measured column")
     for episode, _ in episodes:
         for name in names:
             if name in episode.columns and (rest := _longest_rest(episode, episode.columns[name])) is not None:
@@ -54,7 +54,7 @@ def frozen_sensors(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _longest_rest(episode: EpisodeEvidence, table: Array) -> tuple[int, int, int] | None:
-    """(first frame, last frame, moving frames) of the longest rest; None where the sensor often rests."""
+    """Find (first frame, last frame, moving frames) of the longest rest; None if the sensor often rests."""
     speed = episode.speed
     moves = speed > MIN_SPEED * np.sqrt((speed**2).mean()) if speed.any() else np.zeros(len(speed), dtype=np.bool_)
     same = (table[1:] == table[:-1]).all(axis=1) & table[1:].any(axis=1)

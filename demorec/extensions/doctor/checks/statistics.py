@@ -1,4 +1,4 @@
-"""Checks of a dataset's statistics, by which training normalises: of the whole dataset and of each episode."""
+"""Checks of a dataset's statistics, which normalise training data: of the whole dataset and of each episode."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from demorec.extensions.doctor.errors import NotMeasuredError
 from demorec.extensions.doctor.evidence import Evidence
 
 _RENUMBERED = ("index", "episode_index")
-"""Columns that LeRobot's delete, split and merge renumber without new statistics."""
+"""Columns that LeRobot's delete, split and merge renumber without updating the statistics."""
 _COUNTED = (*_RENUMBERED, "task_index")
 MAX_ERROR = 0.02
-"""Error, in standard deviations, that statistics may have: histograms and sampling are a hundredth off."""
+"""Maximum error of statistics, in standard deviations: histograms and sampling cause errors of 0.01."""
 MIN_BROKEN_ERROR = 0.2
-"""Error from which normalised values are wrong by a fifth of their spread."""
+"""Minimum error of broken statistics: normalised values are wrong by a fifth of their spread."""
 MIN_DEVIATION = 1e-4
-"""Standard deviation by which an element that hardly moves is measured."""
+"""Minimum standard deviation used as the unit, for elements that hardly move."""
 MAX_SUMMED = 4000
-"""Rows over which the roundings of a float32 sum add up: an episode of more than a minute at 60 fps."""
+"""Number of rows over which the rounding of a float32 sum accumulates: an episode of over a minute at 60 fps."""
 FLOAT32_SUM = 0.25
-"""Error of a float32 sum of N equal values, in N roundings of its result: they round alike while the sum grows."""
+"""Error of a float32 sum of N equal values, in N roundings of its result: rounding is uniform while the sum grows."""
 FLOAT32_VARIANCE = 3 * FLOAT32_SUM
 """Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
 Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
 """Episode -> feature -> quantity -> its numbers."""
 Ranges = Mapping[str, Array]
-"""Quantile -> (2, D) lowest and highest value that it may have."""
+"""Quantile -> (2, D) minimum and maximum allowed value."""
 
 
 @check(
     family="files",
     needs="a LeRobot dataset",
-    measures="statistics that are not those of the rows",
+    measures="statistics that do not match the rows",
     unit="standard deviations",
     why="Training normalises by them: state and action are shifted and squeezed.",
     do="demorec dataset select {path} --where 'num_frames > 0' --out NEW computes them again",
@@ -51,8 +51,8 @@ Ranges = Mapping[str, Array]
 def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     """Recompute minimum, maximum, mean, deviation, count and quantiles of every column, and of each episode.
 
-    A quantile may also be the mean of the episodes' quantiles, as LeRobot computes it, or between them, as its merge
-    leaves it. The deviation of a joint that is parked far from zero may have the rounding of LeRobot's float32.
+    A quantile may also be the mean of the episodes' quantiles, as LeRobot computes it, or between them, as after its
+    merge. The deviation of a joint parked far from zero may have the rounding of LeRobot's float32.
     """
     folder = folder_of(evidence)
     stats_path = OLD_STATS if folder.info.is_old else STATS_PATH
@@ -63,14 +63,14 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     names = [name for name, f in folder.info.features.items() if f.is_numeric and name not in unused]
     yield from _of_episodes(evidence, folder, names)
     if folder.info.is_old:
-        return  # training aggregates those of the episodes
+        return  # training aggregates the episodes' statistics
     if evidence.unreadable:
         raise NotMeasuredError(f"the whole dataset's, since {len(evidence.unreadable)} of its episodes cannot be read")
     stats = folder.statistics
     for name in names:
         episodes = [_vectors(folder, name, each.columns[name]) for each in evidence.episodes]
         if not episodes or any(not np.isfinite(values).all() for values in episodes):
-            continue  # without these numbers there is nothing to compare, and `missing_numbers` names them
+            continue  # without these numbers a comparison is impossible, and `missing_numbers` reports them
         ranges = [_quantile_ranges(values) for values in episodes]
         count = sum(len(each.columns[name]) for each in evidence.episodes)
         error, quantity = _largest_error(stats.get(name), np.concatenate(episodes), count, ranges)
@@ -118,7 +118,7 @@ def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
 
 
 def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
-    """Read the statistics in the table of episodes, as far as it has them."""
+    """Read the available statistics in the table of episodes."""
     tables = folder.episode_tables
     there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
     columns = {name: [q for q in NAMES if f"stats/{name}/{q}" in there] for name in names}
@@ -135,12 +135,12 @@ def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
 
 
 def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
-    """(N, D) rows; of arrays of several dimensions their last one, as LeRobot's statistics."""
+    """Convert rows to (N, D); arrays keep only their last dimension, as in LeRobot's statistics."""
     return np.asarray(rows, dtype=np.float64).reshape(-1, folder.info.features[name].shape[-1])
 
 
 def _quantile_ranges(values: Array) -> Ranges:
-    """The values of the neighbouring ranks: LeRobot reads quantiles off a histogram, others interpolate."""
+    """Compute the values of the neighbouring ranks: LeRobot reads quantiles off a histogram, others interpolate."""
     ordered, last = np.sort(values, axis=0), len(values) - 1
     ranks = {name: share * last for name, share in QUANTILES.items()}
     return {
@@ -151,13 +151,13 @@ def _quantile_ranges(values: Array) -> Ranges:
 def _largest_error(
     stored: Mapping[str, Any] | None, values: Array, count: int, episodes: Sequence[Ranges]
 ) -> tuple[float, str]:
-    """The largest error of a feature's quantities in standard deviations, and its quantity.
+    """Find the largest error of a feature's quantities in standard deviations, and its quantity.
 
     Args:
         stored: Quantity -> its numbers.
         values: (N, D) rows.
-        count: Rows.
-        episodes: Quantiles of the episodes, between which those of the set may be.
+        count: Number of rows.
+        episodes: Quantiles of the episodes; those of the set may be between them.
     """
     if not stored:
         return math.inf, "mean"
@@ -191,7 +191,7 @@ def _largest_error(
 
 
 def _between(quantity: str, values: Array, episodes: Sequence[Ranges]) -> tuple[Array, Array]:
-    """(D,) lowest and highest value that a quantile may have."""
+    """Compute the (D,) minimum and maximum value that a quantile may have."""
     low, high = _quantile_ranges(values)[quantity]
     width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
     lows = [low, *(each[quantity][0] for each in episodes)]
@@ -200,7 +200,7 @@ def _between(quantity: str, values: Array, episodes: Sequence[Ranges]) -> tuple[
 
 
 def numbers_of(value: Any) -> Array:
-    """(N,) numbers of an entry in the statistics, however nested; (0,) for anything else, text of numbers included."""
+    """Flatten a nested entry of the statistics to (N,) numbers; (0,) for anything else, including text of numbers."""
     try:
         found = np.asarray(value)
     except (ValueError, OverflowError):
@@ -225,7 +225,7 @@ def _is_finite(value: Any) -> bool:
 @check(
     family="files",
     needs="images, a LeRobot dataset of v3.0",
-    measures="mean colours that are not those of the images",
+    measures="mean colours that do not match the images",
     unit="of 1",
     why="Images are normalised by them.",
     do="demorec dataset select {path} --where 'num_frames > 0' --decode --out NEW computes them again",
@@ -233,12 +233,12 @@ def _is_finite(value: Any) -> bool:
 def wrong_colours(evidence: Evidence) -> Iterator[Fault]:
     """Compare the mean colour of each camera in meta/stats.json with that of the decoded images.
 
-    Writers sample images, so that 0.08 of the full range is allowed.
+    Writers sample images, so an error of 0.08 of the full range is allowed.
     """
     folder = folder_of(evidence)
     cameras = evidence.need_images()
     if folder.info.is_old or not (evidence.path / STATS_PATH).exists():
-        raise NotMeasuredError(f"there is no {STATS_PATH} of v3.0")
+        raise NotMeasuredError(f"{STATS_PATH} of v3.0 is missing")
     for camera, images in cameras.items():
         stored = numbers_of(folder.statistics.get(camera, {}).get("mean"))
         if not images.episodes or images.errors:

@@ -1,4 +1,4 @@
-"""Checks of time: gaps, doubled and early timestamps, another rate than stated, old samples."""
+"""Checks of time: gaps, repeated and reversed timestamps, a different rate than stated, old samples."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredErro
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
 
 MAX_GAP_PERIODS = 2.5
-"""Periods between two frames above which frames are missing between them; one late frame takes two."""
+"""Maximum periods between two frames without missing ones; one late frame takes two."""
 MAX_RATE_ERROR = 0.1
-"""Difference of the measured rate from the stated one, as a share of it, above which motion has a wrong speed."""
+"""Maximum relative error of the measured rate; above it motion has a wrong speed."""
 MIN_FRAMES = 5
 MAX_AGE_S = 0.2
-"""Age of a sample or an image, in seconds, above which a policy sees the past: people react in as much time."""
+"""Maximum age of a sample or an image, in seconds; above it a policy sees the past: people react in that time."""
 
 
 def _timed(evidence: Evidence) -> Iterator[tuple[EpisodeEvidence, Array]]:
     found = [(each, each.time_s) for each in evidence.episodes if each.time_s is not None and len(each.time_s) >= 2]
     if not found:
-        raise NotMeasuredError("there are no timestamps")
+        raise NotMeasuredError("timestamps are missing")
     yield from found
 
 
@@ -67,7 +67,7 @@ def _is_of_other_rate(steps: Array, fps: float) -> bool:
     do=DROP,
 )
 def time_order(evidence: Evidence) -> Iterator[Fault]:
-    """Count the frames whose timestamp is not after that of the frame before."""
+    """Count the frames with a timestamp that is not after the previous one."""
     for episode, times in _timed(evidence):
         wrong = np.flatnonzero(np.diff(times) <= 0)
         if len(wrong):
@@ -99,7 +99,7 @@ def frame_rate(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="broken",
             value=f"{rate:.3g} Hz",
-            message=f"the frames are {1 / rate:.3g} s apart, {rate:.3g} Hz; stated are {evidence.fps:g} Hz",
+            message=f"the frames are {1 / rate:.3g} s apart ({rate:.3g} Hz); the stated rate is {evidence.fps:g} Hz",
         )
         return
     for number, rate in wrong.items():
@@ -107,7 +107,7 @@ def frame_rate(evidence: Evidence) -> Iterator[Fault]:
             severity="broken",
             episode=number,
             value=f"{rate:.3g} Hz",
-            message=f"its frames come at {rate:.3g} Hz, {evidence.fps:g} Hz are stated",
+            message=f"its frames are at {rate:.3g} Hz instead of the stated {evidence.fps:g} Hz",
             do=DROP,
         )
 
@@ -122,12 +122,12 @@ def _period(times: Array) -> float:
     measures="measured timestamps off the grid of the rate",
     unit="ms",
     why="LeRobot refuses timestamps that are more than 0.1 ms off, and decodes the image of another moment.",
-    do="write frame_index / fps as the timestamp when converting; measured times belong in a column of their own",
+    do="write frame_index / fps as the timestamp when converting; store measured times in a separate column",
 )
 def time_grid(evidence: Evidence) -> Iterator[Fault]:
     """Compare the timestamps of a dataset with frame_index / fps, as LeRobot does when it loads one."""
     if evidence.folder is None:
-        raise NotApplicableError("recordings have times of their own")
+        raise NotApplicableError("recordings have their own timestamps")
     from demorec.datasets.lerobot.episode_table import are_on_grid
 
     worst: dict[int, float] = {}
@@ -165,7 +165,7 @@ def time_grid(evidence: Evidence) -> Iterator[Fault]:
 def sample_age(evidence: Evidence) -> Iterator[Fault]:
     """Compare the timestamps of samples and images with those of their frames, stream by stream."""
     if not any(episode.image_ages_s for episode in evidence.episodes):
-        raise NotApplicableError("samples have no timestamps of their own")
+        raise NotApplicableError("samples have no separate timestamps")
     for episode in evidence.episodes:
         for name, ages in episode.image_ages_s.items():
             old = np.abs(ages) > MAX_AGE_S
@@ -186,13 +186,13 @@ def sample_age(evidence: Evidence) -> Iterator[Fault]:
     needs="a recorder that counts its losses",
     measures="frames and images lost while recording",
     unit="frames",
-    why="The disk, the network or the camera was too slow: what is left is not at the stated rate.",
+    why="The disk, the network or the camera was too slow: the remaining frames are not at the stated rate.",
     do="record at a lower rate or size, or on another disk",
 )
 def recording_losses(evidence: Evidence) -> Iterator[Fault]:
     """Report the frames and images that the recorder itself counted as dropped."""
     if evidence.folder is not None:
-        raise NotApplicableError("LeRobot datasets do not state what was lost")
+        raise NotApplicableError("LeRobot datasets do not record losses")
     for episode in evidence.episodes:
         if episode.drops:
             yield Fault(severity="look", episode=episode.number, value=episode.drops, message=f"lost: {episode.drops}")

@@ -1,7 +1,7 @@
-"""Checks of images against the state: do they show this motion, at this time?
+"""Checks of images against the state: whether they show this motion, at this time.
 
-Where the state explains the images of the other episodes (`view_fit.py`), an episode whose images follow it late, or
-not at all, has images of another moment or take.
+If the state explains the images of the other episodes (`view_fit.py`), an episode with delayed or unexplained images
+has images of another time or recording.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.view_fit import MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
 
 MIN_EXPLAINED = 0.35
-"""Usual share of the images' variance that the state explains, from which a camera is judged."""
+"""Minimum usual ratio of the images' variance explained by the state, for a camera to be judged."""
 MAX_SET_LAG_S = 0.3
-"""Time by which images usually follow the state, at most: cameras need 30 to 150 ms."""
+"""Maximum usual delay of images after the state: cameras need 30 to 150 ms."""
 MIN_SHIFT = 1.5
-"""Frames by which an episode's images come early or late, at least."""
+"""Minimum offset, frames, of an early or late episode's images."""
 MIN_GAIN = 1.4
-"""Times less variance that is left unexplained at an episode's own lag than at the usual one."""
+"""Minimum factor by which an episode's own lag reduces the unexplained variance, compared with the usual one."""
 
 MIN_OTHER_RATIO = 0.5
-"""Share of what the state usually explains, from which the state of another episode explains the images."""
+"""Minimum ratio, of the variance usually explained by the state, that another episode's state must explain."""
 MIN_OTHER_GAIN = 2.0
-"""Times less variance that the state of another episode leaves unexplained."""
+"""Minimum factor by which the state of another episode reduces the unexplained variance."""
 
 
 @check(
@@ -40,7 +40,7 @@ MIN_OTHER_GAIN = 2.0
     do=DROP,
 )
 def image_lag(evidence: Evidence) -> Iterator[Fault]:
-    """Find by how many frames the images follow the state best: in the set, and in each episode against the others."""
+    """Find the delay at which the images match the state best: in the set, and in each episode against the others."""
     for camera, fits in _judged(evidence):
         lags = {number: fit.lag for number, fit in fits.items()}
         usual_lag, spread = usual(list(lags.values()), floor=0.2)
@@ -76,9 +76,9 @@ def _gain(fit: ViewFit, usual_lag: float) -> float:
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
 )
 def image_take(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes whose images the state of another episode explains far better than their own, at any lag.
+    """Find episodes with images that the state of another episode explains far better than their own, at any lag.
 
-    Images that no state explains are no evidence: the robot may be where no other episode was.
+    Images that no state explains are not evidence: the robot may be where no other episode was.
     """
     for camera, fits in _judged(evidence):
         usual_best = float(np.median([fit.best for fit in fits.values()]))
@@ -95,7 +95,7 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _judged(evidence: Evidence) -> Iterator[tuple[str, Mapping[int, ViewFit]]]:
-    """Yield each camera whose images the state usually explains."""
+    """Yield each camera with images that the state usually explains."""
     evidence.need_state(MIN_FRAMES)
     reasons = []
     for camera in evidence.need_images():
