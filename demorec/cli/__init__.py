@@ -116,7 +116,7 @@ def _reported(prog: str, run: Callable[[], int]) -> int:
         lack = resource_error(error) or _missing_package(error)  # memory and files may run out in any line
         if lack is None and (line := own_line(error)):
             kind = f"{type(error).__name__}: {error}".rstrip(": ")
-            tell(f"{prog}: {_shortened(kind)} (the traceback is in {_keep_traceback()}); it came up at {line}")
+            tell(f"{prog}: {_shortened(kind)} (the traceback is in {_keep_traceback()}); raised at {line}")
             return 1
         if lack is None:
             tell(f"{prog}: unexpected {type(error).__name__}, please report it with this file: {_keep_traceback()}")

@@ -26,13 +26,13 @@ _AS_THEY_ARE = (
     "robot", "split", "object_split", "variation", "fps", "renderer", "privileged", "state", "action", "episode_length",
     "render_mode", "render_camera", "render_width", "render_height",
 )  # fmt: skip
-"""Flags that are arguments of the environment by the same name."""
+"""Flags that are passed to the environment as arguments of the same name."""
 
 
 @EnvConfig.register_subclass("demorec")
 @dataclass
 class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
-    """Flags `--env.NAME=...`; the scenes of one seed are the same in `demorec evaluate`."""
+    """Flags `--env.NAME=...`; a seed has the same scenes as in `demorec evaluate`."""
 
     task: str | None = "pick_place"
     robot: str = "panda"
@@ -77,7 +77,7 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
 
     @property
     def gym_kwargs(self) -> dict[str, Any]:
-        """Arguments of `demorec.extensions.policies.gym_env.DemorecEnv` beside the task."""
+        """Arguments of `demorec.extensions.policies.gym_env.DemorecEnv` except the task."""
         return {name: getattr(self, name) for name in _AS_THEY_ARE} | {
             "seed": self.scene_seed,
             "cameras": tuple(self.cameras),
@@ -90,10 +90,10 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
     def create_envs(
         self, n_envs: int, use_async_envs: bool = False
     ) -> dict[str, dict[int, gymnasium.vector.VectorEnv]]:
-        """LeRobot's nesting of one vector of environments, whose members cost nothing once their episode is over.
+        """Create LeRobot's nested vector of environments, which idle at no cost after their episode.
 
-        LeRobot steps all of a batch until the last one is done; its own default would simulate new episodes
-        meanwhile and throw them away.
+        LeRobot steps a whole batch until its last episode ends; by default it would simulate further episodes meanwhile
+        and discard them.
         """
         make = freeze_after_episode_end(
             functools.partial(
@@ -110,5 +110,5 @@ class DemorecEnvConfig(EnvConfig):  # type: ignore[misc]
 
 
 def _make_one(task: str, **kwargs: Any) -> gymnasium.Env:
-    """One environment; in a process of its own, it is this import that registers the task."""
+    """Make one environment; in a separate process, this import registers the task."""
     return gymnasium.make(env_id(task), **kwargs)

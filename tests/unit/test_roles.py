@@ -127,7 +127,7 @@ def test_a_feature_that_does_not_exist_is_refused(call: str, flag: str, tmp_path
 def test_other_ways_to_name_a_role_wrongly(tmp_path: Path, capsys: Capture) -> None:
     root = write_convention(tmp_path / "d", UNKNOWN)
     assert exit_code("info", root, "--state", "measured", "--action", "measured") == 2
-    assert "--action names 'measured', which --state names already" in capsys.readouterr().err
+    assert "--action names 'measured', which --state already names" in capsys.readouterr().err
     assert exit_code("replay", root, *NAMED) == 2
     assert "add --robot" in capsys.readouterr().err
     assert exit_code("import", "bag.mcap", "--out", tmp_path / "run", *NAMED) == 2

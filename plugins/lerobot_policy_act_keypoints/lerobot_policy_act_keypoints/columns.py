@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 
 _JOINED_BYTES = 64 << 20
-"""Maximum size of a column whose chunks are joined."""
+"""Maximum size of a column for its chunks to be joined."""
 
 
 class Column:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 
 class TrainingError(Exception):
-    """Training failed, or a file is damaged. `exit_code` is what the command returns."""
+    """Training failed, or a file is damaged. The command returns `exit_code`."""
 
     exit_code = 1
 

@@ -114,7 +114,7 @@ class VideoFile:
         packets = [(p.pts, p.is_keyframe) for p in self._container.demux(self._stream) if p.size and p.pts is not None]
         packets.sort()
         if not packets:
-            raise FrameTimestampError(f"There is no frame in this video: {self._path}")
+            raise FrameTimestampError(f"The video has no frames: {self._path}")
         return np.array([pts for pts, _ in packets], np.int64), np.array([key for _, key in packets], bool)
 
 
@@ -199,8 +199,8 @@ class ImageReader:
         if is_far.any():
             time = times_s[is_far][0]
             raise FrameTimestampError(
-                f"There is no frame within {self._tolerance_s} s of {time:.6f} s, the nearest lies at "
-                f"{found[is_far][0]:.6f} s, so the video does not fit the table of the frames: {path}"
+                f"The video has no frame within {self._tolerance_s} s of {time:.6f} s (the nearest is at "
+                f"{found[is_far][0]:.6f} s), so it does not match the table of the frames: {path}"
             )
         chosen = np.take_along_axis(numbers, nearest, 1)
         return [torch.stack([frames[n].image for n in row]) for row in chosen.tolist()]
@@ -219,7 +219,7 @@ class ImageReader:
         if self._backend == "torchcodec" and not is_depth:  # as in LeRobot, it does not read depth
             return _TorchcodecFile(self._torchcodec.get_decoder(path))
         if self._backend not in _PYAV_NAMES and not is_depth:
-            raise ValueError(f"The video backend is {self._backend!r}, allowed are 'pyav' and 'torchcodec'.")
+            raise ValueError(f"The video backend is {self._backend!r}; choose 'pyav' or 'torchcodec'.")
         key = (path, is_depth)
         if key not in self._files:
             self._files[key] = VideoFile(path, "gray12le" if is_depth else "rgb24")

@@ -2,8 +2,8 @@
 
 A keyframe is a moment at which the gripper is commanded to close or to open (James and Davison, "Q-attention", 2021;
 PerAct, Shridhar et al., 2022). Keyframes follow from the robot's own poses and commands, which real recordings have,
-unlike poses of objects; yet the next closing is where the object is, and the next opening where it has to go. Each
-stays the same from frame to frame until it has passed, which is easy to learn.
+unlike object poses; yet the next closing is at the object, and the next opening at its target. Each is constant until
+it has passed, which is easy to learn.
 """
 
 from __future__ import annotations

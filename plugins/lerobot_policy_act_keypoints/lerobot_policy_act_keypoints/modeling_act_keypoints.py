@@ -46,7 +46,7 @@ def _words(text: str) -> list[str]:
 
 
 class _Gru(nn.GRU):  # type: ignore[misc]
-    """A GRU whose weights stay separate tensors on a GPU: safetensors cannot save parts of cuDNN's buffer."""
+    """A GRU that keeps its weights in separate tensors on a GPU: safetensors cannot save parts of cuDNN's buffer."""
 
     def flatten_parameters(self) -> None:
         """Do nothing."""
@@ -198,7 +198,7 @@ def _maps(channels: int, num_keypoints: int) -> nn.Module:
 
 
 class ActKeypointsPolicy(ACTPolicy):  # type: ignore[misc]
-    """ACT whose environment state is the output of a `KeypointEncoder`; only ACT is trained.
+    """ACT with the output of a `KeypointEncoder` as its environment state; only ACT is trained.
 
     Args:
         config: Settings, with images and a state among the inputs.

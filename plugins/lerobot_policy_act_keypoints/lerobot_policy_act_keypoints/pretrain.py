@@ -196,7 +196,7 @@ class _EncoderTraining:
         self._policy = make_policy(policy, ds_meta=dataset.meta)
         self._before, self._after = make_pre_post_processors(self._policy.config, dataset_stats=dataset.meta.stats)
         self._device = torch.device(policy.device)
-        rows = np.flatnonzero(~np.isnan(targets.values).all(1))  # after the last keyframe there is no target
+        rows = np.flatnonzero(~np.isnan(targets.values).all(1))  # frames after the last keyframe have no target
         training, held_out, self._num_held_out = split(_column(dataset, "episode_index").reshape(-1)[rows])
         self._training, self._held_out = rows[training], rows[held_out]
         values = targets.values[self._training]

@@ -75,7 +75,7 @@ class FastReader(DatasetReader):  # type: ignore[misc]
     """Reader of whole batches.
 
     Args:
-        reader: LeRobot's reader, whose settings and table are taken over.
+        reader: LeRobot's reader, which provides settings and table.
         cache_bytes: Maximum size of the decoded frames that each process keeps.
         expert_only: See `FastDataset`.
     """
@@ -307,8 +307,8 @@ DEFAULT_CACHE_BYTES = 256 << 20
 class FastDataset(LeRobotDataset):  # type: ignore[misc]
     """`LeRobotDataset` with another reader: equal items in the same order, several times as fast.
 
-    A `DataLoader` asks it for whole batches, whose rows are taken at once and whose video frames are decoded in their
-    order in the file. It can be pickled and forked; each process opens its own files and has its own cache.
+    A `DataLoader` requests whole batches from it; their rows are taken at once and their video frames decoded in file
+    order. It can be pickled and forked; each process opens its own files and has its own cache.
 
     Args:
         *args: Arguments of `LeRobotDataset`.

@@ -1,4 +1,4 @@
-"""lerobot-train whose datasets are read by `FastDataset`."""
+"""lerobot-train with datasets read by `FastDataset`."""
 
 from __future__ import annotations
 

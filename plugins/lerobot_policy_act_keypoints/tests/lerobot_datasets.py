@@ -21,20 +21,20 @@ SMALL_ACT: dict[str, Any] = {
     "dim_feedforward": 32,
     "n_encoder_layers": 1,
     "use_vae": False,
-    "dropout": 0.0,  # LeRobot does not take its random numbers up again where they were
+    "dropout": 0.0,  # LeRobot does not restore the random state of a stopped training
     "chunk_size": 8,
     "n_action_steps": 4,
     "pretrained_backbone_weights": None,
 }
-"""Settings of a policy whose training takes no time."""
+"""Settings of a policy that trains in no time."""
 SIZE = 64
-"""Of the images: the least that LeRobot's AV1 encoder takes."""
+"""Side of the images: the minimum of LeRobot's AV1 encoder."""
 
 
 def write_by_lerobot(
     root: Path, lengths: Sequence[int], *, stored_as: str = "video", depth: bool = False, **arguments: Any
 ) -> Path:
-    """A dataset with a feature of every type, two instructions, and small files, so that there are several.
+    """Write a dataset with a feature of every type, two instructions, and small, therefore several, files.
 
     Args:
         root: A folder that does not exist yet.

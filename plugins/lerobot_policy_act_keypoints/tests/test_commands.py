@@ -30,7 +30,7 @@ def ends(*words: str) -> int:
 
 @pytest.fixture
 def instead(monkeypatch: pytest.MonkeyPatch) -> Callable[[Callable[[], None]], None]:
-    """Puts a function in the place of lerobot-train's own."""
+    """Put a function in the place of lerobot-train's own."""
     from lerobot.scripts import lerobot_train
 
     return lambda function: monkeypatch.setattr(lerobot_train, "main", function)
@@ -95,7 +95,7 @@ def test_a_policy_that_is_nowhere_is_named(instead: Any, capsys: pytest.CaptureF
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_losses_are_those_of_lerobot_train(dataset: Path, tmp_path: Path) -> None:
-    """Twelve updates by each program, with worker processes: the same log but for its times, and the same weights."""
+    """Check that twelve updates by each program, with workers, give the same log except times, and the same weights."""
     config = tmp_path / "images.json"
     config.write_text(json.dumps({"dataset": {"repo_id": "local/test", "video_backend": "pyav"}, "policy": SMALL_ACT}))
     results = []

@@ -1,4 +1,4 @@
-"""Keyframes: when the gripper is next told to close or to open, and where the hand is then."""
+"""Keyframes: the next commands that close or open the gripper, and the hand's poses at them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def test_the_next_changes_are_found_and_never_those_of_another_episode() -> None
     opening = np.array([1, 1, 1, 0, 0, 0, 1, 1, 0, 0, 1, 1, 1, 1, 1, 1]) * 0.08
     found = find_keyframes(opening, episode)
     assert found[:8].tolist() == [[3, 6]] * 3 + [[-1, 6]] * 3 + [[-1, -1]] * 2
-    assert found[8:13].tolist() == [[-1, 10]] * 2 + [[-1, -1]] * 3  # that it begins closed is no change of its own
+    assert found[8:13].tolist() == [[-1, 10]] * 2 + [[-1, -1]] * 3  # an initially closed gripper is not a change
     assert found[13:].tolist() == [[-1, -1]] * 3
 
 

@@ -1,4 +1,4 @@
-"""The policy whose images come as keypoints: where its maps point, and that each frame is encoded once."""
+"""The policy with keypoints in place of images: positions of its maps, and one encoding per frame."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ STATE, FRONT = "observation.state", "observation.images.front"
 
 
 def test_a_keypoint_is_where_the_map_is_high() -> None:
-    """A map that is high around one place of the image, which is told in [-1, 1], x to the right and y down."""
+    """Check a map that is high around one position of the image, which is in [-1, 1], x to the right and y down."""
     from lerobot_policy_act_keypoints.modeling_act_keypoints import KeypointEncoder
 
     encoder = KeypointEncoder(num_cameras=1, state_dim=2, num_keypoints=1, channels=4, num_targets=3).eval()
@@ -27,12 +27,12 @@ def test_a_keypoint_is_where_the_map_is_high() -> None:
 
 
 def test_a_place_is_the_same_in_any_batch_and_nearly_so_on_any_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Convolutions in bfloat16, where a CPU has it, move keypoints by a twentieth of a pixel, none by a whole one."""
+    """Check that convolutions in bfloat16, if the CPU has it, move keypoints by up to a twentieth of a pixel."""
     from lerobot_policy_act_keypoints import modeling_act_keypoints as policy
 
     torch.manual_seed(0)
     encoder = policy.KeypointEncoder(num_cameras=1, state_dim=2, num_keypoints=16, channels=16, num_targets=3).eval()
-    torch.nn.init.constant_(encoder.temperature, 5.0)  # maps that point somewhere
+    torch.nn.init.constant_(encoder.temperature, 5.0)  # maps with a clear peak
     image = torch.rand(32, 3, 12, 16).repeat_interleave(8, 2).repeat_interleave(8, 3)
     found = {}
     for has_bfloat16 in (False, True):
@@ -49,7 +49,7 @@ def test_a_place_is_the_same_in_any_batch_and_nearly_so_on_any_cpu(monkeypatch: 
 
 
 class Policy:
-    """Counts the frames that it encodes; what it makes of one depends on nothing else."""
+    """Counts the frames that it encodes; each encoding depends on the frame alone."""
 
     def __init__(self) -> None:
         self.config = SimpleNamespace(type="act_keypoints")
@@ -84,7 +84,7 @@ def test_each_frame_is_encoded_once_and_its_image_is_not_needed_again() -> None:
 
 
 def test_a_place_follows_the_instruction_and_not_the_other_sentences_of_a_batch() -> None:
-    """The order of words matters, capitals and marks do not; words that were not learned are all one."""
+    """Check that the order of words matters, capitals and punctuation do not; all unknown words are equal."""
     from lerobot_policy_act_keypoints.modeling_act_keypoints import KeypointEncoder, vocabulary_of
 
     torch.manual_seed(0)

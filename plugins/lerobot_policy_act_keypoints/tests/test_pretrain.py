@@ -70,7 +70,7 @@ def pretrained(settings: Path) -> Path:
 def test_the_reported_error_is_that_of_the_held_out_episode(
     settings: Path, pretrained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """The baseline computed from the table itself; a second call does nothing but report again."""
+    """Compute the baseline from the table itself; a second call only reports again."""
     import pyarrow.parquet as pq
 
     table = pq.read_table(next((settings.parent / "dataset" / "data").rglob("*.parquet")))
@@ -99,7 +99,7 @@ def test_the_reported_error_is_that_of_the_held_out_episode(
 
 
 def test_lerobot_loads_the_policy_by_its_name_and_it_acts(pretrained: Path) -> None:
-    """What the encoder predicts goes into ACT: other images, other actions."""
+    """Check that the encoder's predictions reach ACT: other images, other actions."""
     import torch
     from lerobot.configs import PreTrainedConfig
     from lerobot.policies.factory import get_policy_class
@@ -301,7 +301,7 @@ def test_a_folder_in_the_dataset_or_in_use_is_refused(
 
 @pytest.mark.long
 def test_it_learns_to_see_where_a_hand_will_grasp(settings: Path, tmp_path: Path) -> None:
-    """To a centimetre, which is a pixel, where the mean of all is a decimetre off."""
+    """Check an error of one centimetre, which is a pixel; the mean of all has an error of a decimetre."""
     dataset = write_demonstrations(tmp_path / "dataset", 120)
     words = [f"--config_path={settings}", f"--dataset.root={dataset}", "--policy.num_keypoints=8"]
     words += ["--policy.encoder_channels=8", "--num-updates", "600", "--frames-per-update", "32"]
@@ -313,7 +313,7 @@ def test_it_learns_to_see_where_a_hand_will_grasp(settings: Path, tmp_path: Path
 
 
 def train(program: str, settings: Path, out: Path, *more: str) -> tuple[list[float], Path]:
-    """Losses, and the last checkpoint, of a training in a process of its own."""
+    """Train in a separate process; returns the losses and the last checkpoint."""
     command = [str(Path(sys.executable).parent / program), f"--config_path={settings}", f"--output_dir={out}"]
     done = subprocess.run([*command, *more], capture_output=True, text=True, check=False)
     text = done.stdout + done.stderr
@@ -325,7 +325,7 @@ def train(program: str, settings: Path, out: Path, *more: str) -> tuple[list[flo
 
 @pytest.mark.long
 def test_the_encoder_stays_as_it_was_pretrained(settings: Path, pretrained: Path, tmp_path: Path) -> None:
-    """Each frame is encoded once, and the losses are those of a training by LeRobot's own command, which does not."""
+    """Check that each frame is encoded once, with the losses of LeRobot's own command, which encodes repeatedly."""
     path = f"--policy.path={pretrained}"
     kept, one = train("lerobot-train-fast", settings, tmp_path / "kept", path)
     afresh, _ = train("lerobot-train", settings, tmp_path / "afresh", path)
@@ -342,7 +342,7 @@ def test_the_encoder_stays_as_it_was_pretrained(settings: Path, pretrained: Path
 
 
 def encoded(settings: Path, folder: Path) -> np.ndarray[Any, Any]:
-    """What the encoder makes of a frame of the dataset that comes as LeRobot's steps hand it on."""
+    """Encode a frame of the dataset as prepared by LeRobot's processing steps."""
     from lerobot.configs import PreTrainedConfig
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
     from lerobot.policies.factory import get_policy_class, make_pre_post_processors

@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 LENGTHS = (7, 11, 5, 9)
 KINDS = ("videos", "images", "long_gops")
-"""All but the last with depth; LeRobot codes colours as AV1, those of the last as H.264 in long groups."""
+"""All except the last have depth; LeRobot codes colours as AV1, those of the last as H.264 in long groups."""
 
 
 def quick(*chosen: str) -> list[Any]:
-    """All kinds, those that are not chosen as long tests: LeRobot's reader takes its time."""
+    """Return all kinds, those not chosen marked as long tests: LeRobot's reader is slow."""
     return [kind if kind in chosen else pytest.param(kind, marks=pytest.mark.long) for kind in KINDS]
 
 
@@ -34,7 +34,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def roots(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Kind -> a dataset, made when it is asked for."""
+    """Map each kind to a dataset, made on demand."""
     return _Made(tmp_path_factory.mktemp("datasets"))
 
 
@@ -59,7 +59,7 @@ class _Made(dict[str, Path]):
 
 
 def pair(root: Path, **arguments: Any) -> tuple[FastDataset, Any]:
-    """Both readers with the same arguments."""
+    """Make both readers with the same arguments."""
     from lerobot.datasets import LeRobotDataset
 
     from lerobot_policy_act_keypoints import FastDataset
@@ -69,14 +69,14 @@ def pair(root: Path, **arguments: Any) -> tuple[FastDataset, Any]:
 
 
 def windows(dataset: Any) -> dict[str, list[float]]:
-    """A history of two of all that is observed, and a chunk of actions, as policies ask for them."""
+    """Request two past observations and a chunk of actions, as policies do."""
     texts = {key for key, feature in dataset.meta.features.items() if feature["dtype"] == "string"}
     keys = [key for key in dataset.meta.features if key.startswith("observation.") and key not in texts]
     return {**dict.fromkeys(keys, HISTORY), "action": CHUNK}
 
 
 def assert_same(fast: FastDataset, slow: Any, *, batch: int = 16, seed: int = 0) -> None:
-    """All items, in batches of a shuffled order."""
+    """Compare all items, in batches of a shuffled order."""
     assert len(fast) == len(slow) > 0
     order = np.random.default_rng(seed).permutation(len(slow)).tolist()
     for start in range(0, len(order), batch):
@@ -191,7 +191,7 @@ def test_what_cannot_be_read_is_refused_as_by_lerobot(roots: dict[str, Path]) ->
         for dataset in (fast, slow):
             with pytest.raises(IndexError):
                 dataset[index]
-    # A table of episodes that places the images 10 ms beside where they are.
+    # A table of episodes with the images' times shifted by 10 ms.
     for dataset in (fast, slow):
         key = f"videos/{CAMERA}/from_timestamp"
         dataset.meta.episodes = dataset.meta.episodes.map(lambda row, key=key: {key: row[key] + 0.01})

@@ -1,4 +1,4 @@
-"""What a policy learns from corrected episodes when it learns from the expert alone."""
+"""Data that a policy learns from corrected episodes with the expert's frames only."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_a_dataset_shows_the_expert_alone(tmp_path: Path) -> None:
     of_expert = {0, 1, 2, 3, 4, 5, 9, 10, 14}
     for item in (experts[index] for index in range(15)):
         assert int(item["index"]) in of_expert
-    assert experts[9]["action_is_pad"].tolist() == [False, False, True]  # the policy goes on there
+    assert experts[9]["action_is_pad"].tolist() == [False, False, True]  # the policy continues there
     assert everything[9]["action_is_pad"].tolist() == [False, False, False]
     assert experts[9]["action"][2].tolist() == everything[10]["action"][0].tolist()  # held, as at an episode's end
     assert experts[0]["action_is_pad"].tolist() == [False, False, False]

@@ -1,9 +1,9 @@
-"""demorec's simulated arms as robots of LeRobot, whose own commands drive them with any of its teleoperators.
+"""demorec's simulated arms as robots of LeRobot, driven by its own commands with any of its teleoperators.
 
     lerobot-teleoperate --robot.type=demorec_so101 --robot.task=stack --fps=30 --teleop.type=so101_leader ...
 
-LeRobot's `keyboard` reports which keys are held, its `gamepad` increments of the hand; both move the hand.
-`lerobot-record` writes the teleoperator's output, so it needs one that gives joints.
+LeRobot's `keyboard` reports the held keys, its `gamepad` increments of the hand; both move the hand. `lerobot-record`
+writes the teleoperator's output, so it needs one with joint values.
 
 Each action is one control step of 1/fps s, no matter how long it took to arrive. LeRobot has no command for a new
 scene, so each connection has one scene; `--robot.record=DIR` writes it as an ordinary recording.
@@ -38,9 +38,10 @@ __all__ = ["DemorecPanda", "DemorecPandaConfig", "DemorecSO101", "DemorecSO101Co
 
 
 HAND = ("delta_x", "delta_y", "delta_z")
-"""How LeRobot's gamepad moves the hand along the axes of the base, x forward and y to the left, each from -1 to 1."""
+"""Increments of the hand from LeRobot's gamepad, along the axes of the base, x forward and y to the left, each from -1
+to 1."""
 CLOSE, OPEN = 0, 2
-"""What it says of the gripper, beside 1 for as it is."""
+"""Its values for the gripper; 1 means no change."""
 KEYS: Mapping[str, tuple[str, float]] = {
     "w": ("delta_x", 1.0),
     "s": ("delta_x", -1.0),
@@ -53,16 +54,16 @@ KEYS: Mapping[str, tuple[str, float]] = {
     "o": ("gripper", OPEN),
     "c": ("gripper", CLOSE),
 }
-"""What a held key does."""
+"""Effect of a held key."""
 HAND_SPEED, TURN_SPEED = 0.2, 1.0
-"""Of the hand, m/s of an arm of task_scale 1, and rad/s."""
+"""Speeds of the hand: m/s for an arm of task_scale 1, and rad/s."""
 
 
 class SimulatedArm(Robot):  # type: ignore[misc]
-    """A row of `demorec list robots` in a scene of a task: its state and actions are those of our datasets."""
+    """A row of `demorec list robots` in a scene of a task, with the states and actions of demorec's datasets."""
 
     row: ClassVar[str]
-    """Of the arm."""
+    """Name of the arm's row."""
 
     def __init__(self, config: SimulatedArmConfig) -> None:
         super().__init__(config)
@@ -86,21 +87,21 @@ class SimulatedArm(Robot):  # type: ignore[misc]
 
     @property
     def spec(self) -> RobotSpec:
-        """The arm."""
+        """The arm's spec."""
         return self._env.info.simulated.robot
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """Of the elements of state and action."""
+        """Names of the elements of state and action."""
         return state_names(self.spec, "joint")
 
     def state_values(self, joint_position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(D,) values of (n_joints,) positions, rad and m."""
+        """Convert (n_joints,) positions, rad and m, to (D,) values."""
         arm = len(self.spec.arm_joints)
         return np.append(joint_position[:arm], self.spec.gripper.width(joint_position[arm:]))
 
     def joint_targets(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(n_arm + 1,) joint targets, rad, and opening, m, of (D,) values."""
+        """Convert (D,) values to (n_arm + 1,) joint targets, rad, and opening, m."""
         return values
 
     @property
@@ -116,36 +117,36 @@ class SimulatedArm(Robot):  # type: ignore[misc]
 
     @property
     def is_connected(self) -> bool:
-        """Whether there is a scene."""
+        """Whether a scene exists."""
         return bool(self._target)
 
     def connect(self, calibrate: bool = True) -> None:
-        """Build the scene; SceneError where that is not possible."""
+        """Build the scene; SceneError if that fails."""
         del calibrate
         self._env.reset(seed=self.config.scene)
         self._target, self._hand = self._state(), None
 
     @property
     def is_calibrated(self) -> bool:
-        """It always is."""
+        """Always True."""
         return True
 
     def calibrate(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def configure(self) -> None:
-        """Nothing to do."""
+        """Do nothing."""
 
     def get_observation(self) -> dict[str, Any]:
-        """State and images now."""
+        """Return the current state and images."""
         images = self._env.situation.images
         return {**self._state(), **{name: found.color for name, found in images.items()}}
 
     def send_action(self, action: dict[str, Any]) -> dict[str, float]:
-        """One control step towards it; elements that it lacks stay. Returns what was sent within the arm's limits.
+        """Move towards the action for one control step; missing elements keep their targets. Returns the values sent.
 
         Raises:
-            ConfigError: It has no element of this arm.
+            ConfigError: The action has no element of this arm.
         """
         if all(value is None for value in action.values()):  # keys, or none
             action = dict.fromkeys(HAND, 0.0) | dict(KEYS[key] for key in action if key in KEYS)
@@ -153,7 +154,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
             action = self._moved(action)
         if not action.keys() & set(self.names):
             raise ConfigError(
-                f"The teleoperator says {', '.join(map(str, action)) or 'nothing'}; the arm takes "
+                f"The teleoperator sends {', '.join(map(str, action)) or 'nothing'}, but the arm takes "
                 f"{', '.join(self.names)}: choose one for this arm."
             )
         self._target |= {name: float(action[name]) for name in self.names if name in action}
@@ -182,7 +183,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         self._env.close()
 
     def _moved(self, action: dict[str, Any]) -> dict[str, float]:
-        """The joints that move the hand by an increment, pointing as before; where that is out of reach it stays."""
+        """Compute the joints that move the hand by an increment at constant orientation; out of reach, it stays."""
         arm, gripper = self._env.world.arm, self.spec.gripper
         hand = self._hand or arm.kinematics.forward(arm.target)
         way = np.array([float(action[name]) for name in HAND]) * (HAND_SPEED * self.spec.task_scale / self.config.fps)
@@ -202,7 +203,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
         return dict(zip(self.names, values.tolist(), strict=True))
 
     def _record(self) -> None:
-        """Write the frame of the last step, the first of a scene into a new file."""
+        """Write the frame of the last step, the first of a scene to a new file."""
         frame = self._env.situation.last_frame
         if self.config.record is None or frame is None:
             return
@@ -213,7 +214,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
 
 
 class DemorecSO101(SimulatedArm):
-    """The SO-101 in the units of LeRobot's `so101_follower`, by the calibration of `--robot.id` where it has one."""
+    """The SO-101 in the units of LeRobot's `so101_follower`, with the calibration of `--robot.id` if it exists."""
 
     config_class = DemorecSO101Config
     name = "demorec_so101"
@@ -221,28 +222,28 @@ class DemorecSO101(SimulatedArm):
 
     @cached_property
     def motors(self) -> Motors:
-        """The servos of the real arm; ConfigError for a calibration that is none of theirs."""
+        """The servos of the real arm; ConfigError if the calibration belongs to another arm."""
         own = self.calibration_fpath if self.calibration_fpath.is_file() else None
         return SO101_FOLLOWER.motors("degrees" if self.config.use_degrees else "range_m100_100", own)
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        """As of the real arm."""
+        """See `SimulatedArm`; names of the real arm."""
         return self.motors.names
 
     def state_values(self, joint_position: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6,) values of (6,) positions, rad."""
+        """Convert (6,) positions, rad, to (6,) values."""
         return np.asarray(self.motors.values(joint_position[np.newaxis])[0])
 
     def joint_targets(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(6,) joint targets, rad, and opening, m, of (6,) values."""
+        """Convert (6,) values to (6,) joint targets, rad, and opening, m."""
         factor, offset = np.array(self.motors.to_positions).T
         position = values * factor + offset
         return np.append(position[:-1], self.spec.gripper.width(position[-1:]))
 
 
 class DemorecPanda(SimulatedArm):
-    """The Panda: joints in rad, the opening in metres, as in our datasets."""
+    """The Panda: joints in rad, the opening in metres, as in demorec's datasets."""
 
     config_class = DemorecPandaConfig
     name = "demorec_panda"
@@ -250,7 +251,7 @@ class DemorecPanda(SimulatedArm):
 
 
 def _free_place(folder: Path) -> Path:
-    """The next episode's file in a folder, which is made."""
+    """Choose the next episode's file in a folder, which is created if missing."""
     folder.mkdir(parents=True, exist_ok=True)
     number = 0
     while (path := folder / f"episode_{number:06d}.mcap").exists():

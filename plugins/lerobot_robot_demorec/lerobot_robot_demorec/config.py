@@ -10,7 +10,7 @@ from lerobot.robots import RobotConfig
 
 @dataclass(kw_only=True)
 class SimulatedArmConfig(RobotConfig):  # type: ignore[misc]
-    """A task's scene, and what is seen of it; names as of `generate-dataset`."""
+    """Scene of a task and its cameras; names as in `generate-dataset`."""
 
     task: str = "pick_place"
     scene: int = 0
@@ -23,13 +23,13 @@ class SimulatedArmConfig(RobotConfig):  # type: ignore[misc]
     record: Path | None = None
 
     def __post_init__(self) -> None:
-        """Cameras are names here, where LeRobot's own method expects configurations of hardware."""
+        """Skip LeRobot's own method, which expects camera hardware instead of names."""
 
 
 @RobotConfig.register_subclass("demorec_so101")
 @dataclass(kw_only=True)
 class DemorecSO101Config(SimulatedArmConfig):
-    """The SO-101, as LeRobot's own `so101_follower`."""
+    """The SO-101, like LeRobot's own `so101_follower`."""
 
     use_degrees: bool = True
 
