@@ -244,7 +244,7 @@ def _lock_part(part: Path) -> int:
     """
     while True:
         if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
-            raise ConfigError(f"This is not an unfinished file and blocks the new one; move it elsewhere: {part}")
+            raise ConfigError(f"This is not an unfinished file and is in the way; move it elsewhere: {part}")
         try:
             handle = open_locked(part)
         except BlockingIOError as error:
