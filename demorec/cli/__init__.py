@@ -28,6 +28,7 @@ from demorec.core.registry import Registry, nearest_match
 class Command(Protocol):
     """A dataclass whose fields are the flags and whose docstring is the help; or a group (`subcommands_of`).
 
+    A class variable `rare_flags` names the fields, also those of dataclasses in it, that only --help-all shows.
     A classmethod `defaults(args)`, where there is one, returns the instance whose values are the flags' defaults.
     """
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any
+from typing import Annotated, Any, ClassVar
 
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
@@ -33,6 +33,28 @@ class Export:
       demorec export hdf5 recordings/cubes --out cubes.hdf5 --action ee_delta
     """
 
+    rare_flags: ClassVar[frozenset[str]] = frozenset(
+        {
+            "mapping",
+            "hold_images",
+            "corrected_only",
+            "allow_duplicates",
+            "workers",
+            "license",
+            "data_files_mb",
+            "video_files_mb",
+            "files_per_chunk",
+            "transcode_codec",
+            "transcode_crf",
+            "calibration",
+            "motor_units",
+            "intervention",
+            "public",
+            "boxes",
+            "progress",
+            "depth",
+        }
+    )
     format: Annotated[Positional[str], arg(metavar="FORMAT", help=f"One of: {', '.join(EXPORTERS.names())}.")]
     sources: Readable
     out: Target

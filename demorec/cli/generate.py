@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
 
 from tyro.conf import arg
 
@@ -20,6 +20,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.files import Closing
 from demorec.core.plain import from_plain, to_plain
 from demorec.core.registry import nearest_match
+from demorec.episode.variation import Ranges
 from demorec.generate.options import RunObserver, RunOptions
 from demorec.runs.run_file import RUN_NAME
 
@@ -45,9 +46,41 @@ class Generate:
       generate-dataset --config cubes/run.json --out again   (compares bit for bit)
     """
 
+    rare_flags: ClassVar[frozenset[str]] = frozenset(
+        {
+            *(each.name for each in dataclasses.fields(Ranges)),
+            "deep_every",
+            "check",
+            "address",
+            "cpus_per_worker",
+            "gpus_per_worker",
+            "recycle_after",
+            "repo_id",
+            "export",
+            "fixed",
+            "physics_hz",
+            "fps",
+            "renderer",
+            "antialias",
+            "depth",
+            "segmentation",
+            "object_split",
+            "split",
+            "sampling",
+            "sampling_block",
+            "joint_rate",
+            "max_attempts",
+            "max_episode_seconds",
+            "gop",
+            "crf",
+            "preset",
+            "jpeg_quality",
+            "allow",
+        }
+    )
     config: Path | None = None
-    """TOML file with any of the options below, without the dashes: num_episodes = 50. Or a run's run.json, a dataset's
-    folder or a recording: the run is made again, up to the last episode that it holds, and compared with it."""
+    """TOML file of options (num_episodes = 50); or a run's run.json, a dataset's folder or a recording, whose run is
+    made again and compared with it."""
     allow: Allow = ()
     """A module or package of your own that may be imported for the tasks, robots and cameras that --config's run,
     dataset or recording names."""

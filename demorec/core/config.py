@@ -97,8 +97,8 @@ class GenerateConfig:
     ranges: Ranges = field(default_factory=Ranges)
     """Single ranges that override those of --variation (auto: those of --variation)."""
     objects: tuple[str, ...] = ()
-    """Shelves that things are drawn from: names from `demorec list objects`, my_package.my_module:MY_SHELF, or a folder
-    of .obj and .stl files in metres, with a slash: ./my_meshes (auto: those of the task, if it draws from shelves)."""
+    """Shelves to draw objects from: names from `demorec list objects`, my_module:MY_SHELF, or a folder of .obj and .stl
+    files in metres, with a slash: ./my_meshes (auto: the task's own)."""
     object_split: Literal["all", "train", "eval"] = "all"
     """train leaves out one shape in five of each kind; eval has only those."""
     sampling: Literal["random", "sobol", "lhs"] = "random"

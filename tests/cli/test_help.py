@@ -22,11 +22,17 @@ GROUPS = ("demorec", "demorec dataset")
 """Programs whose help lists commands."""
 
 
-def help_of(program: str, width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> list[str]:
+def help_of(
+    program: str,
+    width: int,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    flag: str = "--help",
+) -> list[str]:
     monkeypatch.setenv("COLUMNS", str(width))
     start, *command = program.split()
     with pytest.raises(SystemExit) as ended:
-        (main if start == "demorec" else generate_dataset_main)([*command, "--help"])
+        (main if start == "demorec" else generate_dataset_main)([*command, flag])
     assert ended.value.code == 0
     return capsys.readouterr().out.splitlines()
 
@@ -45,10 +51,25 @@ def test_lines_fit_the_terminal(
 
 
 @pytest.mark.parametrize("program", PROGRAMS[1:])
+def test_help_fits_a_page_and_the_rest_is_under_help_all(
+    program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lines = help_of(program, 80, capsys, monkeypatch)
+    assert len(lines) <= 80
+    everything = help_of(program, 80, capsys, monkeypatch, "--help-all")
+    flags, all_flags = ({line.split()[1] for line in page if line.startswith("│ --")} for page in (lines, everything))
+    assert flags <= all_flags
+    hidden = [line for line in lines if line.endswith("more options.")]
+    command = program.removesuffix(" lerobot").removesuffix(" hdf5")
+    assert hidden == [f"{command} --help-all shows {len(all_flags - flags)} more options."] * (flags != all_flags)
+
+
+@pytest.mark.parametrize("program", PROGRAMS[1:])
 def test_every_flag_is_described(
     program: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rows = [line.strip("│ ") for line in help_of(program, 1000, capsys, monkeypatch) if line.startswith("│ ")]
+    lines = help_of(program, 1000, capsys, monkeypatch, "--help-all")
+    rows = [line.strip("│ ") for line in lines if line.startswith("│ ")]
     flags = [number for number, row in enumerate(rows) if row.startswith("-")]
     assert flags
     for number in flags:

@@ -16,8 +16,8 @@ import shutil
 import sys
 import textwrap
 import unicodedata
-from collections.abc import Callable, Mapping, Sequence
-from contextlib import redirect_stderr, redirect_stdout
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin
@@ -48,6 +48,9 @@ _NARROWEST = 40
 """Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
 _UNWRITABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, of bytes that are not UTF-8, and of ends of lines and paragraphs."""
+_HELP_ALL = "--help-all"
+_left_out: dict[str, bool] = {}
+"""Field that the help of the command that is being parsed leaves out -> whether the command has it."""
 _HINTED = object()
 """Marks a type for which tyro's own rule is asked."""
 
@@ -71,12 +74,13 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
     # ~ within quotes and in --out=~/new, which bash leaves as it is
     args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
-    asks_for_help = "-h" in args or "--help" in args
+    rare: frozenset[str] = frozenset() if _HELP_ALL in args else getattr(command, "rare_flags", frozenset())
+    asks_for_help = bool({"-h", "--help", _HELP_ALL} & set(args))
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
     encoding = codecs.lookup(sys.stdout.encoding or "utf-8").name
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
-        with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err):
+        with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err), _leaving_out(rare) as hidden:
             parsed = tyro.cli(
                 command,
                 args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
@@ -89,12 +93,25 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
         page, write = (err, tell) if end.code else (out, say)
         page.seek(0)
         write(*_laid_out(page.read(), terminal_width()))  # tyro repeats what it does not understand as it is
+        if asks_for_help and any(hidden.values()):
+            say(f"{prog} {_HELP_ALL} shows {sum(hidden.values())} more options.")
         for word in args if end.code else ():
             if word.startswith("-") and Path(word).exists():
                 tell(f"{prog}: a path that begins with a dash is written ./{word}")
         raise
     check_targets(parsed)
     return parsed
+
+
+@contextmanager
+def _leaving_out(names: frozenset[str]) -> Iterator[Mapping[str, bool]]:
+    """Leave fields, of a command or of the dataclasses in it, out of the help; give which of them the command has."""
+    global _left_out
+    _left_out = dict.fromkeys(names, False)
+    try:
+        yield _left_out
+    finally:
+        _left_out = {}
 
 
 def _laid_out(page: str, width: int) -> list[str]:
@@ -118,6 +135,9 @@ def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
     for field in spec.fields:
         hint = "(required)" if field.default is MISSING_NONPROP else "" if field.default in (None, "", ()) else None
         kind: Any = field.type if hint is None else Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)]
+        if field.name in _left_out:
+            kind = Annotated[kind, tyro.conf.Suppress]
+            _left_out[field.name] = True
         text = field.helptext() if callable(field.helptext) else field.helptext
         fields.append(dataclasses.replace(field, type=kind, helptext=" ".join((text or "").split())))
     return dataclasses.replace(spec, fields=tuple(fields))

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import say, say_json
@@ -31,6 +31,24 @@ _SCENES = ("task", "robot", "objects", "object_split", "split", "seed", "variati
 class RolloutFlags:
     """Which policy, in which scenes, recorded how; each command has its own default of `split`."""
 
+    rare_flags: ClassVar[frozenset[str]] = frozenset(
+        {
+            "object_split",
+            "action_steps",
+            "episode_length",
+            "renderer",
+            "allow",
+            "gop",
+            "crf",
+            "preset",
+            "jpeg_quality",
+            "stray_radians",
+            "stray_seconds",
+            "random_share",
+            "after_seconds",
+            "objects",
+        }
+    )
     policy: Path | None = None
     """Output folder of lerobot-train, or a pretrained_model folder."""
     task: str = "pick_place"
