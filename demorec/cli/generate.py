@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Generate:
-    """Generate scripted demonstrations: simulate, record (MCAP), export (LeRobot), check.
+    """Generate demonstrations: simulate, record (MCAP), export (LeRobot), check.
 
     Run the same command again to continue where it stopped. A larger --num-episodes extends the run; a smaller one
     uses its first episodes and leaves the others where they are. The episodes depend on the episode options and the
