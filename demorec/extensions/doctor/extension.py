@@ -1,4 +1,4 @@
-"""Declaration of the doctor, which judges anybody's data."""
+"""Declaration of the doctor, which checks data from any source."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ MIN_PAIR_GAIN = 4.0
     needs="state, action",
     measures="actions that come late or early",
     unit="frames",
-    why="A policy learns which action belongs to an observation: a shift of few frames makes it lag or oscillate.",
+    why="A policy learns the action that belongs to an observation: a shift of a few frames makes it lag or oscillate.",
     do="shift the action in the program that recorded it, or drop the episodes: " + DROP,
 )
 def action_lag(evidence: Evidence) -> Iterator[Fault]:
@@ -71,7 +71,7 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
                 severity="broken",
                 episode=number,
                 value=f"{shift:+.1f} frames",
-                message=f"its state follows the action by {episode.lag:+.1f} frames, in the others by {usual_lag:+.1f}",
+                message=f"its state follows the action by {episode.lag:+.1f} frames (others: {usual_lag:+.1f})",
             )
 
 
@@ -130,7 +130,7 @@ def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
             severity="broken",
             episode=number,
             value=f"{shares[number]:.0%} of frames",
-            message="its action is the state of the same frame, in the others it is not",
+            message="its action is the state of the same frame, unlike in the others",
             do=DROP,
         )
 
@@ -140,7 +140,7 @@ def action_equals_state(evidence: Evidence) -> Iterator[Fault]:
     needs="state, action",
     measures="elements of the action that are exchanged",
     why="The policy moves one joint where it should move another.",
-    do="give the columns their order in the program that wrote them, or drop the episodes: " + DROP,
+    do="fix the column order in the program that wrote them, or drop the episodes: " + DROP,
 )
 def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
     """Find two elements with actions that explain the other's motion several times better than their own."""
@@ -160,7 +160,7 @@ def swapped_elements(evidence: Evidence) -> Iterator[Fault]:
             severity="broken",
             message=f"the action's {names[one]} moves the state's {names[two]}, and the other way round",
             value=f"{whole[one, one]:.0%} against {whole[one, two]:.0%} unexplained",
-            do="give the columns their order in the program that wrote them",
+            do="fix the column order in the program that wrote them",
         )
     for number, matrix in matrices.items() if len(matrices) > MIN_OTHERS else ():
         for one, two in _swaps(matrix):

@@ -79,7 +79,7 @@ def _arm_speed(evidence: Evidence, state: Array) -> Array:
 @check(
     family="set",
     needs="state, eight episodes",
-    measures="episodes that hold several",
+    measures="episodes that contain several",
     unit="times the length",
     why="Nothing marks where one attempt ends and the next begins: the policy learns to start over.",
     do="split it where the arm returns to its start, in the program that recorded it, or drop it: " + DROP,
@@ -97,7 +97,7 @@ def joined_episodes(evidence: Evidence) -> Iterator[Fault]:
                 severity="broken" if is_long else "look",
                 episode=episode.number,
                 value=f"{len(state) / length:.1f} times" if is_long else f"{returns + 1} attempts",
-                message=f"it seems to hold {returns + 1} episodes: it jumps back to its start {returns} times",
+                message=f"it seems to contain {returns + 1} episodes: it jumps back to its start {returns} times",
             )
 
 

@@ -71,7 +71,7 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     needs="a LeRobot dataset",
     measures="counters and indices that contradict",
     unit="contradictions",
-    why="LeRobot takes rows and images by these numbers: it finds others, or none.",
+    why="LeRobot looks up rows and images by these numbers: it finds wrong ones, or none.",
     do="demorec dataset select {path} --where 'num_frames > 0' --out NEW numbers them again; otherwise record it again",
 )
 def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
@@ -234,14 +234,14 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> str:
     needs="videos",
     measures="videos that differ from info.json",
     unit="files",
-    why="Readers prepare for the stated size and rate: images are resized, shifted, or refused.",
+    why="Readers expect the stated size and rate: images are resized, shifted, or refused.",
     do="correct meta/info.json, or encode the video as stated",
 )
 def video_format(evidence: Evidence) -> Iterator[Fault]:
     """Compare size, rate, codec and sound of each video file with info.json, and info.json with itself."""
     folder = folder_of(evidence)
     if not folder.info.video_keys:
-        raise NotApplicableError("there are no videos")
+        raise NotApplicableError("the dataset has no videos")
     for key in folder.info.video_keys:
         feature = folder.info.features[key]
         stated = _stated_format(feature)
@@ -311,10 +311,10 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
     """
     folder = folder_of(evidence)
     if not folder.info.video_keys:
-        raise NotApplicableError("there are no videos")
+        raise NotApplicableError("the dataset has no videos")
     for key in folder.info.video_keys:
         if evidence.cameras and key not in evidence.cameras and not folder.info.features[key].is_depth:
-            yield Fault(severity="look", message=f"no video of {key} is here", do="download it")
+            yield Fault(severity="look", message=f"the videos of {key} are missing", do="download it")
             continue
         ends: dict[Path, int] = {}
         is_here = any(place.videos[key][0].exists() for place in folder.listed)

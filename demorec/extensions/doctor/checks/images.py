@@ -55,7 +55,7 @@ MAX_TWIN_DIFFERENCE = 1.0
     needs="images",
     measures="images that do not decode",
     unit="episodes",
-    why="Training ends with an error when it comes to them.",
+    why="Training ends with an error when it reaches them.",
     do="download or record them again, or drop the episode: " + DROP,
 )
 def undecodable_images(evidence: Evidence) -> Iterator[Fault]:
@@ -77,7 +77,7 @@ def undecodable_images(evidence: Evidence) -> Iterator[Fault]:
 @check(
     family="images",
     needs="images",
-    measures="images that show nothing",
+    measures="blank images",
     unit="frames",
     why="The policy acts without seeing, and learns to ignore the camera.",
     do=DROP,
@@ -119,7 +119,7 @@ def _bounds(flags: NDArray[np.bool_]) -> tuple[int, int]:
 @check(
     family="images",
     needs="images",
-    measures="a camera that is covered for a while",
+    measures="a camera that is temporarily covered",
     unit="s",
     why="The policy acts without seeing in these frames.",
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
@@ -272,7 +272,7 @@ def _share_repeated(gaps: NDArray[np.intp]) -> float:
 @check(
     family="images",
     needs="images of three episodes",
-    measures="cameras that are exchanged or turned",
+    measures="cameras that are exchanged or rotated",
     unit="correlation",
     why="The policy sees the wrong view under the name of the right one.",
     do=DROP,
@@ -330,7 +330,7 @@ def _turned(image: Array) -> Iterator[tuple[str, Array]]:
 @check(
     family="images",
     needs="two cameras",
-    measures="two cameras that show the same",
+    measures="two cameras that show the same view",
     unit="of 255",
     why="One of the two views is lost; the policy gets the same image twice.",
     do=DROP,

@@ -51,9 +51,9 @@ def empty_instructions(evidence: Evidence) -> Iterator[Fault]:
 @check(
     family="set",
     needs="instructions",
-    measures="one task in different words, or a lone one",
+    measures="a task in different words, or in unique words",
     unit="episodes",
-    why="Words that differ by a typing error are two tasks for a policy; a lone one is often an error of the operator.",
+    why="Words that differ by a typing error are two tasks for a policy; unique ones are often an operator's error.",
     do="demorec dataset set-task {path} --task 'WORDS' --episodes {episode} --out NEW",
 )
 def odd_instructions(evidence: Evidence) -> Iterator[Fault]:

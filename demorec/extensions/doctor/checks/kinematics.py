@@ -78,7 +78,7 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="broken",
             value=f"{1e3 * error:.0f} mm",
-            message=f"the EE pose is {1e3 * error:.0f} mm off the joints",
+            message=f"the EE pose deviates from the joints by {1e3 * error:.0f} mm",
         )
         return
     for number, error in bad.items():
@@ -86,7 +86,7 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
             severity="broken",
             episode=number,
             value=f"{1e3 * error:.0f} mm",
-            message=f"its EE pose is {1e3 * error:.0f} mm off the joints",
+            message=f"its EE pose deviates from the joints by {1e3 * error:.0f} mm",
             do=DROP,
         )
 

@@ -61,7 +61,7 @@ def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="broken",
             value=f"{ratio:.2f} times",
-            message=f"{', '.join(names[k] for k in wrong)} moves {ratio:.2f} times as far as its velocity says",
+            message=f"{', '.join(names[k] for k in wrong)} moves {ratio:.2f} times as far as its velocity implies",
         )
         return
     for number, (ratios, _) in known_ratios.items():
@@ -71,7 +71,7 @@ def velocity_mismatch(evidence: Evidence) -> Iterator[Fault]:
                 severity="broken",
                 episode=number,
                 value=f"{ratio:.2f} times",
-                message=f"its state moves {ratio:.2f} times as far as its velocities say",
+                message=f"its state moves {ratio:.2f} times as far as its velocities imply",
                 do=DROP,
             )
 

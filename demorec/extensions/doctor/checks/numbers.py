@@ -198,7 +198,7 @@ def element_name(evidence: Evidence, element: int) -> str:
     family="numbers",
     needs="state",
     measures="elements that are exactly zero throughout",
-    why="A converter that lacks a joint writes zeros: the policy learns nothing of it, and commands zero.",
+    why="A converter that lacks a joint writes zeros: the policy learns nothing about it, and commands zero.",
     do="compare the order of the joints in the recorder with the names in info.json",
 )
 def zero_elements(evidence: Evidence) -> Iterator[Fault]:

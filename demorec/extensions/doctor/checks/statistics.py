@@ -78,7 +78,7 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
             yield Fault(
                 severity="look" if quantity == "count" else _severity(error, name),
                 value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
-                message=f"the {quantity} of {name} in {STATS_PATH} is not that of the rows",
+                message=f"the {quantity} of {name} in {STATS_PATH} does not match the rows",
             )
     if unknown := [name for name in stats if name not in folder.info.features]:
         yield Fault(severity="look", message=f"{STATS_PATH} has {', '.join(unknown[:3])}, which is not a feature")
@@ -104,7 +104,7 @@ def _of_episodes(evidence: Evidence, folder: LeRobotFolder, names: Sequence[str]
                     severity="look" if name in _COUNTED or quantity == "count" else _severity(error / 2, name),
                     episode=episode.number,
                     value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
-                    message=f"the {quantity} of {name} in {place} is not that of its rows",
+                    message=f"the {quantity} of {name} in {place} does not match its rows",
                 )
                 break
 

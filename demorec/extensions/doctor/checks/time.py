@@ -32,7 +32,7 @@ def _timed(evidence: Evidence) -> Iterator[tuple[EpisodeEvidence, Array]]:
     needs="timestamps",
     measures="frames that are missing between others",
     unit="s",
-    why="The arm moves on during the gap: the action of the frame before it seems to do more than it did.",
+    why="The arm moves during the gap, so the preceding action seems to have a larger effect than it had.",
     do="look at it: demorec view {path} --episodes {episode}; then cut or drop it: " + DROP,
 )
 def time_gaps(evidence: Evidence) -> Iterator[Fault]:
@@ -63,7 +63,7 @@ def _is_of_other_rate(steps: Array, fps: float) -> bool:
     needs="timestamps",
     measures="timestamps that repeat or run backwards",
     unit="frames",
-    why="LeRobot finds images by the time of a row: the wrong ones, or none.",
+    why="LeRobot finds images by a row's timestamp, so it finds wrong ones or none.",
     do=DROP,
 )
 def time_order(evidence: Evidence) -> Iterator[Fault]:
@@ -83,9 +83,9 @@ def time_order(evidence: Evidence) -> Iterator[Fault]:
 @check(
     family="time",
     needs="timestamps",
-    measures="another rate than the stated one",
+    measures="a rate that differs from the stated one",
     unit="Hz",
-    why="Policies act at the stated rate: they replay the motion faster or slower than it was shown.",
+    why="Policies act at the stated rate, so their motion is faster or slower than demonstrated.",
     do="set fps to the measured rate in the recorder, and record or convert again",
 )
 def frame_rate(evidence: Evidence) -> Iterator[Fault]:

@@ -36,7 +36,7 @@ MIN_OTHER_GAIN = 2.0
     needs="images, state, five episodes",
     measures="images that come early or late",
     unit="frames",
-    why="The policy sees another moment than the one that its action belongs to.",
+    why="The policy sees images from a different time than the action.",
     do=DROP,
 )
 def image_lag(evidence: Evidence) -> Iterator[Fault]:
@@ -70,7 +70,7 @@ def _gain(fit: ViewFit, usual_lag: float) -> float:
 @check(
     family="images",
     needs="images, state, five episodes",
-    measures="images of another take",
+    measures="images of another recording",
     unit="% explained",
     why="The policy learns actions that do not belong to the images.",
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
