@@ -1,4 +1,4 @@
-"""The sheet of images in docs/rendering.md: both cameras by every renderer that works here, at three sizes."""
+"""Draw the labelled sheet of docs/rendering.md: both cameras by every available renderer, at three sizes."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from numpy.typing import NDArray
+from PIL import Image, ImageDraw, ImageFont
 from render import painter_for, plan, run_episode
 
 from demorec.core.errors import RenderError
@@ -17,6 +18,17 @@ from demorec.loop import make_world
 
 SIZES = ((96, 96), (224, 224), (640, 480))
 TILE_HEIGHT = 240
+LABEL_HEIGHT = 20
+
+
+def tile(image: Image.Image, label: str) -> NDArray[np.uint8]:
+    """Scale an image to the height of a row, with its label above."""
+    width = round(TILE_HEIGHT * image.width / image.height)
+    filtering = Image.Resampling.NEAREST if image.height < TILE_HEIGHT else Image.Resampling.LANCZOS
+    canvas = Image.new("RGB", (width, LABEL_HEIGHT + TILE_HEIGHT), "white")
+    canvas.paste(image.resize((width, TILE_HEIGHT), filtering), (0, LABEL_HEIGHT))
+    ImageDraw.Draw(canvas).text((4, 3), label, fill="black", font=ImageFont.load_default(size=12))
+    return np.asarray(canvas)
 
 
 def main() -> int:
@@ -38,10 +50,9 @@ def main() -> int:
                             replace(c, width=width, height=height) for c in episode.info.simulated.scene.cameras
                         )
                         painter = painter_for(renderer, world, cameras, antialias=True, everything=False)
-                        for images in painter.images().values():
-                            wide = round(TILE_HEIGHT * width / height)
-                            nearest = Image.Resampling.NEAREST if height < TILE_HEIGHT else Image.Resampling.LANCZOS
-                            row.append(np.asarray(Image.fromarray(images.color).resize((wide, TILE_HEIGHT), nearest)))
+                        for camera, images in painter.images().items():
+                            label = f"{name}, {camera} camera, {width}x{height}"
+                            row.append(tile(Image.fromarray(images.color), label))
             except RenderError as error:
                 print(f"{name} is left out: {error}")
                 continue

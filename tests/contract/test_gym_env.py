@@ -190,7 +190,7 @@ def test_a_varying_number_of_objects_is_refused_where_a_vector_must_hold_them() 
         for seed in range(8):
             env.reset(seed=seed)
 
-    with pytest.raises(SceneError, match="other objects"):
+    with pytest.raises(SceneError, match="different objects"):
         look_at_several()
     env.close()
 

@@ -138,7 +138,7 @@ def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> Non
     """On a recording of the demo's task, since the examples name what lies on its table."""
     sample = Path(__file__).parents[2] / "recordings/sample/pick_place.mcap"
     recording = {"recordings/demo/episodes/episode_000000.mcap": sample}
-    assert run_examples("docs/recording.md", "from demorec.mcap import open_recording", recording) == 2
+    assert run_examples("docs/recording.md", "import open_recording", recording) == 2
     assert capsys.readouterr().out
 
 
