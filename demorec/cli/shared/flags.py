@@ -74,8 +74,9 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
     # ~ within quotes and in --out=~/new, which bash leaves as it is
     args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
-    rare: frozenset[str] = frozenset() if _HELP_ALL in args else getattr(command, "rare_flags", frozenset())
     asks_for_help = bool({"-h", "--help", _HELP_ALL} & set(args))
+    leaves_out = asks_for_help and _HELP_ALL not in args
+    rare: frozenset[str] = getattr(command, "rare_flags", frozenset()) if leaves_out else frozenset()
     # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
     encoding = codecs.lookup(sys.stdout.encoding or "utf-8").name
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
