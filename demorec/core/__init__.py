@@ -1,1 +1,1 @@
-"""What everything else stands on: errors, numbers, tables, and what keeps the user's files and programs safe."""
+"""Foundations of all other packages: errors, numbers, tables, and protection of the user's files and processes."""

@@ -1,12 +1,12 @@
-"""Atomic writes: a file or folder appears under its name whole, or not at all, and never takes another one's name.
+"""Atomic writes: a file or folder appears under its name complete or not at all, and never takes an existing name.
 
-It is made in a hidden folder next to its place, `.NAME.demorec-part`, the workshop. A lock in it keeps two commands
-apart, and its content marks the workshop as ours. The last step takes the name only if it is still free, or, with
-`--overwrite`, if it still holds what was there at the start.
+The content is written in the workshop, a hidden folder next to the target: `.NAME.demorec-part`. A lock in it excludes
+a second command, and its content marks the workshop as demorec's. The last step takes the name only if it is still
+free, or, with `--overwrite`, if the existing target is unchanged since the start.
 
-A single target is renamed, or changes places with what it replaces, by one system call. Several targets are moved one
-after the other, the old ones first: a journal lets the next command to the same targets undo what a crash cut off.
-The lock is removed last, so that whatever a crash leaves is recognised, and cleared by the next command.
+One system call renames a single target, or exchanges it with the target that it replaces. Several targets are moved in
+sequence, the old ones first: the next command with the same targets reads a journal and undoes an interrupted move. The
+lock is removed last, so that the next command recognises and removes the remains of a crash.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from demorec.core.files import open_locked, sync_path
 from demorec.core.replacing import ReplaceableKind, check_replaceable, json_object, shown
 
 _LOCK, _JOURNAL, _NEW, _OLD = "lock", "journal.json", "new", "old"
-"""All that a workshop holds: the lock, what is being moved where, what is made, and what it replaces."""
+"""Content of a workshop: the lock, the journal of moves, the new targets and the old ones."""
 _MARK = b"demorec is writing here; its next command to the same place removes this folder.\n"
 _AT_FDCWD = -100
 _EXCHANGE = 2
@@ -35,27 +35,29 @@ _NO_REPLACE = 4 if sys.platform == "darwin" else 1
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 Snapshot = dict[str, list[int]]
-"""Name of each file and folder of a target, "" for itself -> inode and, for files, size and time of the last change."""
+"""Name of each file and folder of a target, "" for the target itself -> inode and, for files, size and modification
+time.
+"""
 
 
 @contextmanager
 def atomic_write(
     target: Path, kind: ReplaceableKind, *, overwrite: bool = False, sources: Iterable[Path] = ()
 ) -> Iterator[Path]:
-    """Give a path to write to, which becomes `target` when the block ends without an error.
+    """Yield a path to write to, which becomes `target` when the block ends without an error.
 
-    The path is an empty folder for a kind that is a folder; for others there is no file yet. The parent of `target` is
-    made if it is missing.
+    The path is an empty folder if the kind is a folder; otherwise it does not exist yet. The parent of `target` is
+    created if it is missing.
 
     Args:
-        target: Where the result goes.
-        kind: What it is, and what it may replace.
-        overwrite: Whether the user asks for replacing.
-        sources: What the result is made from, which is never replaced.
+        target: Path of the result.
+        kind: Kind of the result, which decides what it may replace.
+        overwrite: Whether the user asks for replacement.
+        sources: Inputs of the result, which are never replaced.
 
     Raises:
-        ConfigError: The target exists and must stay, another command is writing it, or something has appeared there
-            meanwhile. In the last case the result is kept next to it, under the name that the error reports.
+        ConfigError: The target exists and must stay, another command is writing it, or another file has appeared there.
+        In the last case the result is kept next to it, under the name in the error message.
         ExportError: It cannot be written for another reason, such as a full disk.
     """
     with atomic_write_all([target], kind, overwrite=overwrite, sources=sources) as (part,):
@@ -66,7 +68,7 @@ def atomic_write(
 def atomic_write_all(
     targets: Sequence[Path], kind: ReplaceableKind, *, overwrite: bool = False, sources: Iterable[Path] = ()
 ) -> Iterator[list[Path]]:
-    """Give a path to write to for each target, which all appear when the block ends; else as `atomic_write`."""
+    """Yield a path to write to for each target; all targets appear when the block ends. See `atomic_write`."""
     sources = tuple(sources)
     places = [(Path.cwd() / target).resolve() for target in targets]
     workshop = places[0].parent / f".{places[0].name}.demorec-part"
@@ -76,7 +78,7 @@ def atomic_write_all(
             check_replaceable(Path.cwd() / target, kind, overwrite=overwrite, sources=sources)
 
     try:
-        if not os.path.lexists(workshop):  # else what a crash left of several targets is undone first
+        if not os.path.lexists(workshop):  # otherwise undo the remains of an interrupted move of several targets first
             check()
         with _locked(workshop, targets[0]):
             _undo(workshop)
@@ -93,7 +95,7 @@ def atomic_write_all(
             for part in parts:
                 _sync(part)
             _publish(workshop, parts, places, before)
-    except BrokenPipeError:  # the reader of standard output has left
+    except BrokenPipeError:  # the reader of standard output has closed it
         raise
     except OSError as error:
         what = f"{kind.name[0].upper()}{kind.name[1:]}"
@@ -101,7 +103,7 @@ def atomic_write_all(
 
 
 def snapshot(path: Path) -> Snapshot:
-    """Identify a file, or a folder with all that is in it; empty where nothing is, or an empty folder."""
+    """Identify a file, or a folder with all its content; empty for a missing path or an empty folder."""
     if not os.path.lexists(path):
         return {}
     found = {"": _identity(path)}
@@ -120,9 +122,9 @@ def _identity(path: Path) -> list[int]:
 
 
 def take_name(new: Path, target: Path) -> None:
-    """Rename a file or folder to a name that is free; an empty folder gives way to a folder.
+    """Rename a file or folder to a free name; an empty folder is replaced by a folder.
 
-    A file system that can neither rename without replacing nor link is looked at just before.
+    If the file system can neither rename without replacing nor link, the name is checked just before.
 
     Raises:
         FileExistsError: The name is taken.
@@ -148,7 +150,7 @@ def take_name(new: Path, target: Path) -> None:
 
 
 def _rename(old: Path, new: Path, flag: int) -> bool:
-    """Rename by the system call that takes a flag; False where the system or the file system lacks it."""
+    """Rename with the system call that takes a flag; False if the system or the file system lacks it."""
     import ctypes
 
     library = ctypes.CDLL(None, use_errno=True)
@@ -167,7 +169,7 @@ def _rename(old: Path, new: Path, flag: int) -> bool:
 
 
 def _sync(part: Path) -> None:
-    """Make a file, or all files and names in a folder, last through a power cut."""
+    """Flush a file, or all files and names in a folder, to the disk so that they survive a power cut."""
     if not part.is_dir():
         sync_path(part)
     for folder, _, names in os.walk(part, topdown=False):
@@ -177,7 +179,7 @@ def _sync(part: Path) -> None:
 
 @contextmanager
 def _locked(workshop: Path, target: Path) -> Iterator[None]:
-    """Hold a workshop, made if it is missing, and clear it at the end; the lock dies with the process."""
+    """Lock a workshop, created if missing, and clear it at the end; the lock dies with the process."""
     missing = [folder for folder in workshop.parents if not folder.exists()]
     while True:
         with suppress(FileExistsError):
@@ -185,13 +187,13 @@ def _locked(workshop: Path, target: Path) -> Iterator[None]:
         try:
             _check_ours(workshop)
             handle = open_locked(workshop / _LOCK)
-        except FileNotFoundError:  # the holder before us has just removed it
+        except FileNotFoundError:  # the previous holder has just removed it
             continue
         except BlockingIOError as error:
             raise ConfigError(
                 f"Another command is writing here: wait until it ends, or choose another name: {target}"
             ) from error
-        # The holder before us may have removed the lock between the two calls.
+        # The previous holder may have removed the lock between the two calls.
         with suppress(FileNotFoundError):
             if os.path.samestat(os.fstat(handle), (workshop / _LOCK).stat()):
                 break
@@ -208,7 +210,7 @@ def _locked(workshop: Path, target: Path) -> Iterator[None]:
 
 
 def _check_ours(workshop: Path) -> None:
-    """Refuse a folder of the workshop's name that no command has made."""
+    """Reject a folder with the workshop's name that no command has made."""
     is_folder = stat.S_ISDIR(workshop.lstat().st_mode)
     found = {path.name for path in workshop.iterdir()} if is_folder else {""}
     lock = workshop / _LOCK
@@ -218,19 +220,19 @@ def _check_ours(workshop: Path) -> None:
 
 
 def _clear(workshop: Path) -> None:
-    """Remove a workshop, its lock last, unless the next command must undo what a journal lists."""
+    """Remove a workshop, its lock last, unless its journal lists moves that the next command must undo."""
     if (workshop / _JOURNAL).exists():
         return
     for folder in (_NEW, _OLD):
         shutil.rmtree(workshop / folder, ignore_errors=True)
-    with suppress(OSError):  # what cannot be removed stays marked
+    with suppress(OSError):  # files that cannot be removed stay marked
         if {path.name for path in workshop.iterdir()} == {_LOCK}:
             (workshop / _LOCK).unlink()
             workshop.rmdir()
 
 
 def _publish(workshop: Path, parts: Sequence[Path], places: Sequence[Path], before: Sequence[Snapshot]) -> None:
-    """Give all parts their names; ConfigError, with the parts kept, where another one has a name meanwhile."""
+    """Give all parts their names; ConfigError, with the parts kept, if another file has taken a name meanwhile."""
     try:
         if len(parts) > 1:
             _move_all(workshop, parts, places, before)
@@ -243,7 +245,7 @@ def _publish(workshop: Path, parts: Sequence[Path], places: Sequence[Path], befo
         changed = [str(place / name) for place, was in found for name in _differences(was, snapshot(place))]
         kept = [_kept(part, place) for part, place in zip(parts, places, strict=True)]
         raise ConfigError(
-            f"Something has appeared or changed while this command ran, and stays as it is ({shown(changed)}); the "
+            f"Files have appeared or changed while this command ran, and are left unchanged ({shown(changed)}); the "
             f"result is kept as {shown([str(path) for path in kept])}"
         ) from error
     for folder in {place.parent for place in places}:
@@ -251,15 +253,15 @@ def _publish(workshop: Path, parts: Sequence[Path], places: Sequence[Path], befo
 
 
 def _exchanged(part: Path, place: Path, before: Snapshot) -> bool:
-    """Let a part change places with what it replaces; False where the file system cannot.
+    """Exchange a part with the target that it replaces; False if the file system cannot.
 
     Raises:
-        FileExistsError: Something else is there than at the start; it is back in its place.
+        FileExistsError: The target has changed since the start; it is back in its place.
     """
     try:
         if not _rename(part, place, _EXCHANGE):
             return False
-    except FileNotFoundError:  # what was to be replaced is gone
+    except FileNotFoundError:  # the target to be replaced is gone
         take_name(part, place)
         return True
     if snapshot(part) != before:
@@ -269,9 +271,10 @@ def _exchanged(part: Path, place: Path, before: Snapshot) -> bool:
 
 
 def _move_all(workshop: Path, parts: Sequence[Path], places: Sequence[Path], before: Sequence[Snapshot]) -> None:
-    """Move all old targets away and then all parts into their places; undone when one of them cannot be moved."""
+    """Move all old targets away, then all parts into place; undo the moves if one fails."""
     made = {str(place): snapshot(part) for place, part in zip(places, parts, strict=True)}
-    (workshop / _JOURNAL).write_text(json.dumps(made))  # one that is cut off lists nothing: nothing was moved yet
+    # A journal cut off here lists nothing, because nothing has been moved yet.
+    (workshop / _JOURNAL).write_text(json.dumps(made))
     sync_path(workshop / _JOURNAL)
     sync_path(workshop)
     try:
@@ -287,16 +290,16 @@ def _move_all(workshop: Path, parts: Sequence[Path], places: Sequence[Path], bef
     except BaseException:
         _undo(workshop)
         raise
-    (workshop / _JOURNAL).unlink()  # from here on nothing is undone
+    (workshop / _JOURNAL).unlink()  # no undo after this point
 
 
 def _undo(workshop: Path) -> None:
-    """Bring back what a journal lists: new targets into the workshop, old ones to their places."""
+    """Undo the moves in a journal: new targets into the workshop, old ones to their places."""
     made: dict[str, Any] = json_object(workshop / _JOURNAL)
     for name, new in made.items():
         place = Path(name)
         part, old = workshop / _NEW / place.name, workshop / _OLD / place.name
-        if not os.path.lexists(part) and snapshot(place) == new:  # else somebody has changed or removed it
+        if not os.path.lexists(part) and snapshot(place) == new:  # otherwise it was changed or removed meanwhile
             place.rename(part)
         if os.path.lexists(old):
             try:

@@ -1,8 +1,8 @@
-"""Numba's compiler for the modules of kernels, without the SciPy that it would load with the first kernel.
+"""Numba's compiler for the kernel modules, without loading SciPy at the first kernel.
 
-Numba imports SciPy's linear algebra (0.1 CPU s, 16 MB) to know whether np.convolve and np.correlate may use BLAS. No
-kernel here calls them, and without it they add products up themselves. np.dot and np.linalg ask again when they are
-compiled.
+Numba imports SciPy's linear algebra (0.1 CPU s, 16 MB) to find out whether np.convolve and np.correlate may use BLAS.
+No kernel here calls them, and without BLAS they add up products themselves. np.dot and np.linalg repeat the check when
+they are compiled.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""What the user chooses: the part that decides the data (`GenerateConfig`), read from TOML and flags.
+"""The options that decide the data (`GenerateConfig`), read from TOML and flags.
 
-Two equal configs and seeds give the same episodes, whatever the machine's load, the workers or the order; how a
-run is carried out (workers, executor, output folder) is not in here.
+Equal configs and seeds give equal episodes, independent of the machine's load, the workers and their order. Options of
+execution (workers, executor, output folder) are not part of it.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class VideoConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class GenerateConfig:
-    """Everything that decides what an episode contains."""
+    """All options that decide the content of an episode."""
 
     task: str = "pick_place"
     """What the robot does: a name from `demorec list tasks`, or my_package.my_module:MyTask."""
@@ -120,9 +120,9 @@ class GenerateConfig:
 
     @property
     def modules(self) -> tuple[str, ...]:
-        """Modules outside demorec of what it names, the user's own and those of extensions.
+        """Modules outside demorec that the config names, the user's own and those of extensions.
 
-        A config that the user wrote allows them.
+        A user who writes a config thereby allows them.
         """
         from demorec.core.tables import CAMERAS, OBJECTS, ROBOTS, TASKS
 
@@ -132,16 +132,16 @@ class GenerateConfig:
         return tuple(module for module in modules_of(targets) if is_foreign(module))
 
     def check_names(self, allowed: Iterable[str]) -> None:
-        """Raise ConfigError unless all that it names may be loaded.
+        """Raise ConfigError if the config names a module that is not allowed.
 
-        A config that was read from a recording, a run, a dataset or a policy must pass this before anything is made
-        of it: `demorec.loop.prepare` imports what its plan's config names.
+        Call this on a config read from a recording, a run, a dataset or a policy before using it:
+        `demorec.loop.prepare` imports the modules that its plan's config names.
 
         Args:
             allowed: The user's own modules and packages that may be imported.
 
         Raises:
-            NotAllowedError: It names something of another module.
+            NotAllowedError: It names an object of another module.
         """
         from demorec.core.tables import CAMERAS, OBJECTS, RENDERERS, ROBOTS, TASKS
 
@@ -151,17 +151,17 @@ class GenerateConfig:
         RENDERERS.check_name(self.renderer)
         for name in self.cameras:
             if name == "none":
-                raise ConfigError(f"--cameras none stands alone, found {' '.join(self.cameras)}.")
+                raise ConfigError(f"--cameras none excludes other cameras, found {' '.join(self.cameras)}.")
             CAMERAS.check_name(name, allowed)
         for name in self.objects:
             if "/" not in name:  # a folder runs no code
                 OBJECTS.check_name(name, allowed)
 
     def validate(self) -> None:
-        """Check all values that can be judged without loading anything heavy; the config is the user's own words.
+        """Check all values that need nothing heavy to be loaded; the config must be the user's own.
 
         Raises:
-            ConfigError: The first impossible value, with what is allowed.
+            ConfigError: The first impossible value and the allowed ones.
         """
         from demorec.core.registry import check_choice
         from demorec.core.tables import camera_name
@@ -173,7 +173,7 @@ class GenerateConfig:
         check_option("physics_hz", self.physics_hz, 60, MAX_PHYSICS_HZ)
         check_option("fps", self.fps, 1, MAX_PHYSICS_HZ)
         if self.physics_hz % self.fps:
-            steps = -(-self.physics_hz // self.fps)  # a frame, rounded up
+            steps = -(-self.physics_hz // self.fps)  # steps per frame, rounded up
             other = f", or --physics-hz {steps * self.fps}" if steps * self.fps <= MAX_PHYSICS_HZ else ""
             raise OptionError(
                 "fps",
@@ -198,23 +198,23 @@ class GenerateConfig:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodePlan:
-    """One attempt at one episode: all that a worker needs, as plain data that crosses processes."""
+    """One attempt at one episode: everything a worker needs, as plain data that can cross processes."""
 
     config: GenerateConfig
     episode_index: int
     attempt: int = 0
     versions: Mapping[str, str] | None = None
-    """That the run began with; None: whatever is there now."""
+    """Versions that the run began with; None for the installed ones."""
 
 
 def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
-    """package -> version, of everything that decides the bits of an episode (numba draws, av codes the images).
+    """Return package -> version for every package that decides an episode's bits (numba draws, av encodes the images).
 
-    With a config, which is taken for the user's own words, also of the modules of the user's own that it names
+    With a config, which must be the user's own, includes the user's modules that it names
     (`demorec.core.own_versions`).
 
     Raises:
-        ConfigError: One of these cannot be found.
+        ConfigError: A module or package cannot be found.
         SceneError: The model of the user's own robot is missing.
     """
     versions = dict(_deciding_versions())
@@ -229,7 +229,7 @@ def deciding_versions(config: GenerateConfig | None = None) -> dict[str, str]:
 def _deciding_versions() -> tuple[tuple[str, str], ...]:
     try:
         bullet = version("pybullet")
-    except PackageNotFoundError:  # the fork that is installed where nothing can be compiled (docs/install.md)
+    except PackageNotFoundError:  # the fork that is installed where PyBullet cannot be compiled (docs/install.md)
         bullet = f"{version('pybullet-arm64')} (pybullet-arm64)"
     return (
         ("demorec", version("demorec")),
@@ -243,14 +243,16 @@ _X86_LEVELS = {
     "x86-64-v3": {"avx2", "bmi1", "bmi2", "f16c", "fma", "movbe"},
     "x86-64-v2": {"cx16", "popcnt", "sse4_1", "sse4_2", "ssse3"},
 }
-"""Levels of the x86-64 psABI, highest first: the flags of /proc/cpuinfo that tell one from the level below."""
+"""Levels of the x86-64 psABI, highest first, with the /proc/cpuinfo flags that distinguish each from the next lower
+level.
+"""
 
 
 @functools.cache
 def cpu_type() -> str:
     """Return the CPU's architecture and, where known, its level: "x86-64-v3", "aarch64".
 
-    The C library and NumPy choose their functions by it, which may round differently.
+    The C library and NumPy select functions by this level, and the selected functions may round differently.
     """
     machine = platform.machine() or "unknown"
     with suppress(OSError):
@@ -261,17 +263,17 @@ def cpu_type() -> str:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """The plain tables of a TOML file; ConfigError when it cannot be read."""
+    """Read the tables of a TOML file as plain data; ConfigError if it cannot be read."""
     try:
         return tomllib.loads(path.read_text())
     except OSError as error:
         raise ConfigError(f"The config file cannot be read ({error.strerror}): {path}") from error
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise ConfigError(f"The config file is no valid TOML ({error}): {path}") from error
+        raise ConfigError(f"The config file is not valid TOML ({error}): {path}") from error
 
 
 def parse_config[T](data: dict[str, Any], cls: type[T], *, source: str) -> T:
-    """Plain data to a config; ConfigError names every bad key and the nearest match of an unknown one."""
+    """Convert plain data to a config; ConfigError names every invalid key and the closest match of an unknown one."""
     try:
         return from_plain(data, cls)
     except ValueError as error:
@@ -279,7 +281,7 @@ def parse_config[T](data: dict[str, Any], cls: type[T], *, source: str) -> T:
 
 
 def _nearest_divisors(rate: int, wanted: int) -> str:
-    """In words, the divisors of a rate next to a wanted one that is none: "48 or 60" of 240 for 50."""
+    """Return the divisors of a rate closest to `wanted`, in words: "48 or 60" for 240 and 50."""
     divisors = [n for n in range(1, rate + 1) if rate % n == 0]
     below = [n for n in divisors if n < wanted][-1:]
     return " or ".join(str(n) for n in below + [n for n in divisors if n > wanted][:1])

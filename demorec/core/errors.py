@@ -1,7 +1,7 @@
-"""The errors that demorec raises on purpose: one tree, each one sentence to the user.
+"""Errors that demorec raises on purpose: one tree; each message is one sentence for the user.
 
-A dropped cube is not an error but an `Outcome`; an error means that no trustworthy result could be made.
-All arguments go to `super().__init__`, so that errors cross process borders (pickle) unchanged.
+A dropped cube is not an error but an `Outcome`; an error means that there is no trustworthy result. All arguments are
+passed to `super().__init__`, so that errors survive pickling between processes.
 """
 
 from __future__ import annotations
@@ -22,16 +22,16 @@ class DemorecError(Exception):
 
 
 class ConfigError(DemorecError):
-    """What the user asked for cannot be: an unknown name, an impossible number, an unusable folder."""
+    """Impossible request: an unknown name, an impossible number, an unusable folder."""
 
     exit_code = 2
 
 
 class OptionError(ConfigError):
-    """The value of one option is impossible. Reported with the name of the field, as Python and TOML files have it.
+    """Impossible value of one option. Reported with the field's name, as in Python and TOML files.
 
     Args:
-        option: Name of the field ("max_attempts").
+        option: Field name ("max_attempts").
         problem: The rest of the sentence ("is 0, allowed are 1 to 100.").
     """
 
@@ -42,55 +42,55 @@ class OptionError(ConfigError):
         return " ".join(self.args)
 
     def of_flag(self) -> str:
-        """The sentence with the name of the flag, for the command line ("--max-attempts is 0, ...")."""
+        """The sentence with the flag's name, for the command line ("--max-attempts is 0, ...")."""
         option, problem = self.args
         return f"--{option.replace('_', '-')} {problem}"
 
 
 def check_option(option: str, value: float | None, low: float, high: float, unit: str = "") -> None:
-    """Raise OptionError unless low <= value <= high; None, which leaves the choice to demorec, is always allowed."""
+    """Raise OptionError unless low <= value <= high; None is always allowed and leaves the choice to demorec."""
     if value is not None and not low <= value <= high:
         least, most = (f"{limit:,}" if isinstance(limit, int) else f"{limit:g}" for limit in (low, high))
         raise OptionError(option, f"is {value}, allowed are {least} to {most}{unit and ' '}{unit}.")
 
 
 def check_seed(option: str, value: int | None) -> None:
-    """Raise OptionError unless a seed fits in 63 bits; None, which leaves the choice to demorec, is always allowed."""
+    """Raise OptionError unless a seed fits in 63 bits; None is always allowed and leaves the choice to demorec."""
     check_option(option, value, 0, 2**63 - 1)
 
 
 class NotAllowedError(ConfigError):
-    """A file names a module from outside of demorec, and the user has not said that it may be run."""
+    """A file names a third-party module that the user has not allowed to run."""
 
 
 class SceneError(DemorecError):
-    """No scene could be laid out or simulated within the given ranges; tried again a bounded number of times."""
+    """No scene could be laid out or simulated within the given ranges, after a limited number of attempts."""
 
 
 class RenderError(DemorecError):
-    """An image cannot be drawn: a shape that no renderer knows, a broken mesh, a missing OpenGL library."""
+    """An image cannot be rendered: an unsupported shape, a broken mesh, a missing OpenGL library."""
 
 
 class RecordingError(DemorecError):
-    """A recording cannot be written or read: no MCAP, cut off, damaged, of an unknown format version."""
+    """A recording cannot be written or read: not an MCAP file, truncated, damaged, of an unknown format version."""
 
 
 class NotGeneratedError(RecordingError):
-    """A recording was rendered or replayed from another one, or a policy made it."""
+    """A recording is a render, a replay or a policy rollout."""
 
 
 class ExportError(DemorecError):
-    """A dataset cannot be written: recordings that differ, a target in the way, a failed verification."""
+    """A dataset cannot be written: recordings that differ, an existing target, a failed verification."""
 
 
 class GenerationError(DemorecError):
-    """A run cannot go on: a full disk, a vanished folder, workers that die; what is finished stays."""
+    """A run cannot continue: a full disk, a vanished folder, dying workers; finished episodes stay."""
 
 
 class ResourceError(DemorecError):
-    """The machine lacks memory or open files, or cannot read its disk: says nothing about the data that it was to read.
+    """The machine lacks memory or file descriptors, or cannot read its disk; this implies nothing about the data.
 
-    Never a reason to call a file damaged, to set it aside or to make it again.
+    Never a reason to call a file damaged, to set it aside or to record it again.
     """
 
 
@@ -106,11 +106,11 @@ _LINKER_WORDS |= {os.strerror(number): number for number in (errno.ENOMEM, errno
 
 
 def resource_error(error: BaseException, path: Path | None = None) -> ResourceError | None:
-    """What `error`, or one that it was raised from, says about the machine; None when it is about something else.
+    """Return the machine's failure behind `error` or one of its causes; None if the machine is not the cause.
 
     Args:
-        error: Caught while something was read or written.
-        path: Of that, if it is known.
+        error: Exception caught while reading or writing.
+        path: The file read or written, if known.
     """
     for cause in error_chain(error):
         if isinstance(cause, ResourceError):
@@ -120,7 +120,8 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
                 "A process of this command was killed, perhaps for lack of memory: try again with fewer --workers."
             )
         number = errno.ENOMEM if isinstance(cause, MemoryError) else getattr(cause, "errno", None)
-        if isinstance(cause, ImportError | OSError) and number is None:  # the dynamic linker says why in words alone
+        # the dynamic linker gives the reason only as text
+        if isinstance(cause, ImportError | OSError) and number is None:
             number = next((number for words, number in _LINKER_WORDS.items() if words in str(cause)), None)
         if number in _LACKS:
             unknown = "." if path is None else f"; whether the file is sound is not known: {path}"
@@ -141,29 +142,29 @@ _UNUSABLE = frozenset(
         errno.EROFS,
     }
 )
-"""Errors of a target that the user has to choose again; others are about the machine, such as a full disk."""
+"""Errors that another target fixes; others concern the machine, such as a full disk."""
 
 
 def write_error(
     what: str, error: OSError, target: Path, otherwise: type[DemorecError], *, reason: str = ""
 ) -> DemorecError:
-    """Return the error to be raised for a target that cannot be written: ConfigError where another one must be chosen.
+    """Return the error to raise for a target that cannot be written: ConfigError if the user must choose another.
 
     Args:
         what: Subject of the sentence ("The dataset").
-        error: Raised while the target was written.
+        error: Exception raised while writing the target.
         target: The path that the user named.
-        otherwise: Type for all other reasons.
-        reason: Why, in words; "" for those of the operating system.
+        otherwise: Error type for all other reasons.
+        reason: Reason in words; "" for the operating system's.
     """
     kind = ConfigError if error.errno in _UNUSABLE else otherwise
     return kind(f"{what} cannot be written ({reason or error.strerror or error}): {target}")
 
 
 _MAX_WORDS = 300
-"""Characters: an error may quote what a file holds."""
+"""Maximum length in characters: an error may quote a file's content."""
 _PLAIN_WORDS: tuple[tuple[type[BaseException], str], ...] = (
-    (UnicodeDecodeError, "it is no UTF-8 text"),
+    (UnicodeDecodeError, "it is not UTF-8 text"),
     (RecursionError, "its values are nested too deeply"),
     (struct.error, "it ends within a value"),
     (EOFError, "it ends too early"),
@@ -172,21 +173,21 @@ _PLAIN_WORDS: tuple[tuple[type[BaseException], str], ...] = (
     (AttributeError, "a value is of another kind than expected"),
     (ArithmeticError, "a number is out of range"),
 )
-"""What errors of Python mean about a file that is read; their own words are about the program that reads it."""
+"""Meaning of Python's errors for a file being read; their own messages describe the code that reads it."""
 
 
 def describe_error(error: BaseException) -> str:
-    """What an error of Python or of a library says about what was read, for the inside of a sentence.
+    """Describe an error of Python or a library in terms of the data, for use inside a sentence.
 
-    Neither class names nor error numbers, and no path: the sentence around it has that.
+    Contains no class name, error number or path: the enclosing sentence has the path.
     """
     if isinstance(error, DemorecError):
         return str(error)
-    reason = getattr(error, "strerror", None)  # of the system's errors and of FFmpeg's
+    reason = getattr(error, "strerror", None)  # set by system errors and FFmpeg's
     if isinstance(reason, str) and reason:
         return reason
     if isinstance(error, json.JSONDecodeError):
-        return f"it is no JSON, line {error.lineno}"
+        return f"it is not valid JSON, line {error.lineno}"
     if isinstance(error, KeyError) and error.args:
         return f"it has no {error.args[0]!r}"[:_MAX_WORDS]
     for kind, words in _PLAIN_WORDS:
@@ -199,18 +200,18 @@ def describe_error(error: BaseException) -> str:
 
 
 def without_path(error: BaseException, path: Path) -> str:
-    """What an error of ours says, without the path at its end, for a sentence that names the path already."""
+    """Message of a demorec error without the path at its end, for a sentence that already names the path."""
     return str(error).removesuffix(f": {path}")
 
 
 def as_reason(error: BaseException) -> str:
-    """The message of an error as the rest of a sentence, behind "since"."""
+    """Message of an error as the rest of a sentence, after "since"."""
     text = describe_error(error)
     return text[:1].lower() + text[1:].rstrip(".")
 
 
 def error_chain(error: BaseException) -> Iterator[BaseException]:
-    """An error, what it was raised from, and so on."""
+    """Iterate over an error, its cause, that one's cause, and so on."""
     cause: BaseException | None = error
     seen: list[BaseException] = []
     while cause is not None and cause not in seen:
@@ -223,9 +224,9 @@ class MissingDependencyError(DemorecError):
     """An optional package is not installed.
 
     Args:
-        feature: What the user asked for, as the start of a sentence ("The Ray executor").
+        feature: The requested feature, as the start of a sentence ("The Ray executor").
         package: The package that is missing.
-        remedy: What to type to mend it.
+        remedy: Command that installs it.
     """
 
     def __init__(self, feature: str, package: str, remedy: str) -> None:

@@ -1,7 +1,7 @@
-"""Files of unknown origin, opened without waiting and read within bounds; locks; files written in one step; the cache.
+"""Files of unknown origin, opened without blocking and read within limits; locks; atomic writes; the cache.
 
-A folder may hold anything under the name that is looked for: opening a FIFO waits for its other end for ever, reading
-a device never ends, and a file of some gigabytes fills the memory before anybody has looked at its first byte.
+A folder may hold anything under an expected name: opening a FIFO blocks forever, reading a device never ends, and a
+file of several gigabytes fills the memory before its first byte is checked.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from demorec.core.plain import parse_json
 MCAP_MAGIC = b"\x89MCAP0\r\n"
 RERUN_MAGICS = (b"RRF", b"RRIO")
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-"""First bytes by which files are known."""
+"""Magic bytes of file formats."""
 
 _KINDS = {
     stat.S_IFIFO: "a FIFO",
@@ -39,22 +39,22 @@ _KINDS = {
 
 
 _LFS_POINTER = b"version https://git-lfs.github.com/spec/v1"
-"""Beginning of the text that Git LFS leaves in place of a file that was not fetched."""
+"""First line of the text file that Git LFS leaves in place of a file that was not fetched."""
 
 
 def open_regular(path: Path) -> BufferedReader:
-    """Open a regular file (or a link to one) for reading, without ever waiting.
+    """Open a regular file (or a link to one) for reading without blocking.
 
     Raises:
-        OSError: There is none, it cannot be opened, it is a folder, FIFO, socket or device, or Git LFS has left a
-            pointer in its place; `strerror` says which.
+        OSError: It is missing, cannot be opened, is a folder, FIFO, socket or device, or is a Git LFS pointer;
+        `strerror` says which.
     """
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "its name holds a zero byte", str(path))
     _refuse_irregular(path, path.stat().st_mode)
     descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     try:
-        _refuse_irregular(path, os.fstat(descriptor).st_mode)  # it may have been exchanged in between
+        _refuse_irregular(path, os.fstat(descriptor).st_mode)  # it may have been replaced in between
         if os.pread(descriptor, len(_LFS_POINTER), 0) == _LFS_POINTER:
             raise OSError(errno.ENODATA, "it is a pointer of Git LFS: fetch the file itself by git lfs pull", str(path))
         return os.fdopen(descriptor, "rb")
@@ -64,11 +64,11 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 def read_text_limited(path: Path, limit: int) -> str:
-    """The text of a regular UTF-8 file of at most `limit` bytes.
+    """Read a regular UTF-8 file of at most `limit` bytes.
 
     Raises:
-        OSError: As `open_regular`, or the file is larger.
-        UnicodeDecodeError: It is no UTF-8.
+        OSError: As in `open_regular`, or the file is larger.
+        UnicodeDecodeError: It is not UTF-8.
     """
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
@@ -79,15 +79,15 @@ def read_text_limited(path: Path, limit: int) -> str:
 
 
 MAX_JSON_BYTES = 2 << 30
-"""Above this no JSON file is read: of a run.json some million episodes, which take ten times as much memory."""
+"""Maximum size of a JSON file: a run.json of about a million episodes, which takes ten times as much memory."""
 
 
 def read_json_limited(path: Path, limit: int) -> Any:
-    """The content of a regular JSON file of at most `limit` bytes.
+    """Read a regular JSON file of at most `limit` bytes.
 
     Raises:
-        OSError: As `read_text_limited`.
-        ValueError: It is no UTF-8, no JSON, or nested too deeply to be read.
+        OSError: As in `read_text_limited`.
+        ValueError: It is not UTF-8, not JSON, or nested too deeply.
     """
     try:
         return json.loads(read_text_limited(path, limit))
@@ -96,27 +96,27 @@ def read_json_limited(path: Path, limit: int) -> Any:
 
 
 MAX_SETTINGS_BYTES = 16 << 20
-"""Of a JSON file of settings or results; ours, and LeRobot's, have some kilobytes."""
+"""Maximum size of a JSON file of settings or results; demorec's and LeRobot's have a few kilobytes."""
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a regular file of settings or results, nested no deeper than code can walk.
+    """Read the JSON object in a regular file of settings or results, with limited nesting.
 
     Raises:
-        OSError: As `read_text_limited`.
-        ValueError: It is no UTF-8, no JSON, no object, or nested too deeply.
+        OSError: As in `read_text_limited`.
+        ValueError: It is not UTF-8, not JSON, not an object, or nested too deeply.
     """
     found = parse_json(read_text_limited(path, MAX_SETTINGS_BYTES), allow_nan=True)
     if not isinstance(found, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     return found
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder for results, and those above it; one that is there is fine.
+    """Create a folder for results and its parents; an existing folder is fine.
 
     Raises:
-        DemorecError: It cannot be made.
+        DemorecError: It cannot be created.
     """
     try:
         path.mkdir(parents=True, exist_ok=True)
@@ -125,9 +125,9 @@ def make_folder(path: Path) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a file anew, in one step: what is there stays until all of the text is on the disk.
+    """Write a file atomically: the existing file stays until all of the text is on the disk.
 
-    It is written beside its place first, to a new file: what else has that name is never written through.
+    The text is first written to a new file next to it, so an existing link or device is never written through.
 
     Raises:
         OSError: It cannot be written.
@@ -142,7 +142,7 @@ def replace_text(path: Path, text: str) -> None:
 
 
 def irregular_kind(mode: int) -> str:
-    """What something that is no regular file is, by its `st_mode`: "a FIFO"."""
+    """Describe the kind of an irregular file by its `st_mode`: "a FIFO"."""
     return _KINDS.get(stat.S_IFMT(mode), "something else")
 
 
@@ -152,7 +152,7 @@ def _refuse_irregular(path: Path, mode: int) -> None:
 
 
 class Closing(ABC):
-    """A context manager that is closed when its block ends, however that ends."""
+    """A context manager whose `close` runs when its block ends, with or without an error."""
 
     def __enter__(self) -> Self:
         return self
@@ -162,16 +162,16 @@ class Closing(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Free what is held."""
+        """Free all resources."""
 
 
 LOCK_NAME = ".lock"
 
 
 def open_locked(path: Path, *, waits: bool = False) -> int:
-    """Open a file for writing, made if it is not there, locked until the descriptor is closed or the process dies.
+    """Open a file for writing, created if missing, locked until the descriptor is closed or the process dies.
 
-    Neither a FIFO is waited for nor a link followed, since what is opened is written to.
+    Does not block on a FIFO or follow a link, because the file is written to.
 
     Args:
         path: The file.
@@ -179,7 +179,7 @@ def open_locked(path: Path, *, waits: bool = False) -> int:
 
     Raises:
         BlockingIOError: Another process holds the lock.
-        OSError: It is no regular file, or cannot be opened.
+        OSError: It is not a regular file, or cannot be opened.
     """
     if os.path.lexists(path):
         _refuse_irregular(path, path.lstat().st_mode)
@@ -195,13 +195,13 @@ def open_locked(path: Path, *, waits: bool = False) -> int:
 
 @contextmanager
 def run_lock(folder: Path) -> Iterator[None]:
-    """Hold `folder` for this process until the context ends or the process dies, however it dies.
+    """Lock `folder` for this process until the context ends or the process dies.
 
     The file stays: removing it would let two runs lock two different files of the same name. Child processes do
     not inherit the lock (the descriptor is closed on exec).
 
     Raises:
-        ConfigError: Another process holds it (which one is said), or the folder cannot be written to.
+        ConfigError: Another process holds it (the error names that process), or the folder cannot be written to.
     """
     path = folder / LOCK_NAME
     try:
@@ -214,11 +214,11 @@ def run_lock(folder: Path) -> Iterator[None]:
     except OSError as error:
         if os.path.lexists(path) and not stat.S_ISREG(path.lstat().st_mode):
             raise ConfigError(
-                f"The lock of the output folder is no file: remove it, or choose another --out: {path}"
+                f"The lock of the output folder is not a file: remove it, or choose another --out: {path}"
             ) from error
         raise resource_error(error) or write_error("The output folder", error, folder, DemorecError) from error
     try:
-        with suppress(OSError):  # on a full disk, whose it is cannot be said
+        with suppress(OSError):  # on a full disk the owner cannot be recorded
             os.ftruncate(descriptor, 0)
             os.pwrite(descriptor, f"process {os.getpid()} on {platform.node()}\n".encode(), 0)
         yield
@@ -227,7 +227,7 @@ def run_lock(folder: Path) -> Iterator[None]:
 
 
 def free_name(path: Path) -> Path:
-    """The path itself, or with the first number behind it that nothing is called."""
+    """Return the path itself, or the path with the first free number appended."""
     free, number = path, 0
     while os.path.lexists(free):
         number += 1
@@ -242,7 +242,7 @@ def sha256_of(path: Path) -> str:
 
 
 def sync_path(path: Path) -> None:
-    """Make a file, or the names in a folder, last through a power cut."""
+    """Flush a file, or a folder's entries, to the disk so that they survive a power cut."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -251,7 +251,7 @@ def sync_path(path: Path) -> None:
 
 
 def cache_folder(*parts: str) -> Path:
-    """A folder below the user's cache folder, created when missing; `DEMOREC_CACHE` moves it elsewhere."""
+    """A folder in the user's cache folder, created if missing; `DEMOREC_CACHE` moves it."""
     import platformdirs
 
     root = os.environ.get("DEMOREC_CACHE") or platformdirs.user_cache_dir("demorec", appauthor=False)
@@ -259,14 +259,14 @@ def cache_folder(*parts: str) -> Path:
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:
-        # A home that cannot be written to (containers): work goes on, and is lost with the temporary folder.
+        # The home folder may be read-only (containers): the cache is then lost with the temporary folder.
         folder = Path(tempfile.gettempdir()).joinpath(f"demorec-{os.getuid()}", *parts)
         folder.mkdir(parents=True, exist_ok=True)
     return folder
 
 
 def write_whole(path: Path, write: Callable[[Path], object]) -> None:
-    """Let `write` fill a temporary file beside `path`, then move it there: readers see all of it or nothing."""
+    """Let `write` fill a temporary file next to `path`, then move it there: readers see all of it or nothing."""
     handle, name = tempfile.mkstemp(dir=path.parent, prefix=path.stem, suffix=path.suffix)
     os.close(handle)
     temporary = Path(name)
@@ -279,9 +279,9 @@ def write_whole(path: Path, write: Callable[[Path], object]) -> None:
 
 @contextmanager
 def folder_lock(folder: Path) -> Iterator[None]:
-    """Hold a lock between processes for as long as the context lasts; the system frees it if the process dies.
+    """Hold a lock between processes while the context lasts; the system frees it if the process dies.
 
-    A folder that cannot be written to is not locked: nothing will be kept in it.
+    A read-only folder is not locked: nothing can be stored in it.
     """
     try:
         descriptor = open_locked(folder / "lock", waits=True)

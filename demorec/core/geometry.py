@@ -1,8 +1,8 @@
 """Poses, camera intrinsics and axis conventions, in NumPy alone.
 
-Names cancel: `world_from_tcp = world_from_base @ base_from_tcp`. Quaternions are (x, y, z, w) of unit length.
-Camera axes are OpenCV's (x right, y down, z forward) everywhere; OpenGL's (y up, z backward) exist only inside
-the renderers. Sums are written out, since a BLAS call may round differently on another CPU.
+Frame names cancel: `world_from_tcp = world_from_base @ base_from_tcp`. Quaternions are unit (x, y, z, w). Camera axes
+are OpenCV's (x right, y down, z forward) everywhere; OpenGL's (y up, z backward) exist only inside the renderers. Sums
+are written out because BLAS may round differently on another CPU.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ def _vector(value: ArrayLike, length: int, name: str) -> Array:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Pose:
-    """A rigid transform `a_from_b`: maps points given in frame b to frame a.
+    """A rigid transform `a_from_b`: maps points from frame b to frame a.
 
     Attributes:
         position: (3,) origin of b in a, metres.
-        quat_xyzw: (4,) rotation, unit quaternion with the scalar last. Kept exactly as given (recordings compare bits).
+        quat_xyzw: (4,) rotation, unit quaternion with the scalar last. Kept exactly as given, because recordings are
+        compared bit by bit.
     """
 
     position: Array = field(default_factory=lambda: np.zeros(3))
@@ -55,7 +56,7 @@ class Pose:
 
     @classmethod
     def from_yaw(cls, position: ArrayLike, yaw: float = 0.0) -> Pose:
-        """At `position`, turned by `yaw` (rad) about z."""
+        """Pose at `position`, rotated by `yaw` (rad) about z."""
         return cls(
             position=np.asarray(position, dtype=np.float64),
             quat_xyzw=np.array([0.0, 0.0, math.sin(yaw / 2), math.cos(yaw / 2)]),
@@ -108,7 +109,7 @@ def rotation_from_quat(quat_xyzw: ArrayLike) -> Array:
 
 
 def rotation_rows(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
-    """The rows of the rotation matrix of a unit quaternion, or of many whose parts are arrays."""
+    """Rows of the rotation matrix of a unit quaternion; components may be arrays."""
     return [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
@@ -143,7 +144,7 @@ def quat_multiply(a_xyzw: ArrayLike, b_xyzw: ArrayLike) -> Array:
 
 
 def quat_product(a: Iterable[Any], b: Iterable[Any]) -> list[Any]:
-    """x, y, z, w of the Hamilton product of two quaternions, or of many whose parts are arrays."""
+    """(x, y, z, w) of the Hamilton product of two quaternions; components may be arrays."""
     ax, ay, az, aw = a
     bx, by, bz, bw = b
     return [
@@ -155,7 +156,7 @@ def quat_product(a: Iterable[Any], b: Iterable[Any]) -> list[Any]:
 
 
 def signs_of_course(quaternions: Array) -> Array:
-    """(T,) by which each of (T, 4) is nearest to the one before: both signs mean the same rotation."""
+    """(T,) signs that bring each of (T, 4) closest to its predecessor; q and -q are the same rotation."""
     flips = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     return np.concatenate(([1.0], np.cumprod(flips)))
 
@@ -188,7 +189,9 @@ def intrinsic_matrix(*, width: int, height: int, fov_y: float) -> Array:
 
 
 def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) -> Pose:
-    """`world_from_camera` of a camera at `eye` that looks at `target`, in OpenCV axes (x right, y down, z forward)."""
+    """Return `world_from_camera` for a camera at `eye` looking at `target`, in OpenCV axes (x right, y down, z
+    forward).
+    """
     eye_, target_, up_ = (np.asarray(v, dtype=np.float64) for v in (eye, target, up))
     forward = target_ - eye_
     forward = forward / math.sqrt(float((forward * forward).sum()))

@@ -1,12 +1,13 @@
 """Limits on memory and CPU time for commands that read files of unknown origin.
 
-Such a command runs in a child process, forked before any library is loaded. The parent waits for it, kills it above
-its limits, and turns its death into one sentence. Limits grow with the size of the files that the command line names.
+Such a command runs in a child process, forked before any library is loaded. The parent waits for it, kills it if it
+exceeds its limits, and reports its death in one sentence. Limits grow with the size of the files that the command line
+names.
 
-Memory is what the child has filled (resident and private), which the parent looks at 20 to 100 times a second.
-RLIMIT_DATA counts what is merely reserved, too: 1 GB each by PyArrow and Rerun, and the stacks of threads. So it is set
-higher, as a bound that holds even where the parent is not scheduled in time.
-Linux alone reports all of this; elsewhere commands run without limits.
+Memory means pages that the child has filled (resident and private), which the parent checks 20 to 100 times a second.
+RLIMIT_DATA also counts memory that is only reserved: 1 GB each by PyArrow and Rerun, and thread stacks. It is therefore
+set higher, as a limit that holds even when the parent is not scheduled in time. Only Linux reports all of this;
+elsewhere commands run without limits.
 """
 
 from __future__ import annotations
@@ -25,31 +26,32 @@ from typing import NamedTuple, NoReturn
 from demorec.core.extensions import command_rows
 
 VARIABLE = "DEMOREC_LIMITS"
-"""Environment variable; "off" removes the limits, for files that the user trusts."""
+"""Environment variable; "off" removes the limits, for trusted files."""
 READING_MEMORY_BYTES = 500_000_000
 DRAWING_MEMORY_BYTES = 4_000_000_000
-"""For commands that simulate or draw: their time and memory depend on frames and pixels, not on bytes. Rendering two
+"""For commands that simulate or render: their time and memory depend on frames and pixels, not on bytes. Rendering two
 cameras at 1920x1080 to AV1 with depth takes 0.8 GB."""
 MEMORY_RATIO = 20
-"""Bytes of memory for each byte of input."""
+"""Bytes of memory per byte of input."""
 READING_CPU_S = 20
-"""10 s to read, and 10 s to load libraries and to compile kernels on first use (LeRobot takes 5 s, kernels 4 s)."""
+"""10 s for reading, and 10 s for loading libraries and compiling kernels on first use (LeRobot takes 5 s, kernels 4 s).
+"""
 CPU_S_PER_MB = 10
-"""`check` takes 2 s for each MB of a recording."""
+"""`check` takes 2 s per MB of a recording."""
 
 RESERVED_BYTES = 6_000_000_000
-"""Data that libraries and their threads may reserve without filling it."""
+"""Memory that libraries and their threads may reserve without filling it."""
 RESERVED_BYTES_PER_CORE = 200_000_000
-"""A thread has a stack of 8 MB and an arena of 64 MB; several libraries start one for each core."""
+"""A thread has an 8 MB stack and a 64 MB arena; several libraries start one thread per core."""
 
 _TICK_S = 0.05
-"""Time between two looks at a child's memory."""
+"""Interval between two checks of the child's memory."""
 _LARGE_TICK_S = 0.01
-"""The same above half of the limit."""
+"""Interval above half of the limit."""
 _MAX_FILES = 20_000
-"""Files whose sizes are added up; the rest of a larger folder does not raise its limits."""
+"""Maximum number of files whose sizes are summed; further files of a large folder do not raise the limits."""
 _MAX_NAMES = 3
-"""Paths in a sentence."""
+"""Maximum number of paths in a sentence."""
 _FORWARDED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _CRASHES = (signal.SIGSEGV, signal.SIGBUS, signal.SIGABRT, signal.SIGFPE, signal.SIGILL)
 _SET_PDEATHSIG = 1
@@ -57,13 +59,13 @@ _SET_PDEATHSIG = 1
 
 
 class Limits(NamedTuple):
-    """Limits of one process.
+    """Limits of one child process.
 
     Attributes:
-        paths: Existing files and folders that the command line names.
-        input_bytes: Their size.
+        paths: Existing files and folders on the command line.
+        input_bytes: Their total size.
         memory_bytes: Private memory.
-        cpu_s: CPU time; None for no limit.
+        cpu_s: CPU time; None means unlimited.
     """
 
     paths: tuple[str, ...]
@@ -73,7 +75,7 @@ class Limits(NamedTuple):
 
     @classmethod
     def of(cls, words: Sequence[str]) -> Limits | None:
-        """Limits of a command line without the program's name; None for a command that has none."""
+        """Limits for a command line without the program's name; None for a command without limits."""
         command = words[0] if words else ""
         row = command_rows().get(command)
         if row is None or row.limits == "none":
@@ -87,9 +89,10 @@ class Limits(NamedTuple):
 
 
 def continue_in_child(words: Sequence[str]) -> None:
-    """Go on in a limited child process; the parent exits as the child does.
+    """Continue in a limited child process; the parent exits with the child's exit status.
 
-    Signals that reach the parent alone are passed on, and the child dies with it. Without limits nothing is forked.
+    Signals sent to the parent alone are forwarded, and the child dies with the parent. Does not fork if there are no
+    limits.
 
     Args:
         words: The command line without the program's name.
@@ -116,7 +119,7 @@ def continue_in_child(words: Sequence[str]) -> None:
 
 
 def remove_limits() -> None:
-    """Lift the limits on CPU time and reserved memory, for a program that the user works with (a viewer)."""
+    """Lift the limits on CPU time and reserved memory for an interactive program (a viewer)."""
     for kind in (resource.RLIMIT_CPU, resource.RLIMIT_DATA):
         hard = resource.getrlimit(kind)[1]
         resource.setrlimit(kind, (hard, hard))
@@ -126,7 +129,7 @@ def _limit_this_process(parent: int, limits: Limits) -> None:
     import ctypes
 
     ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # it was killed before
+    if os.getppid() != parent:  # the parent was killed before this call
         os._exit(1)
     reserved = RESERVED_BYTES + RESERVED_BYTES_PER_CORE * (os.cpu_count() or 1)
     _lower(resource.RLIMIT_DATA, limits.memory_bytes + reserved)
@@ -135,18 +138,18 @@ def _limit_this_process(parent: int, limits: Limits) -> None:
 
 
 def _lower(kind: int, value: int) -> None:
-    """Lower the soft limit of a resource unless it is lower already."""
+    """Lower the soft limit of a resource unless it is already lower."""
     soft, hard = resource.getrlimit(kind)
     resource.setrlimit(kind, (value if soft == resource.RLIM_INFINITY else min(soft, value), hard))
 
 
 def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
-    """Wait for the child; its exit code, -N after signal N, and whether it was killed for its memory."""
+    """Wait for the child; return its exit code (-N after signal N) and whether it was killed for its memory."""
     tick_s = _TICK_S
     while True:
         told = signal.sigtimedwait((*_FORWARDED, signal.SIGCHLD), tick_s)
         if told is None:
-            started = _words_of(f"/proc/{child}/task/{child}/children")  # by its main thread, such as its workers
+            started = _words_of(f"/proc/{child}/task/{child}/children")  # started by its main thread, such as workers
             family = [child, *map(int, started)]
             filled = max(map(_private_bytes, family))
             tick_s = _LARGE_TICK_S if filled > memory_bytes // 2 else _TICK_S
@@ -164,7 +167,7 @@ def _watch(child: int, heard: int, memory_bytes: int) -> tuple[int, bool]:
 
 
 def _pass_on(number: int, child: int, heard: int) -> None:
-    """Send a signal to the child unless it was sent to the whole group: a second one would interrupt its clean-up."""
+    """Forward a signal to the child unless the whole group received it: a second one would interrupt its clean-up."""
     time.sleep(_LARGE_TICK_S)
     try:
         numbers = os.read(heard, 4096)  # written by Python's own handler (signal.set_wakeup_fd)
@@ -175,13 +178,13 @@ def _pass_on(number: int, child: int, heard: int) -> None:
 
 
 def _private_bytes(pid: int) -> int:
-    """Memory that a process has filled; 0 when it has ended."""
+    """Memory that a process has filled; 0 if it has ended."""
     _, resident, shared, *_ = _words_of(f"/proc/{pid}/statm") or (b"0", b"0", b"0")
     return (int(resident) - int(shared)) * resource.getpagesize()
 
 
 def _words_of(path: str) -> list[bytes]:
-    """Words of a file below /proc; none when the process has ended. Path.read_text would take five times as long."""
+    """Read the words of a file in /proc; empty if the process has ended (five times faster than Path.read_text)."""
     try:
         descriptor = os.open(path, os.O_RDONLY)
     except OSError:
@@ -195,11 +198,11 @@ def _words_of(path: str) -> list[bytes]:
 
 
 def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_large: bool) -> NoReturn:
-    """Say in one sentence why the child died, or die of the same signal where a person or program has sent it."""
+    """Print why the child died, in one sentence, or die of the same signal if a person or program sent it."""
     from demorec.core.text import printable
 
     beyond = f"far more than its {limits.input_bytes / 1e6:,.1f} MB justify"
-    remedy = f"It is damaged or made to exhaust this machine; {VARIABLE}=off reads it nevertheless"
+    remedy = f"It is damaged or made to exhaust this machine; {VARIABLE}=off reads it anyway"
     if is_too_large:
         reason = f"Reading this takes more than {limits.memory_bytes / 1e6:,.0f} MB of memory, {beyond}. {remedy}"
     elif number == signal.SIGXCPU:
@@ -215,13 +218,13 @@ def _tell_death(command: str, limits: Limits, number: signal.Signals, is_too_lar
         os._exit(128 + number)
     names = ", ".join(limits.paths[:_MAX_NAMES]) + ", ..." * (len(limits.paths) > _MAX_NAMES)
     begin = "\n" if os.isatty(2) else ""  # a progress bar may have left its line open
-    with suppress(OSError):  # when nobody is left to be told
+    with suppress(OSError):  # the terminal may be gone
         os.write(2, f"{begin}demorec {command}: {printable(f'{reason}: {names}')}\n".encode(errors="backslashreplace"))
     os._exit(1)
 
 
 def _paths_in(words: Sequence[str]) -> Iterator[str]:
-    """Existing files and folders among the words of a command line, also as --flag=PATH, once each."""
+    """Existing files and folders among the words of a command line, also as --flag=PATH, each once."""
     for word in dict.fromkeys(words):
         path = word.partition("=")[2] if word.startswith("-") else word
         if path and "\0" not in path and os.path.lexists(Path(path).expanduser()):
@@ -229,10 +232,10 @@ def _paths_in(words: Sequence[str]) -> Iterator[str]:
 
 
 def _sizes_below(paths: Sequence[str]) -> Iterator[int]:
-    """Bytes of files, and of those in folders; links to folders are not followed."""
+    """Sizes in bytes of files, including those in folders; links to folders are not followed."""
     places = (Path(path).expanduser() for path in paths)
     for file in islice((file for place in places for file in _files_below(place)), _MAX_FILES):
-        with suppress(OSError):  # reported where it is read
+        with suppress(OSError):  # reported when the file is read
             yield file.stat().st_size
 
 

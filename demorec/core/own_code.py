@@ -1,4 +1,4 @@
-"""The line of the user's own code at which an error came up."""
+"""The line of the user's own code that raised an error."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pathlib import Path
 from demorec.core.errors import error_chain
 
 _FRAME = re.compile(r'^  File "([^"]+)", line (\d+), in ', re.MULTILINE)
-"""A frame in the text of a traceback, which is what another process leaves of it."""
+"""Frame in the text of a traceback, which is all that another process passes on."""
 _REMOTE = ("_RemoteTraceback", "RemoteTraceback")
-"""Errors of concurrent.futures and multiprocessing that hold such a text."""
+"""Errors of concurrent.futures and multiprocessing that hold such text."""
 _MAX_CODE = 120
-"""Characters of the line that are shown."""
+"""Maximum characters of the line that are shown."""
 
 
 def own_line(error: BaseException) -> str:
     """Find the last line of the user's own files in the traceback of an error: "my_tasks.py:31: goal = goals[3]".
 
-    A file is the user's own unless it belongs to demorec, to Python or to an installed package. The error that was
-    raised first counts. Returns "" if no line is.
+    A file is the user's own unless it belongs to demorec, to Python or to an installed package. The first error in the
+    chain counts. Returns "" if there is no such line.
     """
     for cause in reversed(list(error_chain(error))):
         if isinstance(cause, SyntaxError) and cause.filename and _is_own(cause.filename):

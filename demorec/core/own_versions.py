@@ -1,7 +1,7 @@
-"""The versions that decide an episode, and how two runs differ; digests of the user's own modules and models.
+"""Versions that decide an episode, differences between two runs, and digests of the user's modules and models.
 
-A module in a package counts with all files below its outermost package, any other module with its own file. A robot
-counts with its URDF and the meshes that the URDF names. A module of an installed distribution also has its version.
+A module in a package counts with all files of its outermost package, any other module with its own file. A robot counts
+with its URDF and the URDF's meshes. A module of an installed distribution also counts with its version.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ SOURCE = "source of "
 
 
 def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
-    """Name -> version, or digest (16 hex digits) of the source, of the user's own modules.
+    """Return name -> version, or source digest (16 hex digits), for the user's own modules.
 
     Args:
-        modules: That may be imported; none gives nothing.
-        robot: Name of the robot; one of the user's own counts with its model, too.
+        modules: Modules that may be imported; if empty, the result is empty.
+        robot: Name of the robot; a user's own robot also counts with its model.
 
     Raises:
         ConfigError: A module or the robot cannot be found or loaded, or its model is not a URDF.
@@ -49,7 +49,7 @@ def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
 
 
 def version_differences(there: Mapping[str, str], here: Mapping[str, str]) -> tuple[str, ...]:
-    """One line for each version in which two differ."""
+    """One line per version that differs."""
     lines = []
     for name in dict.fromkeys((*there, *here)):
         old, new = there.get(name, "nothing"), here.get(name, "nothing")
@@ -68,12 +68,12 @@ def differences(
     here: Mapping[str, Any],
     here_versions: Mapping[str, str],
 ) -> tuple[str, ...]:
-    """One line for each value in which two configs, as plain data, and their versions differ."""
+    """One line per difference between two configs, as plain data, and their versions."""
     return (*plain_differences(there, here), *version_differences(there_versions, here_versions))
 
 
 def plain_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:
-    """The same for plain data."""
+    """One line per difference between two configs as plain data."""
     old, new = _flat(there), _flat(here)
     return tuple(
         f"{key} is {_spelt(old, key)} there and {_spelt(new, key)} here"
@@ -102,11 +102,11 @@ def _spelt(values: Mapping[str, Any], key: str) -> str:
 
 
 def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tuple[str, ...]:
-    """One line for each of the user's own modules and models that is another one now than in recorded versions.
+    """One line per user's module or model that has changed since these versions were recorded.
 
     Args:
-        versions: As recorded.
-        allowed: Modules that may be looked at; about others, and those that are not there, nothing is said.
+        versions: Recorded versions.
+        allowed: Modules that may be read; others, and missing ones, are skipped.
     """
     now: dict[str, str] = {}
     for name in (key.removeprefix(SOURCE) for key in versions if key.startswith(SOURCE)):
@@ -119,9 +119,9 @@ def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tu
 
 @functools.cache
 def source_digest(module: str) -> str:
-    """Return the SHA-256 (16 hex digits) of a module's file, or of all files below its outermost package.
+    """Return the SHA-256 (16 hex digits) of a module's file, or of all files of its outermost package.
 
-    A process keeps the digest of its first call, since that is also what the process has imported.
+    A process keeps the digest of its first call, because that version is the one it has imported.
 
     Raises:
         ConfigError: The module cannot be found.
@@ -134,19 +134,19 @@ def source_digest(module: str) -> str:
 
 @functools.cache
 def _distributions() -> Mapping[str, list[str]]:
-    """Top-level module or package -> the installed distributions that it comes from."""
+    """Top-level module or package -> the installed distributions that provide it."""
     return importlib.metadata.packages_distributions()
 
 
 def _files_below(package: Path) -> list[Path]:
-    """List all files of a package in order, without hidden ones and compiled modules."""
+    """List all files of a package in order, except hidden files and compiled modules."""
     files = [path for path in sorted(package.rglob("*")) if path.is_file()]
     names = {path: path.relative_to(package).parts for path in files}
     return [path for path in files if not any(name.startswith(".") or name == "__pycache__" for name in names[path])]
 
 
 def _model_digest(urdf: Path) -> str:
-    """Of a URDF and of the meshes that it names."""
+    """Digest of a URDF and the meshes that it names."""
     content = urdf.read_bytes()
     try:
         names = mesh_names(content.decode(errors="replace"))

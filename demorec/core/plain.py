@@ -1,4 +1,4 @@
-"""Dataclasses to plain JSON data and back, strictly: unknown keys and wrong types are errors that name the key."""
+"""Strict conversion of dataclasses to plain JSON data and back; errors name each unknown key and wrong type."""
 
 from __future__ import annotations
 
@@ -22,25 +22,26 @@ from demorec.core.geometry import Pose
 _converter = make_converter(forbid_extra_keys=True)
 
 MAX_DEPTH = 64
-"""Lists and objects within each other: our own data have ten at most, and code that walks deeper ones would recurse."""
+"""Maximum nesting of lists and objects: our own data need ten at most, and deeper ones would overflow recursive code.
+"""
 _MAX_DIGITS = 20
-"""Of a whole number: 64 bits need no more."""
+"""Maximum digits of a whole number; 64 bits need at most 20."""
 _LENGTH = re.compile(r"^(Not enough|Too many) values in .* to structure as (.*)$", re.DOTALL)
-"""What cattrs says of a list that is not as long as it must be."""
+"""cattrs' message for a list of the wrong length."""
 _CHOICE = re.compile(r"^(.*) not in literal typing\.Literal\[(.*)\]$", re.DOTALL)
-"""What cattrs says of a value that is none of those allowed."""
+"""cattrs' message for a value that is not one of the allowed ones."""
 MAX_LISTED = 8
-"""Mistakes that are listed at once; a hostile file may have hundreds of thousands."""
+"""Maximum errors listed at once; a hostile file may have hundreds of thousands."""
 
 
 def _exactly[T](kind: type[T], accepted: type | tuple[type, ...]) -> Callable[[object, object], T]:
-    """A hook that takes no value of another type, where cattrs would convert ("false" to True, 224.5 to 224)."""
+    """Return a hook that rejects other types, which cattrs would convert ("false" to True, 224.5 to 224)."""
 
     def hook(value: object, _: object) -> T:
-        if type(value) is kind:  # nearly always; the abstract types below are slow
+        if type(value) is kind:  # the usual case; the abstract types below are slow
             return value
         if not isinstance(value, accepted) or (isinstance(value, bool) and kind is not bool):
-            raise ValueError(f"{reprlib.repr(value)} is no {_TYPE_WORDS[kind]}")
+            raise ValueError(f"{reprlib.repr(value)} is not a {_TYPE_WORDS[kind]}")
         return kind(value)  # type: ignore[call-arg]
 
     return hook
@@ -53,17 +54,17 @@ _exact_int, _exact_float = _exactly(int, Integral), _exactly(float, Real)
 def _int(value: object, kind: object) -> int:
     number = _exact_int(value, kind)
     if not -(2**63) <= number < 2**64:
-        raise ValueError(f"{reprlib.repr(value)} is no whole number of 64 bits")
+        raise ValueError(f"{reprlib.repr(value)} is not a 64-bit integer")
     return number
 
 
 def _float(value: object, kind: object) -> float:
     try:
         number = _exact_float(value, kind)
-    except OverflowError:  # a whole number beyond all floats
+    except OverflowError:  # an integer beyond the range of floats
         number = math.inf
     if not math.isfinite(number):
-        raise ValueError(f"{reprlib.repr(value)} is no finite number")
+        raise ValueError(f"{reprlib.repr(value)} is not a finite number")
     return number
 
 
@@ -87,19 +88,19 @@ def _in_words(error: BaseException, type_: type | None) -> str:
     if isinstance(error, ValueError) and (length := _LENGTH.search(words)):
         return f"{length[1].lower()} values, expected {length[2]}"
     if choice := _CHOICE.search(words):
-        return f"{reprlib.repr(choice[1])} is none of {choice[2]}"
-    return words if isinstance(error, ValueError) and " is no " in words else format_exception(error, type_)
+        return f"{reprlib.repr(choice[1])} is not one of {choice[2]}"
+    return words if isinstance(error, ValueError) and " is no" in words else format_exception(error, type_)
 
 
 def listed(words: Iterable[str], most: int = MAX_LISTED, separator: str = "; ") -> str:
-    """The first of some words as one sentence's part, and how many more there are."""
+    """Join the first few words, and the number of those left out, for use in a sentence."""
     items = list(words)
     more = [f"and {len(items) - most:,} more"] if len(items) > most else []
     return separator.join(items[:most] + more)
 
 
 def to_plain(value: object) -> Any:
-    """Plain dicts, lists and scalars of a dataclass; floats keep every bit."""
+    """Convert a dataclass to plain dicts, lists and scalars; floats are bit-exact."""
     return _converter.unstructure(value)
 
 
@@ -107,33 +108,33 @@ def from_plain[T](data: object, cls: type[T]) -> T:
     """Build `cls` from plain data.
 
     Raises:
-        ValueError: One line that lists the keys that are unknown, missing or of a wrong type (the first of very many).
+        ValueError: One line that lists unknown keys, missing keys and wrong types, up to a maximum.
     """
     try:
         return _converter.structure(data, cls)
     except cattrs.BaseValidationError as error:
         words = cattrs.transform_error(error, path=cls.__name__, format_exception=_in_words)
         raise ValueError(listed(words)) from None
-    except (TypeError, AttributeError) as error:  # no object where the outermost one is expected
-        raise ValueError(f"{reprlib.repr(data)} is no {cls.__name__}") from error
+    except (TypeError, AttributeError) as error:  # the outermost value is not an object
+        raise ValueError(f"{reprlib.repr(data)} is not a valid {cls.__name__}") from error
 
 
 def leave_out_default(cls: type, *names: str) -> None:
-    """Write a dataclass without those of these fields that have their default value."""
+    """Omit these fields from a dataclass's plain form when they have their default value."""
     changes: Any = dict.fromkeys(names, override(omit_if_default=True))
     _converter.register_unstructure_hook(cls, make_dict_unstructure_fn(cls, _converter, **changes))
 
 
 def parse_json(text: str, *, allow_nan: bool = False) -> Any:
-    """The value of a JSON text of unknown origin.
+    """Parse JSON text of unknown origin.
 
     Args:
-        text: What to read.
-        allow_nan: Whether NaN and infinities, which Python and NumPy write and the standard does not know, may occur.
+        text: JSON text.
+        allow_nan: Whether NaN and infinities may occur, which Python and NumPy write although the standard forbids
+        them.
 
     Raises:
-        ValueError: No JSON, or what none of our own files holds and no code that reads them can bear: values nested
-            deeper than `MAX_DEPTH`, whole numbers of more than 64 bits.
+        ValueError: Not JSON, nested deeper than `MAX_DEPTH`, or an integer over 64 bits; our own files have neither.
     """
     try:
         value = json.loads(text, parse_int=_whole_number, parse_constant=float if allow_nan else _refuse_constant)
@@ -159,17 +160,17 @@ def _whole_number(digits: str) -> int:
 
 
 def _refuse_constant(word: str) -> float:
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")
 
 
 def to_json(value: object, *, indent: int | None = None) -> str:
-    """Canonical JSON: sorted keys, shortest floats that read back to the same bits."""
+    """Canonical JSON: sorted keys, shortest floats that parse back to the same bits."""
     separators = None if indent else (",", ":")
     return json.dumps(to_plain(value), sort_keys=True, indent=indent, separators=separators, allow_nan=False)
 
 
 def from_json[T](text: str, cls: type[T]) -> T:
-    """Inverse of `to_json`; ValueError as `parse_json` and `from_plain`."""
+    """Parse the output of `to_json`; ValueError as in `parse_json` and `from_plain`."""
     return from_plain(parse_json(text), cls)
 
 

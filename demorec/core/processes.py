@@ -1,4 +1,4 @@
-"""Processes of our own: started afresh (not forked, since threads and locks do not survive that), ending with us."""
+"""Child processes: spawned (not forked, because threads and locks do not survive a fork), and ended with the parent."""
 
 from __future__ import annotations
 
@@ -22,29 +22,29 @@ from demorec.core.limited import remove_limits
 from demorec.core.streams import drop_output
 
 _PATIENCE_S = 3.0
-"""How long a program may take to end when it is asked to."""
+"""Maximum time that a program may take to end after it was asked to."""
 _LATER_S = 0.02
-"""When an interrupt is said again that came where nothing can be raised."""
+"""Delay before repeating an interrupt that arrived where no exception can be raised."""
 _hiding = threading.Lock()
 _starting = threading.Lock()
 
 
 def available_cores() -> int:
-    """Cores that this process may use: its affinity mask, and the quota of its control group where there is one."""
+    """Number of cores that this process may use: its affinity mask and, if any, the quota of its control group."""
     count = len(os.sched_getaffinity(0))
     try:
         quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
         if quota != "max":
             count = min(count, max(1, round(int(quota) / int(period))))
     except (OSError, ValueError):
-        pass  # no control groups of version 2: the affinity mask is all there is
+        pass  # no control groups v2: the affinity mask is the only limit
     return count
 
 
 class _Process(SpawnProcess):
     def start(self) -> None:
         _start_tracker()
-        # The new process inherits the mask: Ctrl-C waits until `run` can catch it, also while modules are imported.
+        # The new process inherits the mask: Ctrl-C is held back until `run` can catch it, also during imports.
         with blocked(signal.SIGINT), _main_hidden():
             super().start()
 
@@ -54,7 +54,7 @@ class _Process(SpawnProcess):
             threading.Thread(target=_end_with_parent, daemon=True).start()
             sys.unraisablehook = _interrupt_again
             super().run()
-        except KeyboardInterrupt:  # Ctrl-C reaches the whole process group; the parent is the one who tells
+        except KeyboardInterrupt:  # Ctrl-C reaches the whole process group; the parent reports it
             os._exit(130)
 
 
@@ -62,7 +62,7 @@ class _Context(SpawnContext):
     Process = _Process
 
     def Lock(self) -> Any:
-        """A lock, as of multiprocessing."""
+        """A lock, as in multiprocessing."""
         _start_tracker()
         return super().Lock()
 
@@ -70,16 +70,17 @@ class _Context(SpawnContext):
 SPAWN = _Context()
 """Like `multiprocessing.get_context("spawn")`, but its processes do not run the main module's file again.
 
-They end when the process that started them ends, whatever it dies of. All that they carry out is imported by name: a
-script that calls demorec needs no `if __name__ == "__main__"`, and a worker does not load the command line's libraries.
+They end when the parent ends, for any reason. Their functions are imported by name: a script that calls demorec needs
+no `if __name__ == "__main__"`, and a worker does not load the command line's libraries.
 """
 
 
 @contextmanager
 def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
-    """So many processes. Ctrl-C, which reaches them, too, ends them; one that comes while they end kills them.
+    """Pool of worker processes. Ctrl-C, which also reaches the workers, ends them; a second one while they end kills
+    them.
 
-    It must not be raised there: a thread of which the end is waited for counts as ended then, and never ends.
+    No exception may be raised during the join: a thread being joined would count as ended and never end.
     """
     pool = ProcessPoolExecutor(workers, mp_context=SPAWN)
 
@@ -97,13 +98,13 @@ def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 def in_turn[Item, Result](
     function: Callable[[Item], Result], items: Sequence[Item], workers: int, *, ahead: int | None = None
 ) -> Iterator[Result]:
-    """What a function returns of each item, in their order, by several processes if there is more than one.
+    """Yield the function's result for each item, in order, from several processes if `workers` is more than one.
 
     Args:
-        function: Imported by name where it is called in other processes.
-        items: Things to be worked on.
-        workers: Processes; 1 works in this one.
-        ahead: Items that each process may be ahead of what is taken here: bounds the memory; None for all.
+        function: Imported by name if it runs in other processes.
+        items: Inputs of the function.
+        workers: Number of processes; 1 runs in this process.
+        ahead: Maximum items that each process may be ahead of the consumer, to limit memory; None means all.
     """
     workers = min(workers, len(items))
     if workers < 2:
@@ -120,9 +121,9 @@ def in_turn[Item, Result](
 
 
 def _start_tracker() -> None:
-    """Start Python's tracker of resources, unless it runs, so that it keeps to itself what it does when we are killed.
+    """Start Python's resource tracker, unless it runs, so that it prints nothing if this process is killed.
 
-    It removes the semaphores that a killed process leaves, and would call them leaked on the terminal.
+    It removes the semaphores of a killed process, and would report them as leaked on the terminal.
     """
     quiet = f"ignore::UserWarning:{resource_tracker.__name__}"
     with _starting:
@@ -133,7 +134,7 @@ def _start_tracker() -> None:
 
 @contextmanager
 def environment(variables: Mapping[str, str]) -> Iterator[None]:
-    """Set environment variables for a child that starts inside; libraries read them when they are imported."""
+    """Set environment variables for a child that starts inside the context; libraries read them on import."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -148,7 +149,7 @@ def environment(variables: Mapping[str, str]) -> Iterator[None]:
 
 @contextmanager
 def blocked(*numbers: signal.Signals) -> Iterator[None]:
-    """Hold signals back, here and in a child that starts inside, until each is ready for them."""
+    """Block signals, here and in a child that starts inside the context, until each is ready for them."""
     held = signal.pthread_sigmask(signal.SIG_BLOCK, numbers)
     try:
         yield
@@ -157,17 +158,17 @@ def blocked(*numbers: signal.Signals) -> Iterator[None]:
 
 
 def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-    """Start a program that ends when this process ends, whatever it dies of.
+    """Start a program that ends when this process ends, for any reason.
 
-    A process of ours stands between them: it starts the program, ends when it does, and ends it when its standard
-    input, of which nobody else has the other end, is closed.
+    An intermediate process starts the program and ends with it. It ends the program when its standard input is closed,
+    whose other end only this process holds.
 
     Args:
         command: The program and its arguments; its standard input is empty.
-        options: Of `subprocess.Popen`, but for `stdin`.
+        options: Arguments of `subprocess.Popen`, except `stdin`.
 
     Returns:
-        That process: what terminates it ends the program.
+        The intermediate process; terminating it ends the program.
     """
     return subprocess.Popen([sys.executable, "-P", "-m", __name__, *command], stdin=subprocess.PIPE, **options)
 
@@ -175,7 +176,7 @@ def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[An
 def _stand_between(command: Sequence[str]) -> int:
     remove_limits()
     program = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the program, too
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the program
 
     def end(number: int, frame: FrameType | None) -> None:
         program.terminate()
@@ -195,7 +196,7 @@ def _stand_between(command: Sequence[str]) -> int:
 
 
 def _interrupt_again(args: sys.UnraisableHookArgs) -> None:
-    """Where Ctrl-C falls into a destructor or a callback, Python prints it and goes on: say it again after that."""
+    """Python prints and ignores a Ctrl-C inside a destructor or a callback: repeat it afterwards."""
     if issubclass(args.exc_type, KeyboardInterrupt):
         again = threading.Timer(_LATER_S, os.kill, (os.getpid(), signal.SIGINT))
         again.daemon = True
@@ -205,9 +206,9 @@ def _interrupt_again(args: sys.UnraisableHookArgs) -> None:
 
 
 def _end_with_parent() -> None:
-    """Leave no orphan behind when the parent is killed: its end of a pipe closes, whatever it died of.
+    """End this process when the parent dies: the parent's end of a pipe closes, for any cause of death.
 
-    The queue of a ProcessPoolExecutor does not tell: its workers hold both ends of that pipe themselves.
+    The queue of a ProcessPoolExecutor does not close: its workers hold both ends of that pipe.
     """
     parent = multiprocessing.parent_process()
     assert parent is not None
@@ -217,7 +218,7 @@ def _end_with_parent() -> None:
 
 @contextmanager
 def _main_hidden() -> Iterator[None]:
-    # multiprocessing.spawn.get_preparation_data tells a child to run what __spec__ or __file__ name.
+    # multiprocessing.spawn.get_preparation_data makes a child run the file in __spec__ or __file__.
     main = sys.modules["__main__"]
     with _hiding:
         held: dict[str, Any] = {k: v for k, v in vars(main).items() if k in ("__spec__", "__file__")}
@@ -230,14 +231,14 @@ def _main_hidden() -> Iterator[None]:
 
 
 def terminate_as_interrupt() -> AbstractContextManager[None]:
-    """Inside, SIGTERM raises KeyboardInterrupt as Ctrl-C does, so that every `finally` runs."""
+    """Context in which SIGTERM raises KeyboardInterrupt like Ctrl-C, so that every `finally` runs."""
     return handled(signal.default_int_handler, signal.SIGTERM)
 
 
 def exit_silently(number: int, frame: FrameType | None) -> NoReturn:
-    """End this process in order, as the handler of a signal.
+    """Exit in order; a signal handler.
 
-    Python would print the traceback of an exit within a destructor or a callback of `atexit`.
+    Python would print the traceback of an exit within a destructor or an `atexit` callback.
     """
     drop_output(sys.stderr.fileno())
     sys.exit(1)
@@ -245,7 +246,7 @@ def exit_silently(number: int, frame: FrameType | None) -> NoReturn:
 
 @contextmanager
 def handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.Signals) -> Iterator[None]:
-    """Handle signals like this inside; leaves them alone outside the main thread, where Python cannot catch them."""
+    """Set a signal handler in this context; does nothing outside the main thread, where Python forbids it."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return

@@ -1,12 +1,13 @@
-"""Things that a user names (tasks, robots, cameras, renderers, exporters, checks), and which modules may be imported.
+"""Tables of names that users can choose (tasks, robots, cameras, renderers, exporters, checks), and the modules that
+may be imported.
 
-A row of a table maps a name to "module:attribute", imported when it is used: listing what there is costs nothing, and a
-heavy library is loaded only by the row that needs it.
+A row maps a name to "module:attribute", which is imported on use: listing costs nothing, and a heavy library is loaded
+only by the row that needs it.
 
-Beside the tables' rows there are modules of the user's own. Importing a module runs it, so one is imported only when
-the user has named it in this call: by a flag (`--task my_tasks:Mine`, `--allow my_tasks`), in the config file that was
-given, or in Python by a `GenerateConfig`. What a recording, a run, a dataset or a policy names is no such word: it
-needs the module in `allowed`.
+Besides the rows, users can name their own modules. Importing a module runs its code. It is imported only if the user
+has named it in this call: by a flag (`--task my_tasks:Mine`, `--allow my_tasks`), in the given config file, or in
+Python by a `GenerateConfig`. A name in a recording, a run, a dataset or a policy does not count: it needs the module in
+`allowed`.
 """
 
 from __future__ import annotations
@@ -26,9 +27,9 @@ from demorec.core.errors import ConfigError, NotAllowedError
 from demorec.core.own_code import own_line
 
 _LONGEST = 100
-"""Characters of names that are compared with others, which takes the product of both and of how many there are."""
+"""Maximum length of a name to compare; the cost grows with the product of both lengths and the number of names."""
 _MOST_LISTED = 30
-"""Names that a refusal lists; of more it names the command that does."""
+"""Maximum number of names in an error; for more, it names the command that lists them."""
 
 
 def nearest_match(name: str, allowed: Iterable[str]) -> str:
@@ -39,7 +40,7 @@ def nearest_match(name: str, allowed: Iterable[str]) -> str:
 
 
 def check_choice[T: str](kind: str, name: str, allowed: Collection[T]) -> T:
-    """Return `name`; ConfigError with the nearest match unless it is allowed."""
+    """Return `name` if it is allowed; otherwise ConfigError with the closest match."""
     for choice in allowed:
         if choice == name:
             return choice
@@ -48,16 +49,16 @@ def check_choice[T: str](kind: str, name: str, allowed: Collection[T]) -> T:
 
 @dataclass(frozen=True)
 class Registry[T]:
-    """Names of one kind and where their objects are.
+    """Names of one kind, each with the location of its object.
 
-    A registry with a `subclass_of` or `instance_of` is open: it also takes "my_package.my_module:MyThing", if the
-    caller allows that module (`demorec.core.registry`) and the thing is of the right kind.
+    A registry with `subclass_of` or `instance_of` is open: it also accepts "my_package.my_module:MyThing" if the caller
+    allows that module (`demorec.core.registry`) and the object has that type.
 
     Attributes:
-        kind: What a row is, in the singular, for messages ("task").
+        kind: Name of one row, singular, for messages ("task").
         rows: name -> "module:attribute".
-        subclass_of: "module:attribute" of the class that the user's own classes must derive from.
-        instance_of: "module:attribute" of the class that the user's own objects must be of.
+        subclass_of: "module:attribute" of the base class of the user's classes.
+        instance_of: "module:attribute" of the class of the user's objects.
     """
 
     kind: str
@@ -66,7 +67,7 @@ class Registry[T]:
     instance_of: str = ""
 
     def names(self) -> tuple[str, ...]:
-        """Every name, in the order of the table."""
+        """All names, in table order."""
         return tuple(self.rows)
 
     def target(self, name: str) -> str:
@@ -74,14 +75,14 @@ class Registry[T]:
         return self.rows.get(name, name)
 
     def check_name(self, name: str, allowed: Iterable[str] = ()) -> None:
-        """Raise ConfigError with the nearest match unless `name` may be loaded; imports nothing.
+        """Raise ConfigError with the closest match if `name` is not known or allowed; imports nothing.
 
         Args:
-            name: A row's, or "package.module:Thing" where the registry is open.
-            allowed: Modules and packages of the user's own that may be imported.
+            name: A row's name, or "package.module:Thing" if the registry is open.
+            allowed: The user's modules and packages that may be imported.
 
         Raises:
-            NotAllowedError: It is a thing of a module that is not among those.
+            NotAllowedError: Its module is not allowed.
         """
         if name in self.rows:
             return
@@ -95,16 +96,16 @@ class Registry[T]:
             )
         if not is_allowed(parts[0], allowed):
             raise NotAllowedError(
-                f"The {self.kind} {name!r} is code from outside of demorec that a file names, and only you can say "
+                f"The {self.kind} {name!r} is third-party code that a file names, and only you can decide "
                 f"whether to run it: if you trust that module, add --allow {parts[0]}."
             )
 
     def load(self, name: str, allowed: Iterable[str] = ()) -> T:
-        """Import and return the object called `name`; arguments as of `check_name`.
+        """Import and return the object called `name`; arguments as in `check_name`.
 
         Raises:
-            ConfigError: No such name, or one of the user's own that cannot be imported or is of another kind.
-            NotAllowedError: As `check_name`.
+            ConfigError: Unknown name, or a user's object that cannot be imported or has the wrong type.
+            NotAllowedError: As in `check_name`.
         """
         self.check_name(name, allowed)
         if name in self.rows:
@@ -115,7 +116,7 @@ class Registry[T]:
         if not fits:
             relation = "a subclass" if self.subclass_of else "an instance"
             raise ConfigError(
-                f"{name!r} is no {self.kind}: it must be {relation} of {base.__module__}.{base.__qualname__}."
+                f"{name!r} is not a {self.kind}: it must be {relation} of {base.__module__}.{base.__qualname__}."
             )
         if inspect.isabstract(found):
             missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
@@ -124,13 +125,13 @@ class Registry[T]:
 
 
 def _import(target: str) -> Any:
-    """The object of a table's "module:attribute"."""
+    """Import the object at a table's "module:attribute"."""
     module_name, _, attribute = target.partition(":")
     return getattr(importlib.import_module(module_name), attribute)
 
 
 def split_name(name: str) -> tuple[str, str] | None:
-    """("package.module", "Thing") of "package.module:Thing"; None unless the name is exactly of that form."""
+    """Split "package.module:Thing" into ("package.module", "Thing"); None if the name has another form."""
     module, _, attribute = name.partition(":")
     if attribute.isidentifier() and is_module_name(module):
         return module, attribute
@@ -138,7 +139,7 @@ def split_name(name: str) -> tuple[str, str] | None:
 
 
 def modules_of(names: Iterable[str]) -> tuple[str, ...]:
-    """The modules that those of the names which are "package.module:Thing" lie in, each once."""
+    """Modules of the names of the form "package.module:Thing", each once."""
     found = (split_name(name) for name in names)
     return tuple(dict.fromkeys(parts[0] for parts in found if parts is not None))
 
@@ -149,19 +150,19 @@ def is_foreign(module: str) -> bool:
 
 
 def is_allowed(module: str, allowed: Iterable[str]) -> bool:
-    """Whether a module is one of those named, or lies in a package that is."""
+    """Whether a module is allowed itself or by one of its packages."""
     return any(module == name or module.startswith(f"{name}.") for name in allowed)
 
 
 def import_object(kind: str, name: str) -> object:
-    """Import the module of "package.module:Thing" and return the thing.
+    """Import the module of "package.module:Thing" and return the object.
 
     Args:
-        kind: What it is to be ("task"), for messages.
-        name: Of the form that `split_name` takes.
+        kind: Expected kind ("task"), for messages.
+        name: A name that `split_name` accepts.
 
     Raises:
-        ConfigError: The module cannot be imported, whatever it raises, or has no such attribute.
+        ConfigError: The module cannot be imported, for any reason, or has no such attribute.
     """
     module_name, _, attribute = name.partition(":")
     make_importable(module_name)
@@ -184,10 +185,9 @@ def import_object(kind: str, name: str) -> object:
 
 
 def make_importable(module: str) -> None:
-    """Let a module of the current folder be found, as `python -m` does, where it is not found without.
+    """Make a module of the current folder importable, as `python -m` does, unless it already is.
 
-    The folder is appended to the path, so that nothing in it takes the place of what is installed; processes that are
-    started later inherit it.
+    The folder is appended to the path, so that installed modules take precedence; child processes inherit the path.
     """
     top = module.partition(".")[0]
     here = Path.cwd()
@@ -199,9 +199,9 @@ def make_importable(module: str) -> None:
 
 
 def module_file(module: str) -> Path:
-    """The file of a module; of a package, that of its `__init__`.
+    """File of a module; for a package, its `__init__` file.
 
-    Packages around it are imported on the way, so it must be an allowed one.
+    Imports the enclosing packages, so the module must be an allowed one.
 
     Raises:
         ConfigError: There is no such module, or it has no file.
@@ -209,22 +209,22 @@ def module_file(module: str) -> Path:
     make_importable(module)
     try:
         spec = importlib.util.find_spec(module)
-    except (Exception, SystemExit) as error:  # a package around it is the user's code, too
+    except (Exception, SystemExit) as error:  # an enclosing package is the user's code, too
         raise ConfigError(f"The module {module!r} cannot be found ({type(error).__name__}: {error}).") from error
     if spec is None or spec.origin is None or not Path(spec.origin).is_file():
         raise ConfigError(
-            f"There is no file of the module {module!r}: install its package, put its folder on PYTHONPATH, or run the "
-            "command in the folder where it lies."
+            f"The module {module!r} has no file: install its package, put its folder on PYTHONPATH, or run the "
+            "command in its folder."
         )
     return Path(spec.origin)
 
 
 def import_root(module: str) -> Path:
-    """The folder on the path in which a module was found; errors as of `module_file`."""
+    """Folder on the path in which a module was found; errors as in `module_file`."""
     file = module_file(module)
     return file.parents[module.count(".") + (file.stem == "__init__")]
 
 
 def is_module_name(name: str) -> bool:
-    """Whether a module or package can be called so."""
+    """Whether a name is valid for a module or package."""
     return all(part.isidentifier() for part in name.split("."))

@@ -1,9 +1,9 @@
-"""What may be replaced or deleted, and how: the one rule of every command.
+"""The rule of all commands for replacing and deleting files.
 
-Only what a command recognises, by its content, as the kind of thing that it makes is replaced, and only when the user
-asks for it. Never a source of the same command, never a folder that a person lives or works in, never a folder with
-anything foreign in it. What is replaced stays whole until what takes its place is whole (`demorec.core.atomic`); the
-parts of a run are moved aside first and deleted last.
+A command replaces only a file or folder that it recognises, by its content, as the kind that it makes, and only if the
+user asks for it. It never replaces one of its sources, a folder that a person lives or works in, or a folder with
+foreign content. The old content stays complete until the new one is complete (`demorec.core.atomic`); the parts of a
+run are moved aside first and deleted last.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.files import MAX_JSON_BYTES, MCAP_MAGIC, RERUN_MAGICS, read_json_limited
 
 _SHOWN = 5
-"""How many foreign files a refusal names."""
+"""Maximum foreign files in an error message."""
 _ASIDE = ".demorec-replaced"
 _MARK = "what-this-is.txt"
 _MARK_TEXT = "What --overwrite replaces. demorec removes this folder when the new is in place, or puts it back.\n"
@@ -28,15 +28,15 @@ _MARK_TEXT = "What --overwrite replaces. demorec removes this folder when the ne
 
 @dataclass(frozen=True, kw_only=True)
 class ReplaceableKind:
-    """A kind of file or folder that a command makes, and may therefore replace.
+    """A kind of file or folder that a command makes and may replace.
 
     Attributes:
-        name: In a sentence: "a recording".
+        name: Noun for a sentence: "a recording".
         is_folder: Whether it is a folder.
-        recognises: Whether a file or folder is of this kind, by its content.
-        strangers: Names, relative to such a folder or within such a file, of what in it is not part of it and would be
-            deleted with it.
-        advice: What to do where one is there already.
+        recognises: Whether a file or folder is of this kind, judged by its content.
+        strangers: Names, relative to the folder or within the file, of content that is not part of this kind and would
+        be deleted.
+        advice: Action for the user if one already exists.
     """
 
     name: str
@@ -62,37 +62,37 @@ REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_
 
 
 def check_replaceable(target: Path, kind: ReplaceableKind, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
-    """Raise unless `target` is free, or may be replaced by something of its kind and the user asks for that.
+    """Raise unless `target` is free, or is of this kind and the user asks for replacement.
 
-    An empty folder counts as free; an empty file does not, since somebody's lock or mark may be one.
+    An empty folder counts as free; an empty file does not, because it may be a lock or a marker.
 
     Args:
-        target: Where something new shall be.
-        kind: What is made there.
-        overwrite: Whether the user asks for replacing.
-        sources: What the command reads; neither it nor what holds it is replaced, nor anything in it.
+        target: Path of the new result.
+        kind: Kind of the result.
+        overwrite: Whether the user asks for replacement.
+        sources: Inputs of the command; they, the folders that contain them and their content are never replaced.
 
     Raises:
-        ConfigError: Something is there, and the user does not ask for replacing it, or it must never be replaced.
+        ConfigError: The target exists and the user does not ask for replacement, or it must never be replaced.
     """
     reason = obstacle(target, kind, sources)
     if not reason and (not os.path.lexists(target) or _is_empty(target)):
         return
     if not overwrite:
         if reason:
-            raise ConfigError(f"Something is there already, and not to be replaced, since {reason}: {target}")
-        raise ConfigError(f"{kind.name[0].upper()}{kind.name[1:]} is there already: {kind.advice}: {target}")
+            raise ConfigError(f"The target exists already and must not be replaced, since {reason}: {target}")
+        raise ConfigError(f"{kind.name[0].upper()}{kind.name[1:]} exists already: {kind.advice}: {target}")
     if reason:
         raise ConfigError(f"This is never replaced, since {reason}: choose another name: {target}")
 
 
 def obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path] = ()) -> str:
-    """Why `target` must not be replaced, as `check_replaceable` tells it; "" when it may be, or nothing is there."""
+    """Reason why `target` must not be replaced, for `check_replaceable`; "" if it may be, or is missing."""
     try:
         if not os.path.lexists(target):
             return ""
         if not target.exists():
-            return "it is a link to something that is not there"
+            return "it is a link whose target is missing"
         if reason := use_as_source(target.resolve(), sources):
             return reason
         if kind.is_folder and not target.is_dir():
@@ -105,13 +105,13 @@ def obstacle(target: Path, kind: ReplaceableKind, sources: Iterable[Path] = ()) 
         if not kind.recognises(target):
             return f"it is not {kind.name}"
         foreign = kind.strangers(target)
-        return f"it holds what is not part of {kind.name} ({shown(foreign)})" if foreign else ""
+        return f"it holds files that are not part of {kind.name} ({shown(foreign)})" if foreign else ""
     except OSError as error:
         return f"it cannot be read ({error.strerror})"
 
 
 def use_as_source(target: Path, sources: Iterable[Path]) -> str:
-    """How a command that reads these sources uses `target`, a resolved path; "" when it does not."""
+    """How a command with these sources uses `target`, a resolved path; "" if it does not."""
     for source in sources:
         resolved = source.resolve()
         if resolved == target:
@@ -119,12 +119,12 @@ def use_as_source(target: Path, sources: Iterable[Path]) -> str:
         if resolved.is_relative_to(target):
             return f"this command reads something in it ({source})"
         if target.is_relative_to(resolved):
-            return f"it lies in what this command reads ({source})"
+            return f"it is inside an input of this command ({source})"
     return ""
 
 
 def protection(folder: Path) -> str:
-    """Why a folder is never replaced whatever it holds: a person lives or works there; "" for any other one."""
+    """Reason why a folder is never replaced, because a person lives or works there; "" for other folders."""
     resolved = folder.resolve()
     if resolved == resolved.parent:
         return "it is the root of the file system"
@@ -132,7 +132,7 @@ def protection(folder: Path) -> str:
         if place.resolve() == resolved:
             return f"it is the {what}"
         if place.resolve().is_relative_to(resolved):
-            return f"the {what} lies in it"
+            return f"the {what} is inside it"
     return "it is a repository (.git)" if os.path.lexists(resolved / ".git") else ""
 
 
@@ -141,12 +141,12 @@ def _is_empty(path: Path) -> bool:
 
 
 def shown(names: Sequence[str]) -> str:
-    """The first few of some names, for a sentence."""
+    """The first few names, for a sentence."""
     return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
 
 
 def files_below(folder: Path) -> Iterator[str]:
-    """Every entry of a folder that is no folder itself, relative to it, links to folders included; in order."""
+    """Entries of a folder, except folders but including links to folders, relative to it and in order."""
     for place, folders, files in os.walk(folder):
         links = [name for name in folders if (Path(place) / name).is_symlink()]
         folders.sort()
@@ -155,7 +155,7 @@ def files_below(folder: Path) -> Iterator[str]:
 
 
 def json_object(path: Path) -> dict[str, Any]:
-    """The JSON object in a regular file; {} when there is none, or a larger one than any of ours."""
+    """Read the JSON object in a regular file; {} if it is missing or larger than any of demorec's."""
     try:
         found = read_json_limited(path, MAX_JSON_BYTES)
     except (OSError, ValueError):
@@ -165,14 +165,14 @@ def json_object(path: Path) -> dict[str, Any]:
 
 @contextmanager
 def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
-    """Move parts of a folder aside while what takes their place is made; delete them at the end.
+    """Move parts of a folder aside while their replacements are made; delete them at the end.
 
-    An error puts them back. A crash leaves them in a folder of its own, for `settle_parts`.
+    An error restores them. A crash leaves them in a separate folder, for `settle_parts`.
 
     Args:
-        folder: Where they are.
-        names: Of files and folders, whether there or not. The first is the one whose presence means that what takes
-            their place has been made: it goes first and comes back last.
+        folder: Folder of the parts.
+        names: Names of files and folders, existing or not. The presence of the first one means that the replacements
+        are complete: it is moved away first and restored last.
     """
     aside = folder / _ASIDE
     aside.mkdir()
@@ -189,10 +189,10 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
 
 
 def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
-    """Whether a crash within `replaced_parts` has left something for `settle_parts`: what has its mark.
+    """Whether a crash within `replaced_parts` left a marked folder for `settle_parts`.
 
     Raises:
-        ConfigError: What is there by the name of such leftovers is not ours.
+        ConfigError: A folder with that name has no mark of demorec.
     """
     aside = folder / _ASIDE
     if not os.path.lexists(aside):
@@ -204,10 +204,10 @@ def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
 
 
 def settle_parts(folder: Path, names: Sequence[str]) -> None:
-    """Finish what a crash within `replaced_parts` left: put the old back, or delete it where the new is there.
+    """Finish `replaced_parts` after a crash: restore the old parts, or delete them if the new ones are complete.
 
     Raises:
-        ConfigError: As `check_unsettled_parts`.
+        ConfigError: As in `check_unsettled_parts`.
     """
     aside = folder / _ASIDE
     check_unsettled_parts(folder, names)
@@ -225,7 +225,7 @@ def _drop(aside: Path, names: Sequence[str]) -> None:
             shutil.rmtree(aside / name)
         else:
             (aside / name).unlink(missing_ok=True)
-    (aside / _MARK).unlink(missing_ok=True)  # last: it tells whose the folder is
+    (aside / _MARK).unlink(missing_ok=True)  # last: it marks the folder as demorec's
     aside.rmdir()
 
 

@@ -1,7 +1,7 @@
 """Randomness as a function of (root seed, episode, attempt, purpose).
 
-Each purpose has a stream of its own, so that drawing one number more for the looks never moves a cube, and an
-episode does not depend on which worker makes it or what was made before.
+Each purpose has its own stream: one more draw for the appearance never moves a cube. An episode does not depend on its
+worker or on earlier episodes.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ Purpose = Literal[
     "language",
     "takeover",
 ]
-"""What a stream is used for. Append only: the position in this list is part of every recorded seed."""
+"""Purposes of random streams. Append only: the position in this list is part of each recorded seed."""
 
 PURPOSES: tuple[Purpose, ...] = get_args(Purpose)
 
 
 def generator(*, root_seed: int, episode_index: int, attempt: int, purpose: Purpose) -> np.random.Generator:
-    """Return the stream for one purpose of one attempt at one episode (independent of all others).
+    """Return the stream for one purpose of one attempt at one episode, independent of all other streams.
 
-    The construction is NumPy's for parallel streams: SeedSequence with a spawn key
+    Uses NumPy's construction for parallel streams: SeedSequence with a spawn key
     (https://numpy.org/doc/stable/reference/random/parallel.html).
     """
     spawn_key = (episode_index, attempt, PURPOSES.index(purpose))

@@ -1,4 +1,4 @@
-"""Standard streams that a program can rely on, whatever the shell has closed."""
+"""Standard streams that a program can rely on even if the shell has closed them."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def open_closed_streams() -> None:
                 os.dup2(opened, number)
                 os.close(opened)
             os.set_inheritable(number, True)
-        if getattr(sys, name) is None:  # as Python sets it where it finds none
+        if getattr(sys, name) is None:  # as Python does for a missing stream
             stream = os.fdopen(number, "w" if number else "r", closefd=False)
             setattr(sys, name, stream)
             setattr(sys, f"__{name}__", stream)
@@ -29,7 +29,7 @@ def open_closed_streams() -> None:
 def drop_output(number: int) -> None:
     """Connect a standard stream that cannot be written to the null device.
 
-    Otherwise its buffer would fail again at the end of the program, with a traceback and an exit code of Python's.
+    Otherwise flushing its buffer would fail again at exit, with a traceback and Python's exit code.
     """
     nowhere = os.open(os.devnull, os.O_WRONLY)
     os.dup2(nowhere, number)

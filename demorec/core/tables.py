@@ -1,4 +1,4 @@
-"""The tables of everything that a user can name; their rows are those of `demorec.core.extensions`."""
+"""Tables of everything users can name; `demorec.core.extensions` provides their rows."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ RANKINGS: Registry[Callable[..., Any]] = Registry(kind="ranking", rows=Extension
 
 
 def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:
-    """`ROBOTS.load`, with the model of a robot of the user's own named as recordings name it.
+    """Load a robot by `ROBOTS.load`, with the model path of a user's robot in the form that recordings use.
 
     Raises:
-        ConfigError: As `Registry.load`, or the model lies where a recording cannot name it.
+        ConfigError: As in `Registry.load`, or recordings cannot name the model's location.
     """
     robot = ROBOTS.load(name, allowed)
     module, *_ = modules_of([ROBOTS.target(name)])
@@ -48,11 +48,11 @@ def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:
 
 
 def environment_name(task: str) -> str:
-    """Gymnasium's name of a task's environment: "demorec/PickPlace-v0", or "demorec/Mine-v0" for "my_package:Mine"."""
+    """Gymnasium ID of a task's environment: "demorec/PickPlace-v0", or "demorec/Mine-v0" for "my_package:Mine"."""
     name = "".join(word.capitalize() for word in task.split("_")) if task in TASKS.rows else task.rpartition(":")[2]
     return f"demorec/{name}-v0"
 
 
 def camera_name(name: str) -> str:
-    """What a camera is called in recordings and datasets: the row's name, or "top" for "my_cameras:TOP"."""
+    """Name of a camera in recordings and datasets: the row's name, or "top" for "my_cameras:TOP"."""
     return name if split_name(name) is None else name.rpartition(":")[2].lower()

@@ -1,4 +1,4 @@
-"""Options that name a new file or folder: one type, and one rule for names that none can have."""
+"""Type of options that name a new file or folder, and the check for impossible names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_args, get_type_hints
 from demorec.core.errors import OptionError
 
 _TARGET = object()
-"""Marks the type of a target."""
+"""Marker of the type."""
 Target = Annotated[Path, _TARGET]
 OptionalTarget = Annotated[Path | None, _TARGET]
 
@@ -20,11 +20,11 @@ def check_targets(command: Any) -> None:
     """Check the targets of a command before it does anything.
 
     Args:
-        command: A dataclass whose fields, and those of dataclasses in it, are options.
+        command: A dataclass whose fields, and those of nested dataclasses, are options.
 
     Raises:
-        OptionError: A target can never be made: its name is too long or not UTF-8, it is below a file, it is, or is
-            below, a link to something that is not there.
+        OptionError: A target can never be created: its name is too long or not UTF-8, it is below a file, or it is (or
+        is below) a dangling link.
     """
     for option, target in _targets(command):
         if not is_utf8(target):
@@ -37,11 +37,11 @@ def check_targets(command: Any) -> None:
         for place in (target, *target.parents):
             if place.is_symlink() and not place.exists():
                 what = "is" if place == target else f"is below {place.name},"
-                raise OptionError(option, f"{what} a link to something that is not there, remove it: {target}")
+                raise OptionError(option, f"{what} a link whose target is missing, remove it: {target}")
 
 
 def is_utf8(path: Path) -> bool:
-    """Whether a path is text; PyArrow and Rerun, for example, open no other ones."""
+    """Whether a path is UTF-8 text; PyArrow and Rerun, for example, open no other paths."""
     try:
         str(path).encode()
     except UnicodeEncodeError:
@@ -50,7 +50,7 @@ def is_utf8(path: Path) -> bool:
 
 
 def _targets(command: Any) -> Iterator[tuple[str, Path]]:
-    """(option, path) of the targets that the user has named."""
+    """Yield (option, path) of each target that the user has named."""
     hints = get_type_hints(type(command), include_extras=True)
     for field in dataclasses.fields(command):
         value = getattr(command, field.name)

@@ -1,4 +1,4 @@
-"""Text that came from outside (file names, recordings, run.json, datasets) made fit for a terminal or a log."""
+"""Make text from outside (file names, recordings, run.json, datasets) safe for a terminal or a log."""
 
 from __future__ import annotations
 
@@ -7,33 +7,34 @@ import unicodedata
 
 _VISIBLE = {"\n": "\\n", "\r": "\\r", "\t": "\\t"}
 _INVISIBLE_KINDS = ("Cc", "Cf", "Cs", "Zl", "Zp")
-"""Unicode's categories of what a terminal obeys or reorders instead of showing it: control characters (escape codes
-begin with one), format characters (among them those that turn the direction of writing), surrogates (bytes of a file
-name that are no UTF-8) and separators of lines and paragraphs."""
+"""Unicode categories that a terminal obeys or reorders instead of displaying: control characters (escape codes begin
+with one), format characters (including those that change the writing direction), surrogates (bytes of a file name that
+are not UTF-8), and line and paragraph separators.
+"""
 
 
 def printable(text: str) -> str:
-    r"""The same text with every control character spelt out (\x1b, \n, \u202e), so that it can do nothing but be read.
+    r"""Return the text with every control character escaped (\x1b, \n, \u202e), so that it is only displayed.
 
-    All foreign text goes through here before it reaches a terminal; `demorec.cli.shared.output` sees to that.
+    All foreign text passes through here before it reaches a terminal; `demorec.cli.shared.output` ensures that.
     """
-    if text.isprintable():  # nearly always; a plain space counts as printable
+    if text.isprintable():  # the usual case; a plain space counts as printable
         return text
     return "".join(_spelt(character) for character in text)
 
 
 _MARKS = re.compile(r"^[#+=-]|[\\`*\[\]|~$#]|(?<![^\W_])_|_(?![^\W_])")
-"""What acts in a line of Markdown; an underscore within a word does not."""
+"""Characters with a meaning in a line of Markdown; an underscore within a word has none."""
 _ENTITIES = {ord("&"): "&amp;", ord("<"): "&lt;", ord(">"): "&gt;"}
 
 
 def markdown(text: str) -> str:
-    """The same text for a line of Markdown, which can do nothing but be read: no HTML, link, table or emphasis."""
+    """Escape text for a line of Markdown: no HTML, link, table or emphasis."""
     return _MARKS.sub(r"\\\g<0>", printable(text)).translate(_ENTITIES)
 
 
 def display_width(text: str) -> int:
-    """How many columns of a terminal a printable text takes: wide characters (CJK) take two, combining marks none."""
+    """Terminal columns of a printable text: wide characters (CJK) take two, combining marks none."""
     if text.isascii():
         return len(text)
     return sum(_columns(character) for character in text)

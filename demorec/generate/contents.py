@@ -133,7 +133,7 @@ def check_dataset_place(folder: Path, run: RunFile) -> None:
     if not os.path.lexists(dataset):
         return
     if not dataset.exists():
-        raise ConfigError(f"The dataset is a link to something that is not there, mend or remove it: {dataset}")
+        raise ConfigError(f"The dataset is a link whose target is missing, mend or remove it: {dataset}")
     if run.export is None and not is_dataset_of_run(dataset, run.config_digest):
         raise ConfigError(f"A dataset that this run did not make is in the way; move it elsewhere: {dataset}")
 

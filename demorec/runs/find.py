@@ -126,7 +126,7 @@ def find(path: Path) -> Found:
         return _file(path)
     except FileNotFoundError:
         if path.is_symlink():
-            return Found(path=path, kind="nothing", reason="This is a link to something that is not there")
+            return Found(path=path, kind="nothing", reason="This is a link whose target is missing")
         part = path.with_name(f"{path.name}.part")
         left = Found(path=path, kind="unfinished", unfinished=(part,) if _is_there(part) else ()).left
         return Found(

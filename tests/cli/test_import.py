@@ -16,7 +16,7 @@ BAD: dict[str, tuple[int, str]] = {
     "a bag that is not there": (2, "There is no bag that could be read"),
     "a mapping that is not there": (2, "There is no mapping (demorec import ... --suggest > FILE writes one)"),
     "a word for a format that is misspelt": (2, "There is no bag 'lerobt'. Did you mean 'lerobot'?"),
-    "no toml": (2, "The mapping is no valid TOML"),
+    "no toml": (2, "The mapping is not valid TOML"),
     "unknown encoding": (1, "the encoding 'cbor' is not read"),
     "two types on a topic": (1, "has messages of several types"),
     "a text file": (1, "This is not "),

@@ -184,7 +184,7 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run("info", tmp_path / "c.mcap") == 0
     assert "unknown: recovered after a crash" in capsys.readouterr().out
     assert run("recover", part) == 2
-    assert "there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     assert run("recover", part, "--overwrite") == 0
     assert run("recover", part, "--out", tmp_path / "d.mcap") == 0
 

@@ -90,7 +90,7 @@ TARGETS = {
     "mixed": "data/notes.txt",
     "link_to_mixed": "data/notes.txt",
     "noted": "(notes)",
-    "link_to_nothing": "a link to something that is not there",
+    "link_to_nothing": "a link whose target is missing",
 }
 
 
@@ -204,7 +204,7 @@ def test_a_run_where_somebody_works_is_not_overwritten(run: Path, monkeypatch: p
             run_fake(run, num_episodes=2, seed=1, overwrite=True)
     with monkeypatch.context() as patch:
         patch.chdir(run / "episodes")
-        with pytest.raises(ConfigError, match="the current folder lies in it"):
+        with pytest.raises(ConfigError, match="the current folder is inside it"):
             run_fake(run, num_episodes=2, seed=1, overwrite=True)
     (run / ".git").mkdir()
     with pytest.raises(ConfigError, match="it is a repository"):
@@ -385,7 +385,7 @@ KEPT: dict[str, dict[str, str]] = {
         "thesis.tex": "it is not a recording",
         "thesis": "it is a folder",
         "link_to_thesis": "it is a folder",
-        "link_to_nothing": "a link to something that is not there",
+        "link_to_nothing": "a link whose target is missing",
         "broken.mcap": "needs a different name from the damaged one",
         "lock.mcap": "lock.mcap",
     },
@@ -394,7 +394,7 @@ KEPT: dict[str, dict[str, str]] = {
         "thesis.rrd": "it is not a Rerun file",
         "link.rrd": "this command reads it",
         "folder.rrd": "it is a folder",
-        "dangling.rrd": "a link to something that is not there",
+        "dangling.rrd": "a link whose target is missing",
         "lock.rrd": "lock.rrd",
     },
     "view alone.mcap --screenshot": {
@@ -402,7 +402,7 @@ KEPT: dict[str, dict[str, str]] = {
         "link.png": "this command reads it",
         "lock.png": "lock.png",
     },
-    "view dataset --screenshot": {FRAME: "it lies in what this command reads"},
+    "view dataset --screenshot": {FRAME: "it is inside an input of this command"},
     "report alone.mcap --out": {
         "thesis.html": "it is not a report",
         "link.html": "this command reads it",

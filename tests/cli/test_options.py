@@ -91,7 +91,7 @@ def test_targets_that_cannot_be_made(
     Path("link").symlink_to("nothing")
     reasons = {
         "": "One of the paths is empty",
-        "link": "is a link to something that is not there",
+        "link": "is a link whose target is missing",
         "x" * 300: "File name too long",
         "file/below": "Not a directory",
         "bytes\udcff": "has bytes that are not UTF-8",

@@ -82,7 +82,7 @@ def test_another_request_is_refused(
     before = files_of(out)
     capsys.readouterr()
     assert exit_code(*same, *other) == 2
-    assert "is there already" in capsys.readouterr().err
+    assert "exists already" in capsys.readouterr().err
     another = run / "episodes" / "episode_000001.mcap"
     assert exit_code("render", another, "--out", out / source.name, "--looks", 1) == 2
     assert files_of(out) == before

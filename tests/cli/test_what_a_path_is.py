@@ -61,7 +61,7 @@ ODD: tuple[tuple[Callable[[Path], None], str], ...] = (
     (make_fifo, "This is a FIFO, no file and no folder"),
     (make_socket, "This is a socket, no file and no folder"),
     (make_device, "This is a device, no file and no folder"),
-    (make_dangling, "This is a link to something that is not there"),
+    (make_dangling, "This is a link whose target is missing"),
     (make_loop, "This cannot be read (Too many levels of symbolic links)"),
     (make_empty_folder, "The folder holds no recording (*.mcap), run (run.json) or dataset (meta/info.json)"),
     (make_nothing, "There is no such file or folder"),

@@ -99,7 +99,7 @@ def test_the_same_recordings_give_the_same_bytes(exporter: str, run: Path, tmp_p
 def test_a_dataset_is_replaced_only_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, episodes="0")
     before = content_of(tmp_path / "d")
-    with pytest.raises(ConfigError, match="is there already"):
+    with pytest.raises(ConfigError, match="exists already"):
         export(run, tmp_path / "d", exporter)
     assert content_of(tmp_path / "d") == before
     assert export(run, tmp_path / "d", exporter, overwrite=True).num_episodes == 3

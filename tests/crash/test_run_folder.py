@@ -152,7 +152,7 @@ def test_a_lock_that_is_no_file_is_told(tmp_path: Path, reference: RunResult, ma
     (out / ".lock").unlink()
     make(out / ".lock")
     before = (out / "run.json").read_bytes()
-    with pytest.raises(ConfigError, match=r"The lock of the output folder is no file: remove it.*\.lock"):
+    with pytest.raises(ConfigError, match=r"The lock of the output folder is not a file: remove it.*\.lock"):
         run_fake(out)
     assert (out / "run.json").read_bytes() == before
 

@@ -72,8 +72,8 @@ def _raised(code: str) -> Exception:
     ("code", "words"),
     [
         ("{}['fps']", "it has no 'fps'"),
-        ("json.loads('{')", "it is no JSON, line 1"),
-        ("b'\\xff'.decode()", "it is no UTF-8 text"),
+        ("json.loads('{')", "it is not valid JSON, line 1"),
+        ("b'\\xff'.decode()", "it is not UTF-8 text"),
         ("struct.unpack('<Q', b'ab')", "it ends within a value"),
         ("len(5)", "a value is of another kind than expected"),
         ("None.items()", "a value is of another kind than expected"),

@@ -142,7 +142,7 @@ def test_a_file_that_somebody_has_added_to_is_not_replaced(run: Path, tmp_path: 
     with h5py.File(target, "a") as file:
         file[addition] = np.arange(5)
     before = target.read_bytes()
-    with pytest.raises(ConfigError, match=f"what is not part of .*{addition}"):
+    with pytest.raises(ConfigError, match=f"files that are not part of .*{addition}"):
         export(run, target, "hdf5", **options)
     assert target.read_bytes() == before
 
@@ -158,7 +158,7 @@ def test_a_file_with_a_note_or_a_link_of_somebody_is_not_replaced(run: Path, tmp
             else:
                 file[place][word] = h5py.SoftLink("/data/demo_0/actions")
         before = target.read_bytes()
-        with pytest.raises(ConfigError, match=f"what is not part of .*{word}"):
+        with pytest.raises(ConfigError, match=f"files that are not part of .*{word}"):
             export(run, target, "hdf5", overwrite=True)
         assert target.read_bytes() == before
 

@@ -135,7 +135,7 @@ def test_a_card_that_nobody_has_touched_is_replaced_in_silence(run: Path) -> Non
 def test_a_link_to_nothing_is_told(run: Path) -> None:
     shutil.rmtree(run / "dataset")
     (run / "dataset").symlink_to(run / "nowhere")
-    with pytest.raises(ConfigError, match="a link to something that is not there"):
+    with pytest.raises(ConfigError, match="a link whose target is missing"):
         export_run(run, repo_id="me/cubes")
     assert (run / "dataset").is_symlink()
 

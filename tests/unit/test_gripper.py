@@ -23,8 +23,8 @@ def test_each_kind_of_gripper_is_read_as_it_was_written(name: str, has: dict[str
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        ({"force": "strong"}, "'strong' is no number"),
-        ({"force": None}, "is no number"),
+        ({"force": "strong"}, "'strong' is not a number"),
+        ({"force": None}, "is not a number"),
         ({"max_widht": 0.1}, "extra fields found"),
     ],
 )

@@ -70,7 +70,7 @@ def test_things_of_another_kind_are_refused_and_not_called(name: str) -> None:
 
 def test_a_class_is_no_instance_of_itself() -> None:
     assert NUMBERS.load("math:pi", ["math"]) == pytest.approx(3.14159, abs=1e-5)
-    with pytest.raises(ConfigError, match=r"is no number: it must be an instance of numbers\.Number"):
+    with pytest.raises(ConfigError, match=r"is not a number: it must be an instance of numbers\.Number"):
         NUMBERS.load("fractions:Fraction", ["fractions"])
 
 

@@ -75,7 +75,7 @@ def _refuse(reason: str, data: bytes) -> Values:
 def _decode_json(data: bytes) -> Values:
     value = parse_json(data.decode(), allow_nan=True)
     if not isinstance(value, dict):
-        raise ValueError("it is no JSON object")
+        raise ValueError("it is not a JSON object")
     values: Values = _array_of(value)
     return values
 

@@ -44,7 +44,7 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:
-        raise ConfigError(f"The mapping is no valid TOML ({describe_error(error)}): {path}") from error
+        raise ConfigError(f"The mapping is not valid TOML ({describe_error(error)}): {path}") from error
     if problems := list(islice(_unknown_keys(data, SourceMapping, "", kind), MAX_LISTED)):
         for other in _KINDS:
             if not any(_unknown_keys(data, SourceMapping, "", other)):
