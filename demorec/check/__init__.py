@@ -1,1 +1,3 @@
-"""Is a recording what it says? One check per function, each with its limits; none needs the simulator."""
+"""Check the integrity of recordings, runs and datasets. One check per function, each with its limits; none needs the
+simulator.
+"""

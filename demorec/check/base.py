@@ -1,7 +1,7 @@
 """A check: one function that measures one quantity, with the limits that judge it.
 
-A check returns the worst value and its place. The limits turn the value into pass, warn or fail, so a report shows
-what was found and what is allowed, and `demorec list checks` prints the limits beforehand. Larger values are worse.
+A check returns the worst value and its place. The limits turn the value into pass, warn or fail, so that a report shows
+both the value and the limit. `demorec list checks` prints the limits. Larger values are worse.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from demorec.core.geometry import Array
 
 Level = Literal["pass", "warn", "fail", "skip"]
 Form = Literal["simulated", "external", "run", "external run", "dataset"]
-"""What is checked: a recording that demorec simulated, one that it did not, a run of either, a LeRobot dataset."""
+"""Subject of a check: a simulated recording, an external one, a run of either, or a LeRobot dataset."""
 Group = Literal["file", "time", "images", "run", "import", "dataset"]
 ADVICE: Mapping[Group, tuple[str, str]] = {
     "file": ("The recording is damaged or incomplete.", "demorec recover {path}, or record it again"),
-    "time": ("Streams are not where their frames are.", "record it again: the file was changed, or written wrongly"),
+    "time": ("Streams and frames do not match.", "record it again: the file was changed, or written wrongly"),
     "images": ("Images are missing or damaged.", "record it again, or leave it out"),
-    "run": ("The run is not what its run.json states.", "run the command that began it again, or restore the files"),
-    "import": ("The run lacks what was lost, or has it at another time.", "look at it: demorec view {path}"),
-    "dataset": ("The dataset is not what was exported.", "export it again"),
+    "run": ("The run differs from its run.json.", "run the command that began it again, or restore the files"),
+    "import": ("The run lacks lost data, or has it at another time.", "look at it: demorec view {path}"),
+    "dataset": ("The dataset differs from the export.", "export it again"),
 }
 """Group -> why a fault matters, and what to do."""
 
-BLOCKED = "it needs what is damaged"
+BLOCKED = "it needs a damaged part"
 NOTHING = "nothing to measure"
 
 SCENE = "a simulated scene"
@@ -41,12 +41,12 @@ SCENE = "a simulated scene"
 
 @dataclass(frozen=True, kw_only=True)
 class Measurement:
-    """What a check found.
+    """Result of a measurement.
 
     Attributes:
         value: The worst value, in the check's unit.
-        frame: Where it was found; None when it belongs to no frame.
-        detail: What exactly (which joint, topic, camera, file), for people.
+        frame: Frame of that value; None if it belongs to no single frame.
+        detail: Description for people (which joint, topic, camera or file).
     """
 
     value: float
@@ -56,17 +56,17 @@ class Measurement:
 
 @dataclass(frozen=True, kw_only=True)
 class NotMeasured:
-    """That a check cannot judge its subject.
+    """A check that cannot judge its subject.
 
     Attributes:
-        why: For people: "too few frames", or what is missing.
+        why: Reason for people: "too few frames", or the missing data.
     """
 
     why: str
 
 
 Found = Measurement | NotMeasured | None
-"""The result of a check; None where the thing does not exist (no cameras, no depth)."""
+"""Result of a check; None if it does not apply (no cameras, no depth)."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -103,12 +103,12 @@ class Check:
 
     @property
     def do(self) -> str:
-        """What to do; `{path}` stands for the file."""
+        """Remedy; `{path}` is a placeholder for the file."""
         return ADVICE[self.group][1]
 
     @property
     def page(self) -> str:
-        """Its explanation, for people."""
+        """Explanation for people."""
         return f"{inspect.cleandoc(self.measure.__doc__ or '')}\n\n{self.summary}."
 
     @property
@@ -120,10 +120,11 @@ class Check:
         return f"{self.group}, needs {self.needs}: {self.measures}; {warns}{fails}"
 
     def run(self, subject: object) -> Result:
-        """Measure and judge; an error while reading or computing is a failure of this check, a missing package is none.
+        """Measure and judge; an error while reading or computing is a failure of this check, but a missing package is
+        not.
 
         Raises:
-            ResourceError: This machine cannot measure it, which says nothing about the subject.
+            ResourceError: The machine lacks resources; this implies nothing about the subject.
         """
         try:
             found = self.measure(subject)
@@ -134,9 +135,9 @@ class Check:
                 raise lack from error
             if isinstance(error, DemorecError):
                 return self._result("fail", Measurement(value=math.nan, detail=str(error)))
-            # What is broken in a way that nobody foresaw must not take the other checks' findings with it.
+            # An unforeseen fault must not discard the findings of other checks.
             logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
-            odd = Measurement(value=math.nan, detail="the data are such that this check cannot be computed on them")
+            odd = Measurement(value=math.nan, detail="this check cannot be computed on these data")
             return self._result("fail", odd)
         if found is None:
             return self.skipped(NOTHING)
@@ -146,7 +147,7 @@ class Check:
         return self._result(level, found)
 
     def skipped(self, why: str) -> Result:
-        """The result of a check that could not be run."""
+        """Result of a check that could not be run."""
         return self._result("skip", Measurement(value=math.nan, detail=why))
 
     def _result(self, level: Level, found: Measurement) -> Result:
@@ -167,14 +168,14 @@ class Check:
 
 @dataclass(frozen=True, kw_only=True)
 class Result:
-    """A check's judgement of one subject.
+    """Judgement of one subject by a check.
 
     Attributes:
-        check, group, unit, warn, fail: As in `Check`.
-        level: "skip" where there was nothing to measure.
-        value: What was found; None when nothing could be measured, or it is beyond all numbers.
-        frame, detail: As in `Measurement`.
-        why, do: Why it matters, and what to do; `{path}` stands for the file.
+        check, group, unit, warn, fail: See `Check`.
+        level: "skip" if there was nothing to measure.
+        value: The measured value; None if nothing could be measured or it is not finite.
+        frame, detail: See `Measurement`.
+        why, do: Why it matters, and what to do; `{path}` is a placeholder for the file.
     """
 
     check: str
@@ -191,12 +192,12 @@ class Result:
 
     @property
     def allowed(self) -> float:
-        """The limit that the value is reported with: the one that a failure or a warning broke."""
+        """Limit to report with the value: the one that a failure or a warning exceeded."""
         return self.fail if self.level == "fail" else self.warn
 
     @property
     def is_blocked(self) -> bool:
-        """Whether nothing was measured since what it needs is damaged, which another check tells."""
+        """Whether nothing was measured because a required part is damaged, which another check reports."""
         return self.level == "skip" and self.detail == BLOCKED
 
 
@@ -211,9 +212,10 @@ def check(
     needs: str = SCENE,
     needs_images: bool = False,
 ) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
-    """Make a `Check` of a function; its name is the function's. A generator is judged by the `worst` it yields.
+    """Decorate a function as a `Check` with the function's name. A generator is judged by the `worst` value that it
+    yields.
 
-    Without `fail` there are no warnings, and without any limit nothing above zero passes.
+    Warnings need `fail`; without any limit only zero passes.
     """
 
     def wrap(function: Callable[[Any], Found | Iterator[Found]]) -> Check:
@@ -240,15 +242,15 @@ def check(
 
 file_check = partial(check, group="file", on=("simulated", "external"), needs="a recording")
 time_check = partial(check, group="time")
-external_check = partial(check, on=("external",), needs="own timestamps of each sample")
+external_check = partial(check, on=("external",), needs="a timestamp for each sample")
 run_check = partial(check, group="run", on=("run",), needs="a run of simulated episodes")
 dataset_check = partial(check, group="dataset", on=("dataset",), needs="a LeRobot dataset")
 
 
 def worst(*found: Found) -> Found:
-    """The measurement of the largest value (a NaN counts as largest), which names what was not measured beside it.
+    """Measurement with the largest value (a NaN counts as largest), including the reasons for missing measurements.
 
-    Where nothing was measured: why not, or None when there is nothing.
+    If nothing was measured, the reason, or None if nothing applies.
     """
     known = [measurement for measurement in found if isinstance(measurement, Measurement)]
     reasons = list(dict.fromkeys(row.why for row in found if isinstance(row, NotMeasured)))
@@ -261,7 +263,7 @@ def worst(*found: Found) -> Found:
 
 
 def worst_frame(error: Array, detail: str) -> Measurement | None:
-    """The largest of (T,) values and its frame; None without a value that is not NaN."""
+    """Largest of (T,) values and its frame; None if all are NaN."""
     if not np.isfinite(error).any():
         return None
     frame = int(np.nanargmax(error))
@@ -269,5 +271,5 @@ def worst_frame(error: Array, detail: str) -> Measurement | None:
 
 
 def counted(wrong: Sequence[str], good: str = "") -> Measurement:
-    """The number of faults and the first three by name, or `good` where there is none."""
+    """Number of faults and the first three by name, or `good` if there are none."""
     return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or good)

@@ -1,4 +1,4 @@
-"""A LeRobot dataset as its checks see it."""
+"""A LeRobot dataset for its checks."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ Rows = Mapping[str, NDArray[Any]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DescribedEpisode:
-    """A simulated episode of a dataset with its row of the sidecar.
+    """A simulated episode of a dataset, with its row of the sidecar.
 
     Attributes:
         number: Its `episode_index`.
         rows: Feature -> (T, D).
         kept: Its row of the sidecar.
-        info: What was known before its first frame.
+        info: Metadata known before its first frame.
     """
 
     number: int
@@ -43,11 +43,11 @@ class DescribedEpisode:
 
 
 class CheckedDataset:
-    """A LeRobot dataset, opened for its checks; properties raise ExportError where the files do not give them.
+    """A LeRobot dataset, opened for its checks; properties raise ExportError for missing data.
 
     Args:
         path: Its folder.
-        motors: The servos whose values its state and actions are, if the user says so.
+        motors: Servos whose values are the state and action, if the user names them.
         named: Features whose role the user names.
     """
 
@@ -75,12 +75,12 @@ class CheckedDataset:
 
     @property
     def rows(self) -> Mapping[int, Rows]:
-        """Number of an episode -> feature -> (T, D), of the episodes whose rows can be read."""
+        """Episode number -> feature -> (T, D), for the episodes with readable rows."""
         return self._rows_and_errors[0]
 
     @property
     def unreadable(self) -> Mapping[int, str]:
-        """Number of an episode -> why its rows cannot be read."""
+        """Episode number -> reason why its rows cannot be read."""
         return self._rows_and_errors[1]
 
     @cached_property
@@ -106,18 +106,20 @@ class CheckedDataset:
 
     @cached_property
     def sidecar(self) -> list[dict[str, Any]]:
-        """The rows that demorec keeps of each episode; empty for a dataset of another writer."""
+        """The sidecar's rows for the episodes; empty for a dataset of another writer."""
         return self.folder.sidecar([name for name in EPISODE_SCHEMA.names if name != "episode_index"])
 
     def check_simulated(self) -> None:
-        """Raise ConfigError for a dataset of external episodes, which no simulator can make or replay."""
+        """Raise ConfigError for a dataset of external episodes, which cannot be simulated or replayed."""
         if any(row["episode_info"] is None for row in self.sidecar):
             raise ConfigError(
                 f"The episodes of this dataset were recorded by another robot or program and have no scene: {self.path}"
             )
 
     def described(self) -> list[DescribedEpisode]:
-        """The simulated episodes that the sidecar describes, in order; LeRobot's `resume` adds some without."""
+        """Simulated episodes that the sidecar describes, in order; LeRobot's `resume` adds episodes without a
+        description.
+        """
         found = []
         for row in self.sidecar:
             number = row["episode_index"]

@@ -1,4 +1,4 @@
-"""A recording as the checks see it: everything is read once, when the first check asks for it."""
+"""A recording for its checks: each part is read once, when the first check needs it."""
 
 from __future__ import annotations
 
@@ -32,15 +32,15 @@ _STAMP_FIRST = {
 """Types whose first field is a timestamp, alone or in a header."""
 _STAMP = struct.Struct("<iI")
 _STAMP_OFFSET = 4
-"""Bytes of CDR's head before the first field."""
+"""Size of the CDR header before the first field, in bytes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TopicScan:
-    """The messages of one topic, in the order of the file.
+    """Messages of one topic, in file order.
 
     Attributes:
-        schema: Its type.
+        schema: Its message type.
         time_ns: (N,) time of each message.
         stamp_ns: (N,) timestamp inside each message; None for types without one.
     """
@@ -51,11 +51,11 @@ class TopicScan:
 
 
 class CheckedEpisode(ExitStack):
-    """One recording, closed at the end of a `with`. Properties raise RecordingError where the file does not give them.
+    """One recording, closed at the end of a `with`. Properties raise RecordingError for missing data.
 
     Args:
         path: The recording.
-        colours: Whether colour images are decoded by the check of images.
+        colours: Whether the image check decodes colour images.
     """
 
     def __init__(self, path: Path, *, colours: bool = True) -> None:
@@ -76,28 +76,28 @@ class CheckedEpisode(ExitStack):
 
     @cached_property
     def form(self) -> Form:
-        """By whether there is a scene; one that cannot be opened counts as simulated."""
+        """Simulated if there is a scene; a recording that cannot be opened counts as simulated."""
         with suppress(RecordingError):
             return "simulated" if self.recording.info.simulation is not None else "external"
         return "simulated"
 
     @cached_property
     def frame_times(self) -> NDArray[np.int64]:
-        """(T,) ns: when each frame ought to be."""
+        """(T,) nominal time of each frame, ns."""
         return frame_times(self.recording.num_frames, self.recording.info.fps)
 
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
-        """Every message of every topic, read once: every chunk's checksum is verified on the way."""
+        """Every message of every topic, read once; this verifies every chunk's checksum."""
         return _scan_topics(self.container)
 
     @cached_property
     def container(self) -> Container:
-        """The file's messages and metadata as they are."""
+        """Unprocessed messages and metadata of the file."""
         return self.enter_context(closing(Container(self.path)))
 
     def undecoded(self) -> tuple[int, list[tuple[str, str]]]:
-        """How many streams of images were decoded, and (camera, problem) of each that does not decode to its end."""
+        """Number of decoded image streams, and (camera, problem) of each that does not decode completely."""
         recording = self.recording
         streams: list[tuple[str, Callable[[str], Iterator[Any]]]] = []
         if self._colours:
@@ -118,7 +118,7 @@ class CheckedEpisode(ExitStack):
 
 
 def _scan_topics(container: Container) -> dict[str, TopicScan]:
-    """Read all messages by topic, and all attachments; the checksum of every chunk is verified on the way."""
+    """Read all messages by topic, and all attachments; this verifies every chunk's checksum."""
     schemas = {name: container.schemas[channel.schema_id].name for name, channel in container.channels.items()}
     times: dict[str, list[int]] = defaultdict(list)
     stamps: dict[str, list[int]] = defaultdict(list)
@@ -139,7 +139,7 @@ def _scan_topics(container: Container) -> dict[str, TopicScan]:
 
 
 def _stamp_ns(data: bytes) -> int:
-    """The first field of a message; -1 for one that is too short."""
+    """First field of a message; -1 for a message that is too short."""
     if len(data) < _STAMP_OFFSET + _STAMP.size:
         return -1
     seconds, nanoseconds = _STAMP.unpack_from(data, _STAMP_OFFSET)

@@ -1,6 +1,6 @@
 """Checks of a recording's file: index, checksums, topics, messages, and the times of every stream.
 
-The streams of recordings that demorec did not simulate have clocks of their own.
+External recordings have a separate clock for each stream.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ def opens(episode: CheckedEpisode) -> Measurement:
 
 
 @file_check(
-    measures="damaged chunks, and messages unlike the index",
+    measures="damaged chunks, and messages that differ from the index",
 )
 def checksums(episode: CheckedEpisode) -> Measurement:
     """Verify the checksum of every chunk and attachment, and the counts of the index."""
     counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
     wrong = [
-        f"{topic}: {counts[topic]}, index says {count}"
+        f"{topic}: {counts[topic]}, the index has {count}"
         for topic, (_, count) in episode.recording.topics.items()
         if counts[topic] != count
     ]
@@ -51,7 +51,7 @@ def checksums(episode: CheckedEpisode) -> Measurement:
     measures="topics that are missing or of another type",
 )
 def topics(episode: CheckedEpisode) -> Measurement:
-    """Find the streams that the metadata lists: each of its type, with one message for each frame."""
+    """Find the streams that the metadata lists: each with its type and one message per frame."""
     num_frames = episode.recording.num_frames
     expected: dict[str, tuple[str, int | None]] = {}
     for stream in episode.recording.streams:
@@ -67,7 +67,7 @@ def topics(episode: CheckedEpisode) -> Measurement:
         elif found.schema != schema:
             wrong.append(f"{topic} is {found.schema}, expected {schema}")
         elif topic == channels.JOINT_STATES:
-            # There may be more joint states than frames, but one at each frame.
+            # There may be more joint states than frames, but each frame needs one.
             missing = num_frames - len(set(found.time_ns.tolist()) & set(episode.frame_times.tolist()))
             if missing:
                 wrong.append(f"{topic} lacks {missing} frames")
@@ -105,13 +105,13 @@ def readable(episode: CheckedEpisode) -> Measurement:
     fail=1,
 )
 def complete(episode: CheckedEpisode) -> Measurement:
-    """Look for the outcome that ends a recording."""
+    """Check for the outcome at the end of a recording."""
     cut = episode.recording.outcome is None
     return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")
 
 
 @time_check(
-    measures="messages that are not at their frame's time",
+    measures="messages away from their frame's time",
     unit="ms",
 )
 def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
@@ -120,17 +120,17 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
     for topic in (stream.topic for stream in episode.recording.streams if stream.topic in episode.scan):
         times = episode.scan[topic].time_ns
         if topic == channels.JOINT_STATES and len(times) != len(expected):
-            times = times[np.isin(times, expected)]  # others are between the frames
+            times = times[np.isin(times, expected)]  # the others are between frames
         count = min(len(times), len(expected))
         yield worst_frame(np.abs(times[:count] - expected[:count]) / 1e6, topic)
 
 
 @time_check(
-    measures="messages whose own stamp differs from their time",
+    measures="messages whose header timestamp differs from their log time",
     unit="ms",
 )
 def stamps(episode: CheckedEpisode) -> Iterator[Found]:
-    """Compare the timestamp in each message's header, which ROS tools use, with the time at which it was logged."""
+    """Compare the timestamp in each message's header, which ROS tools use, with its log time."""
     for topic, scan in episode.scan.items():
         if scan.stamp_ns is None or not len(scan.time_ns):
             continue
@@ -144,7 +144,7 @@ def stamps(episode: CheckedEpisode) -> Iterator[Found]:
     measures="images that are missing or far from a keyframe",
 )
 def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
-    """Count the encoded images of each camera: one a frame, at the frame's time, with a keyframe in every GOP."""
+    """Count each camera's encoded images: one per frame, at the frame's time, with a keyframe in every GOP."""
     expected = episode.frame_times
     for camera in episode.recording.info.simulated.scene.cameras:
         settings = episode.recording.video_settings(camera.name)
@@ -173,7 +173,7 @@ def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
     fail=0.5,
 )
 def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
-    """Count the frames without an image, of each camera."""
+    """Count the frames of each camera without an image."""
     for camera, numbers in subject.recording.table().images.items():
         without = np.flatnonzero(numbers == NO_IMAGE)
         if len(numbers):

@@ -1,4 +1,4 @@
-"""Check that all images of a recording decode: colours, distances and labels."""
+"""Check that all images of a recording decode: colour, depth and labels."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from demorec.check.episode import CheckedEpisode
     needs_images=True,
 )
 def images_decode(subject: CheckedEpisode) -> Measurement | None:
-    """Decode every image: colours, distances and labels."""
+    """Decode every image: colour, depth and labels."""
     cameras, wrong = subject.undecoded()
     if not cameras:
         return None

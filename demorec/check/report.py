@@ -19,20 +19,20 @@ from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
 from demorec.runs.run_file import DATASET
 
 _WORTH_PROCESSES = {"with images": 4, "without": 50}
-"""Recordings from which on several processes check faster than one: each takes seconds to start."""
+"""Minimum number of recordings for several processes to be faster than one: each takes seconds to start."""
 SubjectKind = Literal["recording", "run", "dataset"]
 _SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
 @dataclass(frozen=True, kw_only=True)
 class CheckOptions:
-    """Which checks are run.
+    """Selection of checks.
 
     Attributes:
         images: Whether images are decoded.
-        colours: Whether colour images are among them: the doctor decodes them, too.
+        colours: Whether colour images are decoded, too; the doctor also decodes them.
         only: Names of checks; empty for all.
-        workers: Processes; 1 works in this one.
+        workers: Number of processes; 1 runs in this process.
     """
 
     images: bool = True
@@ -47,7 +47,7 @@ class CheckOptions:
         check_option("workers", self.workers, 1, 1024)
 
     def checks(self, *forms: Form) -> list[Check]:
-        """Those of some forms, in the order of the table."""
+        """Selected checks of some forms, in table order."""
         wanted = set(forms)
         return [
             check for check in _all_checks() if wanted & set(check.on) and (not self.only or check.name in self.only)
@@ -64,8 +64,8 @@ class Subject:
     """Something to check.
 
     Attributes:
-        path: Where it is.
-        kind: What it is.
+        path: Its path.
+        kind: Its kind.
     """
 
     path: Path
@@ -77,30 +77,30 @@ class SubjectReport(Subject):
     """All results about one subject.
 
     Attributes:
-        results: In the order of the table.
+        results: Results in table order.
     """
 
     results: tuple[Result, ...]
 
     @property
     def level(self) -> Level:
-        """The worst; "skip" where nothing was measured."""
+        """The worst level; "skip" if nothing was measured."""
         return max((result.level for result in self.results), key=lambda level: _SEVERITY[level], default="skip")
 
     def is_bad(self, *, strict: bool = False) -> bool:
-        """Whether a check failed, or with `strict` warned."""
+        """Whether a check failed or, with `strict`, warned."""
         return _SEVERITY[self.level] >= _SEVERITY["warn" if strict else "fail"]
 
     def count(self, level: Level) -> int:
-        """How many results have a level."""
+        """Count the results with a level."""
         return sum(result.level == level for result in self.results)
 
 
 def find_subjects(paths: Sequence[Path]) -> list[Subject]:
-    """Recordings, runs (with their recordings and their dataset) and datasets, in order, each once.
+    """Find recordings, runs (with their recordings and dataset) and datasets, in order, each once.
 
     Raises:
-        ConfigError: A path is missing or holds nothing that can be checked.
+        ConfigError: A path is missing or holds nothing to check.
     """
     found: list[Subject] = []
     for path in paths:
@@ -120,19 +120,19 @@ def find_subjects(paths: Sequence[Path]) -> list[Subject]:
 
 
 def useful_workers(subjects: Sequence[Subject], *, images: bool, cores: int) -> int:
-    """How many processes check fastest: one for each core, or one where that many do not pay."""
+    """Return the fastest number of processes: one per core, or one if several do not pay off."""
     count = sum(subject.kind == "recording" for subject in subjects)
     return cores if count >= _WORTH_PROCESSES["with images" if images else "without"] else 1
 
 
 def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterator[SubjectReport]:
-    """One report for each subject, in order."""
+    """Yield one report per subject, in order."""
     if options.workers == 1 or len(subjects) < 2:
         for subject in subjects:
             yield check_subject(subject, options)
         return
     with process_pool(min(options.workers, len(subjects))) as pool:
-        # Datasets take longest: they begin first.
+        # Datasets take longest, so they start first.
         order = sorted(subjects, key=lambda subject: subject.kind != "dataset")
         begun = {subject: pool.submit(check_subject, subject, options) for subject in order}
         for subject in subjects:
@@ -140,7 +140,7 @@ def check_subjects(subjects: Sequence[Subject], options: CheckOptions) -> Iterat
 
 
 def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
-    """All checks of one recording, run or dataset."""
+    """Run all checks of one recording, run or dataset."""
     if subject.kind == "recording":
         with CheckedEpisode(subject.path, colours=options.colours) as episode:
             found = _run(options, episode)
@@ -156,12 +156,12 @@ Checked = CheckedEpisode | CheckedDataset | CheckedRun
 
 
 def _within(path: Path, detail: str) -> str:
-    """The detail of a result without the path of its subject, which the report prints above it."""
+    """Remove the subject's path from a result's detail; the report prints it above."""
     return detail.removesuffix(f": {path}").replace(f"{path}/", "")
 
 
 def _run(options: CheckOptions, subject: Checked) -> list[Result]:
-    """Run the checks of a subject in order. One that fails for the same unreadable part as another is blocked."""
+    """Run the checks of a subject in order. A check that fails on the same unreadable part as another is blocked."""
     checks = [check for check in options.checks(subject.form) if options.images or not check.needs_images]
     results: list[Result] = []
     unreadable: set[str] = set()

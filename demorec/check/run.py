@@ -18,7 +18,7 @@ from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_externa
 
 _ANY_RUN: tuple[Form, ...] = ("run", "external run")
 _NOT_RECORDED = ("file", "seconds")
-"""What run.json has of an attempt that is not in its recording."""
+"""Keys of an attempt in run.json that are not in its recording."""
 
 
 class CheckedRun:
@@ -33,17 +33,17 @@ class CheckedRun:
 
     @cached_property
     def form(self) -> Form:
-        """Whether demorec simulated its episodes or others recorded them."""
+        """Whether its episodes are simulated or external."""
         return "external run" if is_external_run(self.path) else "run"
 
     @cached_property
     def run(self) -> RunFile:
-        """run.json; a DemorecError when it cannot be read."""
+        """Content of run.json; a DemorecError if it cannot be read."""
         return load_any_run_file(self.path)
 
     @property
     def attempts(self) -> list[Attempt]:
-        """Of the attempts that have a recording."""
+        """Attempts that have a recording."""
         run = self.run
         return [attempt for attempt in (run.attempts if run.generation is None else run.known) if attempt.file]
 
@@ -58,7 +58,7 @@ def run_files(run: CheckedRun) -> Measurement:
     """Compare the recordings with those that run.json lists, and their SHA-256."""
     listed = {attempt.file: attempt.sha256 for attempt in run.attempts}
     there = {str(path.relative_to(run.path)) for path in run.recordings}
-    hint = "" if run.run.is_complete else " yet; the command that began the run takes it in and goes on"
+    hint = "" if run.run.is_complete else " yet; the command that began the run adds it and continues"
     wrong = [f"{file} is missing" for file in sorted(listed.keys() - there)]
     wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - listed.keys())]
     for file in sorted(there & listed.keys()):
@@ -73,19 +73,21 @@ def run_files(run: CheckedRun) -> Measurement:
 
 
 @run_check(
-    measures="episodes that were asked for and are missing",
+    measures="requested episodes that are missing",
     on=_ANY_RUN,
     needs="a run",
     fail=math.inf,
 )
 def run_complete(run: CheckedRun) -> Measurement:
-    """Count what a generation or an import that was interrupted has still to do."""
+    """Count the remaining episodes of an interrupted generation or import."""
     return Measurement(value=run.run.num_missing, detail=run.run.unfinished)
 
 
 @run_check(measures="recordings that differ from run.json", on=_ANY_RUN, needs="a run")
 def run_agrees(run: CheckedRun) -> Measurement:
-    """Compare each recording with its line: number, attempt, seed, outcome, digest; and its config and versions."""
+    """Compare each recording with its line in number, attempt, seed, outcome and digest, and with the run's config and
+    versions.
+    """
     wrong = [text for attempt in run.attempts for text in _contradictions(run, attempt)]
     return counted(wrong, f"{len(run.attempts)} recordings")
 
@@ -96,7 +98,7 @@ def _contradictions(run: CheckedRun, attempt: Attempt) -> Iterator[str]:
     except (DemorecError, OSError) as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        return  # reported by the checks of that recording
+        return  # reported by that recording's checks
     listed = asdict(attempt)
     for name, value in asdict(recorded).items():
         if name not in _NOT_RECORDED and listed[name] != value:
@@ -106,7 +108,7 @@ def _contradictions(run: CheckedRun, attempt: Attempt) -> Iterator[str]:
 
 
 def _other_config(run: RunFile, info: EpisodeInfo) -> Iterator[str]:
-    """The values of a recording's config that differ from the run's, and "versions"."""
+    """Names of config values in a recording that differ from the run's, and "versions"."""
     config = to_plain(run.config)
     yield from (
         name

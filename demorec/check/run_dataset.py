@@ -1,4 +1,4 @@
-"""The dataset in a run's folder against the recordings that it comes from."""
+"""Check the dataset in a run's folder against the recordings that it was exported from."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from demorec.mcap import open_simulated
 from demorec.runs.run_file import DATASET
 
 _OF_THE_PLACE = ("episode_index", "source", "content_digest")
-"""What the sidecar keeps that is not of the recording."""
+"""Sidecar keys that do not come from the recording."""
 
 
-@run_check(measures="episodes of its dataset unlike the recordings")
+@run_check(measures="episodes of its dataset that differ from the recordings")
 def run_dataset(run: CheckedRun) -> Measurement | None:
     """Compare every number and encoded image of each episode with its recording, exported with the same options."""
     path = run.path / DATASET
@@ -33,7 +33,7 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
         return None
     dataset = CheckedDataset(path)
     if not dataset.sidecar or any(row["source"] is None for row in dataset.sidecar):
-        return Measurement(value=1, detail="the dataset does not state which recordings it comes from")
+        return Measurement(value=1, detail="the dataset does not name its source recordings")
     dataset.check_simulated()
     options = export_options(path)
     wrong = list(dict.fromkeys(dataset.unreadable.values()))
@@ -50,10 +50,10 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
 
 
 def export_options(dataset: Path) -> ExportOptions:
-    """With which a dataset was made, as far as they decide its episodes.
+    """Options with which a dataset was exported, as far as they decide its episodes.
 
     Raises:
-        ConfigError: It does not say so.
+        ConfigError: The dataset does not record them.
     """
     try:
         made = read_json(dataset / EXPORT_PATH)
@@ -70,7 +70,7 @@ def export_options(dataset: Path) -> ExportOptions:
         options.validate()
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise ConfigError(
-            f"The dataset does not say how it was exported ({describe_error(error)}): {dataset}"
+            f"The dataset does not record its export options ({describe_error(error)}): {dataset}"
         ) from error
     return options
 
@@ -78,7 +78,7 @@ def export_options(dataset: Path) -> ExportOptions:
 def episode_differences(
     recording_file: Path, options: ExportOptions, episode: DescribedEpisode, dataset: CheckedDataset
 ) -> Iterator[tuple[str, tuple[int, ...]]]:
-    """(what, in which frames) of an episode is not what a recording gives with the same options.
+    """Yield (feature, frames) for each difference between an episode and its recording exported with the same options.
 
     Raises:
         ExportError: A video of the dataset cannot be read.
@@ -88,7 +88,7 @@ def episode_differences(
         with open_simulated(recording_file) as recording:
             expected = ExportEpisode(recording, options)
             columns, record = expected.columns, EpisodeRecord.of(expected)
-            # Encoded again, images have the bytes of the version and machine that encoded them.
+            # The bytes of re-encoded images depend on the version and machine of the encoder.
             reasons = reasons_to_transcode(expected)
             recorded = recorded_videos(expected, [camera for camera, reason in reasons.items() if not reason])
     except RecordingError as error:
@@ -97,7 +97,7 @@ def episode_differences(
     except DemorecError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
-        yield f"its recording gives no such episode ({describe_error(error)})", ()
+        yield f"its recording cannot be exported as this episode ({describe_error(error)})", ()
         return
     place = dataset.folder.listed[episode.number]
     if place.tasks != (expected.info.instruction,):

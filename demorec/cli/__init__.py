@@ -1,8 +1,8 @@
-"""The command line: one file per command, `shared` for what they have in common, exit codes, errors as one sentence.
+"""The command line: one file per command, `shared` for common parts, exit codes, errors in one sentence.
 
-Exit codes: 0 done; 1 it did not work, a check failed, or data are damaged; 2 the request was wrong (an impossible
-option, a missing path, a target that is in the way); 130 interrupted.
-Modules of this package import heavy libraries inside `run` only, so that `--help` is quick.
+Exit codes: 0 success; 1 failure, a failed check, or damaged data; 2 an invalid request (an impossible option, a missing
+path, an existing target); 130 interrupted. Modules of this package import heavy libraries inside `run` only, so that
+`--help` is fast.
 """
 
 from __future__ import annotations
@@ -33,13 +33,13 @@ class Command(Protocol):
     """
 
     def run(self) -> int:
-        """Do it and return the exit code."""
+        """Run the command and return the exit code."""
 
 
 COMMANDS: Registry[type[Command]] = Registry(kind="command", rows=ExtensionRows("commands"))
 
 _LONGEST = 4000
-"""Of an error's sentence."""
+"""Maximum characters of an error message."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -57,7 +57,7 @@ def generate_dataset_main(argv: Sequence[str] | None = None) -> None:
 
 
 def _run_named(commands: Registry[type[Command]], args: Sequence[str], *, prog: str, about: str) -> int:
-    """Run the command that the first word names; without one, say what the program is about and list all of them."""
+    """Run the command named by the first word; without one, print the program's purpose and list all commands."""
     name = args[0] if args else ""
     if commands is COMMANDS:
         tell(*(f"{prog}: {problem}" for problem in extensions().problems))
@@ -72,7 +72,7 @@ def _run_named(commands: Registry[type[Command]], args: Sequence[str], *, prog: 
 
 def _run(commands: Registry[type[Command]], name: str, args: Sequence[str], *, prog: str) -> int:
     try:
-        command = commands.load(name)  # which may take a while
+        command = commands.load(name)  # may take a while
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")
         return 130
@@ -82,7 +82,7 @@ def _run(commands: Registry[type[Command]], name: str, args: Sequence[str], *, p
 
 
 def subcommands_of(command: type[Command]) -> Registry[type[Command]] | None:
-    """The commands of a group such as `demorec dataset`, which are the attribute `commands` of its class."""
+    """Commands of a group such as `demorec dataset`, from its class attribute `commands`."""
     found: Registry[type[Command]] | None = getattr(command, "commands", None)
     return found
 
@@ -92,7 +92,7 @@ def run_command(command: type[Command], args: Sequence[str], *, prog: str) -> in
     handler = logging.StreamHandler()
     handler.setFormatter(PrintableFormatter())
     logging.basicConfig(level=logging.WARNING, handlers=[handler])
-    logging.captureWarnings(True)  # so that Python's warnings, too, come through the formatter
+    logging.captureWarnings(True)  # so that Python's warnings are formatted, too
     return _reported(prog, lambda: parse(command, args, prog=prog).run())
 
 
@@ -102,7 +102,7 @@ def _print(lines: Sequence[str]) -> int:
 
 
 def _reported(prog: str, run: Callable[[], int]) -> int:
-    """Run a part of a program, turn its errors into one sentence, and return the exit code."""
+    """Run a part of a program, print its errors as one sentence, and return the exit code."""
     try:
         return run()
     except DemorecError as error:
@@ -111,10 +111,10 @@ def _reported(prog: str, run: Callable[[], int]) -> int:
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")
         return 130
-    except BrokenPipeError:  # the reader of the answer has left and wants no more words
+    except BrokenPipeError:  # the reader of the output has closed it
         return 1
     except Exception as error:
-        lack = resource_error(error) or _missing_package(error)  # memory and files may run out in any line
+        lack = resource_error(error) or _missing_package(error)  # any line may run out of memory or file descriptors
         if lack is None and (line := own_line(error)):
             kind = f"{type(error).__name__}: {error}".rstrip(": ")
             tell(f"{prog}: {_shortened(kind)} (the traceback is in {_keep_traceback()}); raised at {line}")
@@ -132,11 +132,11 @@ _DISTRIBUTIONS = {
     "ruamel": "ruamel-yaml",
     "fast_simplification": "fast-simplification",
 }
-"""Imported name -> name to install, where the two differ."""
+"""Import name -> package name, if they differ."""
 
 
 def _missing_package(error: Exception) -> DemorecError | None:
-    """Return the sentence for an import of a package that is not installed; None for any other error."""
+    """Return an error for an import of a package that is not installed; None for other errors."""
     if not isinstance(error, ModuleNotFoundError) or not error.name or error.name.startswith("demorec"):
         return None
     name = error.name.partition(".")[0]
@@ -145,12 +145,12 @@ def _missing_package(error: Exception) -> DemorecError | None:
 
 
 def _shortened(text: str) -> str:
-    """A sentence without its middle where it quotes a file at great length."""
+    """Shorten a sentence in the middle if it quotes a file at great length."""
     return text if len(text) <= _LONGEST else f"{text[: _LONGEST * 3 // 4]} ... {text[-_LONGEST // 4 :]}"
 
 
 def _keep_traceback() -> str:
-    """Where the traceback of the error that is being handled was written; its last line, when it cannot be."""
+    """Write the traceback of the current error and return its path, or its last line if it cannot be written."""
     text = traceback.format_exc()
     try:
         with tempfile.NamedTemporaryFile("w", prefix="demorec-error-", suffix=".txt", delete=False) as file:

@@ -1,4 +1,4 @@
-"""`demorec export`: recordings to a dataset."""
+"""`demorec export`: export recordings to a dataset."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from demorec.datasets.options import CommonOptions, ExportReport
 
 @dataclass(frozen=True, kw_only=True)
 class Export:
-    """Turn recordings into a dataset.
+    """Export recordings to a dataset.
 
-    The dataset appears whole or not at all; the recordings are never touched. The flags below apply to every format;
-    name a format in front of --help to see its own flags as well. `demorec list exporters` says what each makes.
+    The dataset appears complete or not at all; the recordings are never changed. The flags below apply to every format;
+    put a format before --help to see its own flags as well. `demorec list exporters` describes the formats.
 
     Examples:
       demorec export lerobot recordings/cubes --out cubes --repo-id me/cubes
@@ -61,21 +61,21 @@ class Export:
     """Folder or file to create."""
     mapping: MappingFile = None
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
-    """How to export."""
+    """Options of the export."""
 
     @classmethod
     def defaults(cls, args: Sequence[str]) -> Export:
-        """Nothing but the options of the format that the command line names."""
+        """Return the options of the format that the command line names."""
         required: Any = MISSING_NONPROP
         name = next((arg for arg in args if arg in EXPORTERS.rows), None)
         options = CommonOptions() if name is None else EXPORTERS.load(name).options()
         return cls(format=required, sources=required, out=required, options=options)
 
     def run(self) -> int:
-        """Export and say what came out."""
+        """Export and print a summary."""
         exporter = EXPORTERS.load(self.format)
         if type(self.options) is not exporter.options:
-            raise ConfigError(f"Name the format before everything else: demorec export {self.format} ...")
+            raise ConfigError(f"The format must come first: demorec export {self.format} ...")
         if not self.sources:
             raise ConfigError(
                 f"No recordings are given: name a run, e.g. demorec export {self.format} recordings/cubes."
@@ -106,9 +106,9 @@ def _summary_lines(report: ExportReport) -> Iterator[str]:
     if report.left_out:
         yield f"Left out, since the dataset does not have them: {', '.join(report.left_out)}."
     if report.depth_left_out:
-        yield f"Distances are left out unless --depth asks for them: camera {', '.join(report.depth_left_out)}."
+        yield f"Depth images are left out without --depth: camera {', '.join(report.depth_left_out)}."
     if report.silent:
-        yield f"No subtask is known, so none is written, in {', '.join(report.silent)}."
+        yield f"No subtasks are known, so none are written, for {', '.join(report.silent)}."
     yield from (f"Images re-encoded: camera {what}." for what in report.transcoded)
     if report.verified_frames:
         yield f"Verified: {report.verified_frames} frames read through LeRobot equal the recordings."

@@ -1,4 +1,4 @@
-"""`demorec generate`, also called `generate-dataset`: the main job."""
+"""`demorec generate`, also called `generate-dataset`: generate demonstrations."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 class Generate:
     """Generate demonstrations: simulate, record (MCAP), export (LeRobot), check.
 
-    Run the same command again to continue where it stopped. A larger --num-episodes extends the run; a smaller one
-    uses its first episodes and leaves the others where they are. The episodes depend on the episode options and the
-    seed alone: they are the same for any number of workers, any executor and any order.
+    Run the same command again to continue where it stopped. A larger --num-episodes extends the run; a smaller one uses
+    its first episodes and leaves the others in place. The episodes depend only on the episode options and the seed, not
+    on the number of workers, the executor or the order.
 
     Examples:
       generate-dataset --num-episodes 50 --out recordings/cubes
@@ -82,25 +82,27 @@ class Generate:
     """TOML file of options (num_episodes = 50); or a run's run.json, a dataset's folder or a recording, whose run is
     made again and compared with it."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that --config's run,
-    dataset or recording names."""
+    """Module or package of your own that may be imported for tasks, robots and cameras named by --config's run, dataset
+    or recording.
+    """
     options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
-    """How the run is carried out; does not affect the data."""
+    """Options of execution; they do not affect the data."""
     check: bool = True
-    """Check run, recordings and dataset at the end, without decoding images (demorec check does)."""
+    """Check run, recordings and dataset at the end, without decoding images (see demorec check)."""
     deep_every: int = 50
-    """At the end, make the first episode and one in N again from config and seed, and compare every number and image
-    with the recording (demorec check --deep does so for all); 0: none."""
+    """At the end, generate the first episode and one in N again from config and seed, and compare every number and
+    image with the recording (demorec check --deep: all episodes); 0: none.
+    """
     dry_run: bool = False
     """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
     view: bool = False
     """Show the episodes in Rerun as they are made."""
     episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)
-    """What determines the data."""
+    """Options that determine the data."""
 
     @classmethod
     def defaults(cls, args: Sequence[str]) -> Generate:
-        """Read the defaults of the flags from the file of options that --config names, if it does."""
+        """Read the flags' defaults from the options file of --config, if any."""
         path = config_path(args)
         if path is None or _is_original(path):
             return cls()
@@ -115,8 +117,8 @@ class Generate:
         episodes.validate()
         options.validate()
         if self.deep_every < 0:
-            raise ConfigError(f"deep-every is {self.deep_every}, allowed are 0 (none) and more.")
-        name = episodes.task.rpartition(":")[2]  # of somebody else's "package.module:Name", its name
+            raise ConfigError(f"deep-every is {self.deep_every}, allowed are 0 (none) or more.")
+        name = episodes.task.rpartition(":")[2]  # the name in the user's "package.module:Name"
         options = replace(
             options,
             out=options.out or Path("recordings") / name,
@@ -171,8 +173,8 @@ class Generate:
         """Read the run, dataset or recording that --config names; None without one.
 
         Raises:
-            ConfigError: It cannot be made again, or flags ask for other episodes or for modules of nothing.
-            NotAllowedError: It names something of a module that is not allowed.
+            ConfigError: It cannot be generated again, or flags ask for other episodes or allow unneeded modules.
+            NotAllowedError: It names an object of a module that is not allowed.
         """
         if self.config is None or not _is_original(self.config):
             if self.allow:
@@ -186,7 +188,7 @@ class Generate:
         if different := plain_differences(default, asked):
             flags = [f"--{line.partition(' is ')[0].split()[-1].replace('_', '-')}" for line in different]
             raise ConfigError(
-                f"--config makes the episodes of {self.config} again as they are: leave out {', '.join(flags)}."
+                f"--config generates the episodes of {self.config} again unchanged: leave out {', '.join(flags)}."
             )
         original = read_original(self.config)
         original.config.check_names(allowed_modules(self.allow))
@@ -194,18 +196,18 @@ class Generate:
 
 
 def _is_original(path: Path) -> bool:
-    """Check whether --config names something to be made again, and not a TOML file of options."""
+    """Check whether --config names a run, dataset or recording and not a TOML file of options."""
     return path.is_dir() or path.name == RUN_NAME or path.suffix == ".mcap"
 
 
 def _prepare_comparison(original: Original, out: Path) -> None:
-    """Refuse to write into the original, and print in which versions it differs from what is here."""
+    """Refuse to write into the original, and print its versions that differ from the installed ones."""
     from demorec.core.config import deciding_versions
     from demorec.core.own_versions import version_differences
     from demorec.core.replacing import use_as_source
 
     if overlap := use_as_source(out.resolve(), [original.source]):
-        raise ConfigError(f"The copy needs a place of its own, but {overlap}: choose another --out: {out}")
+        raise ConfigError(f"The copy needs a separate folder, but {overlap}: choose another --out: {out}")
     here = deciding_versions(original.config)
     different = dict.fromkeys(line for there in original.versions for line in version_differences(there, here))
     if different:
@@ -213,9 +215,9 @@ def _prepare_comparison(original: Original, out: Path) -> None:
 
 
 class RunProgress(RunObserver, Closing):
-    """How a run goes, one bar after another; a context manager.
+    """Progress of a run, one bar after another; a context manager.
 
-    `watch` is called with every attempt that has ended.
+    `watch` is called with every finished attempt.
     """
 
     def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
@@ -225,31 +227,31 @@ class RunProgress(RunObserver, Closing):
         self._failed = 0
 
     def close(self) -> None:
-        """Take the last bar off the terminal."""
+        """Remove the last bar from the terminal."""
         if self._bar is not None:
             self._bar.close()
 
     def verifying(self, done: int, total: int) -> None:
-        """Recordings that are there already are being verified."""
+        """Show the verification of existing recordings."""
         self._show("verifying", total).set(done)
 
     def checking(self, done: int, total: int) -> None:
-        """Run, recordings and dataset are being checked."""
+        """Show the checks of run, recordings and dataset."""
         self._show("checking", total, unit="item").set(done)
 
     def exporting(self, done: int, total: int) -> None:
-        """Recordings are being exported."""
+        """Show the export of recordings."""
         self._show("exporting", total).set(done)
 
     def started(self, run: RunFile, workers: int) -> None:
-        """The work begins."""
+        """Show that the work begins."""
         self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
 
     def ended(self, attempt: Attempt) -> None:
-        """An attempt has come to its end."""
+        """Show that an attempt has ended."""
         if self._watch is not None:
             self._watch(attempt)
-        assert self._bar is not None  # `started` comes first
+        assert self._bar is not None  # `started` is called first
         if attempt.success:
             self._bar.advance()
         else:
@@ -257,7 +259,7 @@ class RunProgress(RunObserver, Closing):
             self._bar.note(counted(self._failed, "failed attempt"))
 
     def says(self, message: str) -> None:
-        """Something that a person should know."""
+        """Print a message for the user."""
         tell(message)
 
     def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
@@ -271,7 +273,7 @@ class RunProgress(RunObserver, Closing):
 
 @contextmanager
 def _viewer(folder: Path) -> Iterator[Callable[[Attempt], None]]:
-    """A window; what it gives hands finished attempts to it."""
+    """Open a viewer window; yields the function that sends finished attempts to it."""
     from demorec.view.live import LiveViewer
 
     with LiveViewer() as viewer:
@@ -279,7 +281,7 @@ def _viewer(folder: Path) -> Iterator[Callable[[Attempt], None]]:
 
 
 def config_path(args: Sequence[str]) -> Path | None:
-    """What --config names on a command line that has not been parsed yet."""
+    """Path after --config on a command line that has not been parsed yet."""
     for position, word in enumerate(args):
         if word == "--config" and position + 1 < len(args):
             return Path(args[position + 1])
@@ -289,10 +291,10 @@ def config_path(args: Sequence[str]) -> Path | None:
 
 
 def with_file_values[T](command: T, path: Path) -> T:
-    """A copy of `command` with the values of a TOML file; its keys are fields of `command` or of dataclasses in it.
+    """Copy `command` with the values of a TOML file; its keys are fields of `command` or of its nested dataclasses.
 
     Raises:
-        ConfigError: The file cannot be read, or has unknown keys or values of a wrong type; all of them at once.
+        ConfigError: The file cannot be read, or has unknown keys or values of a wrong type, all listed at once.
     """
     values = {key.replace("-", "_"): value for key, value in read_toml(path).items()}
     places = dict(_places(command))
@@ -311,7 +313,7 @@ def with_file_values[T](command: T, path: Path) -> T:
 
 
 def _places(owner: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Name of each flag -> the fields that lead to the dataclass that has it."""
+    """Name of each flag -> the fields that lead to its dataclass."""
     for part in dataclasses.fields(owner):
         value = getattr(owner, part.name)
         if dataclasses.is_dataclass(value):
@@ -324,5 +326,5 @@ def _replaced(owner: Any, above: tuple[str, ...], key: str, value: Any) -> Any:
     if above:
         return dataclasses.replace(owner, **{above[0]: _replaced(getattr(owner, above[0]), above[1:], key, value)})
     if isinstance(getattr(owner, key), tuple) and not isinstance(value, list):
-        value = [value]  # cameras = "front" says what it means
+        value = [value]  # cameras = "front" means one camera
     return dataclasses.replace(owner, **{key: getattr(from_plain({**to_plain(owner), key: value}, type(owner)), key)})

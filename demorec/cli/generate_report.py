@@ -1,4 +1,4 @@
-"""What a person sees at the end of a run: a table of what there is, and the commands that come next."""
+"""Output at the end of a run: a table of the results, and the next commands."""
 
 from __future__ import annotations
 
@@ -26,20 +26,21 @@ if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
 
 POLICY_CONFIG = Path("examples/act_numbers.json")
-"""Settings of README's training, relative to a checkout."""
+"""Configuration of README's training, relative to a checkout."""
 MAX_PROBED_EPISODES = 8
 
 
 def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
-    """Every check of run, recordings and dataset that needs no decoded images; of the episodes asked for.
+    """Run every check of the run, its recordings and its dataset that needs no decoded images, for the requested
+    episodes.
 
     Args:
-        result: Of the run.
-        deep_every: The first episode and one in so many are made again; 0 for none.
-        progress: Called with how many things of how many are done.
+        result: Result of the run.
+        deep_every: Interval N at which episodes are generated again, starting with the first; 0 for none.
+        progress: Called with the number of finished items and the total.
 
     Returns:
-        What was found, for the closing table, and one line for each check that failed.
+        The entry for the closing table, and one line for each failed check.
     """
     from demorec.check.proof import prove
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
@@ -72,7 +73,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
 
 
 def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[str, Sequence[str]] | None) -> None:
-    """The closing table, with what `check_run` returned."""
+    """Print the closing table, with the result of `check_run`."""
     run, folder = result.run, result.folder
     attempts = run.attempts
     first_tries = sum(bool(a.success) and a.attempt == 0 for a in attempts)
@@ -121,7 +122,7 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
 
 
 def print_comparison(original: Original, result: RunResult) -> bool:
-    """Print whether a run is the same as the original, or what differs; return whether it is."""
+    """Print whether a run equals the original, or the differences; return whether it does."""
     from demorec.generate.reproduce import compare
 
     same = compare(original, result)
@@ -129,7 +130,7 @@ def print_comparison(original: Original, result: RunResult) -> bool:
     before = len(same) - len(result.made)
     if before > 0:
         tell(
-            f"Note: {counted(before, 'episode')} of {result.folder} had been made before and were not made again: use "
+            f"Note: {counted(before, 'episode')} of {result.folder} existed before and were not generated again: use "
             "a new --out to compare them too."
         )
     tell(*original.faults[:10])
@@ -142,7 +143,7 @@ def print_comparison(original: Original, result: RunResult) -> bool:
 
 
 def next_commands(result: RunResult) -> list[str]:
-    """What to type next, quoted for the shell."""
+    """Next commands for the user, quoted for the shell."""
     folder = str(result.folder)
     allow = [word for module in result.run.config.modules for word in ("--allow", module)]
     commands = [[_program("demorec"), name, folder, *allow] for name in ("view", "check")]
@@ -157,7 +158,7 @@ def next_commands(result: RunResult) -> list[str]:
 
 
 def has_environment_state(result: RunResult) -> bool:
-    """Whether the first recordings have equally many numbers about objects, as a policy without images needs."""
+    """Whether the first recordings have equally many values of object state, which a policy without images needs."""
     lengths = set()
     for attempt in result.run.successes[:MAX_PROBED_EPISODES]:
         with open_simulated(result.folder / attempt.file) as recording:
@@ -168,7 +169,7 @@ def has_environment_state(result: RunResult) -> bool:
 
 
 def _program(name: str) -> str:
-    """What starts it from the user's shell: its path where PATH does not lead to it."""
+    """Command for a program in the user's shell: its path if PATH does not contain it."""
     return name if shutil.which(name) else str(Path(sys.executable).with_name(name))
 
 
@@ -190,13 +191,13 @@ def _seconds(attempts: tuple[Attempt, ...], export: ExportRecord | None) -> str:
 
 
 def print_estimate(measured: Sequence[Made], tried: Sequence[Made], dataset_bytes: int, options: RunOptions) -> None:
-    """The table of a dry run, from what `estimate` returned."""
+    """Print the table of a dry run from the result of `estimate`."""
     assert options.out is not None
     last, cores = measured[-1].attempt, available_cores()
     num_workers, successes = options.workers or cores, sum(bool(report.attempt.success) for report in tried)
     each = sum(last.seconds.values())
     attempts = options.num_episodes * len(tried) / max(successes, 1)
-    # Wall-clock time with a core for each worker, without the export.
+    # Wall-clock time with one core per worker, without the export.
     seconds = measured[0].attempt.seconds.get(STARTING, 0.0) + each * math.ceil(attempts / num_workers)
     stages = ", ".join(f"{stage} {value:.2f}" for stage, value in last.seconds.items())
     workers = counted(num_workers, "worker")

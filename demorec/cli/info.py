@@ -1,4 +1,4 @@
-"""`demorec info`: what a recording, a run or a dataset holds."""
+"""`demorec info`: show the content of a recording, a run or a dataset."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ if TYPE_CHECKING:
     from demorec.runs.run_file import RunFile
 
 _MOST_PROBLEMS = 5
-"""Of a dataset that are listed one by one."""
+"""Maximum problems of a dataset that are listed one by one."""
 _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 
 @dataclass(frozen=True, kw_only=True)
 class Info:
-    """Show what each path holds.
+    """Show the content of each path.
 
     Examples:
       demorec info recordings/cubes
@@ -45,7 +45,7 @@ class Info:
     roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
-        """Read and print; 1 when something among several paths cannot be read."""
+        """Read and print; 1 if one of several paths cannot be read."""
         need_paths(self.paths, "info")
         named = self.roles.named
         described = {} if self.mapping is not None or named else _described(self.paths)
@@ -73,7 +73,7 @@ def _described(paths: Sequence[Path]) -> dict[Path, tuple[dict[str, Any], list[s
 
 
 def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
-    """Plain data for --json, and the lines for people."""
+    """Plain data for --json, and lines for the terminal."""
     found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
     describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
     if describe is None and named:
@@ -195,7 +195,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
         ("digest", run.digest),
     ]
     if run.beyond:
-        facts.append(("beyond these", f"{len(run.beyond)} attempts at later episodes, of when more was asked for"))
+        facts.append(("beyond these", f"{len(run.beyond)} attempts at later episodes, requested earlier"))
     if run.export is not None:
         facts.append(("dataset", f"{path / 'dataset'} ({run.export.repo_id})"))
     rows = [("episode", "attempt", "outcome", "frames", "size", "file")]
@@ -214,7 +214,7 @@ def _run_lines(path: Path, run: RunFile) -> list[str]:
 
 
 def _external_run_lines(path: Path, run: RunFile, roles: Roles | None) -> list[str]:
-    """About a run."""
+    """Lines about an external run."""
     frames = sum(line.num_frames for line in run.attempts)
     counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
     parts = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
@@ -276,7 +276,7 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
 
 
 def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
-    """What the tables say beyond info.json, where demorec understands them, and what is wrong with the dataset."""
+    """Table content beyond info.json, if readable, and the problems of the dataset."""
     from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.datasets.lerobot.inspect import attempt_counts, dataset_digest, dataset_problems, without_digest
 

@@ -1,4 +1,4 @@
-"""`demorec list`: what there is to choose from."""
+"""`demorec list`: list the available choices."""
 
 from __future__ import annotations
 
@@ -74,4 +74,4 @@ _DESCRIBED: Mapping[str, Callable[[Any], str]] = {
     "objects": _kinds,
     "renderers": lambda renderer: (renderer.__doc__ or "").strip().partition("\n")[0],
 }
-"""How a row is described in one line, where it has no summary of its own."""
+"""One-line description of rows that have no summary."""

@@ -1,4 +1,4 @@
-"""`demorec recover`: what a crash left, as a recording."""
+"""`demorec recover`: recover a recording after a crash."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 class Recover:
     """Recover a recording that a crash cut off or damaged.
 
-    Keeps everything that is whole: all frames up to the last second before the crash. The damaged file stays as it is.
-    A recording that is whole is not copied unless --out is given. Exit code 1 if there is nothing to keep.
+    Keeps all intact data: all frames up to the last second before the crash. The damaged file stays as it is. An intact
+    recording is not copied unless --out is given. Exit code 1 if there is nothing to keep.
 
     Examples:
       demorec recover recordings/cubes/unfinished/node-1-0/episode_000003.mcap.part
@@ -26,15 +26,16 @@ class Recover:
     """
 
     file: Positional[Path]
-    """An unfinished recording (NAME.mcap.part), or a finished one that was damaged."""
+    """Unfinished recording (NAME.mcap.part), or a damaged finished one."""
     out: OptionalTarget = None
-    """The recording to write (auto: NAME.mcap beside NAME.mcap.part; NAME.recovered.mcap beside NAME.mcap, or in
-    RUN/recovered where that is an episode of a run or an evaluation)."""
+    """Recording to write (auto: NAME.mcap next to NAME.mcap.part; NAME.recovered.mcap next to NAME.mcap, or in
+    RUN/recovered for an episode of a run or an evaluation).
+    """
     overwrite: bool = False
-    """Replace an existing recording of that name."""
+    """Replace an existing recording with that name."""
 
     def run(self) -> int:
-        """Recover and say how much was kept."""
+        """Recover and print how much was kept."""
         from demorec.mcap import is_whole, recover
 
         found = expect(self.file, "recording", "unfinished")
@@ -56,5 +57,5 @@ def _default_target(file: Path) -> Path:
     folder = file.absolute().parent
     marks = (RUN_NAME, EVALUATION_NAME)
     if folder.name in (EPISODES, FAILED) and any((folder.parent / mark).is_file() for mark in marks):
-        return folder.parent / "recovered" / name  # beside it, it would count as one more episode
+        return folder.parent / "recovered" / name  # in the same folder it would count as one more episode
     return file.with_name(name)

@@ -1,4 +1,4 @@
-"""`demorec view`: episodes in Rerun."""
+"""`demorec view`: view episodes in Rerun."""
 
 from __future__ import annotations
 
@@ -43,10 +43,10 @@ _RANK_HELP = f"Order of the episodes, the worst first: {', '.join(RANKINGS.names
 
 @dataclass(frozen=True, kw_only=True)
 class View:
-    """Watch episodes in Rerun: recordings, runs, exported datasets, and .rrd files of --save.
+    """View episodes in Rerun: recordings, runs, exported datasets, and .rrd files of --save.
 
-    Opens a window; --save, --screenshot and --web need no screen. The ffmpeg that Rerun needs for H.264 is included; a
-    plain `rerun FILE.rrd` plays H.264 only if there is an ffmpeg on the PATH.
+    Opens a window; --save, --screenshot and --web need no screen. Rerun's ffmpeg for H.264 is included; a plain `rerun
+    FILE.rrd` plays H.264 only if ffmpeg is on the PATH.
 
     Examples:
       demorec view recordings/cubes
@@ -72,21 +72,21 @@ class View:
     screenshot: OptionalTarget = None
     """Write a screenshot (.png) of the viewer instead of opening a window."""
     at: float | None = None
-    """Second of the episode that the screenshot shows (auto: the middle of the first episode)."""
+    """Time of the screenshot in the episode, in seconds (auto: the middle of the first episode)."""
     size: tuple[int, int] = (1600, 950)
     """Width and height of the screenshot in pixels."""
     web: bool = False
-    """Serve Rerun's web viewer on this machine and print its address; stop it with Ctrl-C."""
+    """Serve Rerun's web viewer on this machine and print its address; Ctrl-C stops it."""
     port: int | None = None
     """Port of the web viewer (auto: a free one)."""
     allow: Allow = ()
-    """A module or package of your own; models of robots and objects beside it may be read."""
+    """A module or package of your own; models of robots and objects next to it may be read."""
     overwrite: bool = False
     """Replace an existing file of --save or --screenshot."""
     roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
-        """Convert, then show, save, take a screenshot or serve."""
+        """Convert, then show, save, take a screenshot, or serve."""
         self._validate()
         allow_models(allowed_modules(self.allow))
         if any(path.suffix == ".rrd" for path in self.paths):
@@ -107,7 +107,7 @@ class View:
         if self.rank is not None:
             sources = self._ranked(sources)
         if self.save is None and self.screenshot is None and not self.web:
-            need_screen()  # before minutes of converting
+            need_screen()  # fail before minutes of conversion
         if self.compare:
             if len(sources) != 2:
                 raise ConfigError(f"--compare takes two episodes, found {len(sources)}: name two recordings.")
@@ -129,7 +129,7 @@ class View:
             return self._show(files, sources, image)
 
     def _save(self, sources: Sequence[PlaybackSource], targets: Sequence[Path]) -> None:
-        """Write all .rrd files, none of which appears before all are complete."""
+        """Write all .rrd files; none appears before all are complete."""
         from demorec.view.save import save, save_comparison
 
         read = places_read(self.paths)
@@ -145,7 +145,7 @@ class View:
 
     @contextmanager
     def _image(self) -> Iterator[Path | None]:
-        """Give the path for the screenshot, which appears at the end; None if none is asked for."""
+        """Yield the path for the screenshot, which appears at the end; None if none is requested."""
         if self.screenshot is None:
             yield None
             return
@@ -168,7 +168,7 @@ class View:
         if self.rank is not None:
             RANKINGS.check_name(self.rank)
         if self.web and (self.save is not None or self.screenshot is not None):
-            raise ConfigError("--web serves until Ctrl-C: give --save or --screenshot in a call of its own.")
+            raise ConfigError("--web serves until Ctrl-C: use --save or --screenshot in a separate call.")
         check_option("port", self.port, 1, 65535)
         if self.port is not None and not self.web:
             raise ConfigError("--port belongs to --web.")
@@ -180,10 +180,10 @@ class View:
             if target.suffix != suffix:
                 raise ConfigError(f"{flag} writes a {suffix} file, found the name {target.name!r}.")
             if not target.absolute().parent.is_dir():
-                raise ConfigError(f"{flag}: there is no folder {target.parent}.")
+                raise ConfigError(f"{flag}: folder {target.parent} is missing.")
 
     def _check_targets(self, saved: Sequence[Path]) -> None:
-        """Refuse impossible targets before any work; those of --save are looked at when they are opened."""
+        """Refuse impossible targets before any work; those of --save are checked when they are opened."""
         if self.screenshot is not None:
             read = places_read(self.paths)
             check_replaceable(self.screenshot, IMAGE, overwrite=self.overwrite, sources=read)
@@ -192,9 +192,9 @@ class View:
     def _show_rrd(self) -> int:
         others = [path for path in self.paths if path.suffix != ".rrd"]
         if others:
-            raise ConfigError(f".rrd files are shown in a call of their own, without others: {others[0]}")
+            raise ConfigError(f".rrd files need a separate call, without other paths: {others[0]}")
         if self.compare or self.save is not None or self.episodes or self.include_failures:
-            raise ConfigError("An .rrd file is shown as it is: --compare, --save and --episodes are for recordings.")
+            raise ConfigError("An .rrd file is shown unchanged: --compare, --save and --episodes are for recordings.")
         for path in self.paths:
             expect(path, "rrd")
         self._check_targets(())
@@ -220,7 +220,7 @@ class View:
         return 0
 
     def _second(self, sources: Sequence[PlaybackSource]) -> float | None:
-        """When the screenshot is taken; None leaves it to the viewer, which knows how long an .rrd file is."""
+        """Time of the screenshot; None leaves it to the viewer, which knows the duration of an .rrd file."""
         from demorec.view.viewer import moment
 
         ends = []

@@ -1,1 +1,1 @@
-"""What a run is on disk: its record run.json, its lock, its recordings."""
+"""A run on disk: its run.json, its lock, its recordings."""

@@ -1,7 +1,7 @@
-"""The folder of a run whose episodes are external: numbered recordings in episodes/, run.json, a lock.
+"""Folder of a run of external episodes: numbered recordings in episodes/, run.json, a lock.
 
-The recordings are the truth; run.json has a line for each and can be made again from them. An episode that a crash cut
-off is made whole when the folder is opened again, and nothing that is there is ever written over.
+The recordings are authoritative; run.json has a line for each and can be rebuilt from them. An episode cut off by a
+crash is recovered when the folder is opened again; existing files are never overwritten.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ class ExternalFolder:
     """An opened run.
 
     Attributes:
-        path: Of the folder.
-        episodes: What is there, in order.
-        recovered: Recordings that were made whole when it was opened.
-        planned: As in `RunFile`; written into run.json with the next change.
+        path: Path of the folder.
+        episodes: Existing episodes, in order.
+        recovered: Recordings that were recovered on opening.
+        planned: See `RunFile`; written to run.json with the next change.
 
     Args:
-        path: Of the folder.
-        recovers: Whether what a crash left of an episode is made whole; an import makes it again.
+        path: Path of the folder.
+        recovers: Whether to recover episodes cut off by a crash; an import records them again instead.
     """
 
     def __init__(self, path: Path, *, recovers: bool = True) -> None:
@@ -60,7 +60,7 @@ class ExternalFolder:
         if os.path.lexists(path / RUN_NAME):
             try:
                 known = _load(path)
-            except DamagedRunFileError:  # the recordings know what it said
+            except DamagedRunFileError:  # the recordings have the same information
                 is_damaged = True
         if recovers:
             self._recover_parts()
@@ -78,13 +78,13 @@ class ExternalFolder:
                 continue
             try:
                 recover(part, target)
-            except RecordingError:  # not one whole frame: it stays as it is, and its number is not used again
+            except RecordingError:  # no complete frame: the file stays, and its number is not used again
                 continue
             part.rename(free_name(part.with_name(f"{part.name}.recovered")))
             self.recovered.append(target)
 
     def _line(self, file: Path, known: Mapping[str, Attempt]) -> Attempt:
-        """What run.json says of a recording, or what it says itself where that is not the same file."""
+        """Line of a recording in run.json, or from the recording itself if the file is another one."""
         _refuse_foreign(file)
         line = known.get(f"{EPISODES}/{file.name}")
         if line is not None and line.num_bytes == file.stat().st_size:
@@ -93,19 +93,19 @@ class ExternalFolder:
 
     @property
     def next_index(self) -> int:
-        """The number of the next episode: above all that are there, finished or not."""
+        """Number of the next episode, greater than all existing ones, finished or not."""
         numbers = [line.episode_index for line in self.episodes]
         for path in (self.path / EPISODES).glob("episode_*"):
             if path.suffix == ".part" and not path.stat().st_size:
-                continue  # of an episode that was opened, and given no frame: the next one takes its place
+                continue  # an episode without frames: the next one takes its place
             digits = path.name.removeprefix("episode_").partition(".")[0]
             numbers.append(int(digits) if digits.isdecimal() else -1)
         return max(numbers, default=-1) + 1
 
     def kind(self) -> EpisodeInfo | None:
-        """Description of the last episode, which new ones must be like; None of an empty run.
+        """Description of the last episode, which new ones must match; None for an empty run.
 
-        ConfigError where somebody has put another file in its place.
+        ConfigError if another file has replaced it.
         """
         if not self.episodes:
             return None
@@ -115,16 +115,18 @@ class ExternalFolder:
             return recording.info
 
     def check_fits(self, info: EpisodeInfo) -> None:
-        """Raise ConfigError with everything in which a new episode differs from the last one that is there."""
+        """Raise ConfigError with all differences between a new episode and the last existing one."""
         kind = self.kind()
         if kind is not None and (different := differences(kind, info)):
             raise ConfigError(
-                f"The run holds episodes of another kind ({'; '.join(different)}): record into another folder: "
+                f"The run's episodes differ from this one ({'; '.join(different)}): record into another folder: "
                 f"{self.path}"
             )
 
     def has(self, info: EpisodeInfo) -> bool:
-        """Whether an earlier start of the same import has written an episode; ConfigError for another recording."""
+        """Whether an earlier start of the same import has written an episode; ConfigError if it is another
+        recording.
+        """
         path = episode_path(self.path, info.episode_index)
         if not path.exists():
             return False
@@ -133,30 +135,31 @@ class ExternalFolder:
             if recording.info == info and recording.outcome is not None:
                 return True
         raise ConfigError(
-            f"Another recording is there already: import what the interrupted call was given, or choose another --out: "
-            f"{path}"
+            f"Another recording exists already: import the same files as before, or choose another --out: {path}"
         )
 
     def begin(self, info: EpisodeInfo) -> None:
-        """Write run.json before a planned episode is recorded: a crash leaves a run that says what is missing."""
+        """Write run.json before a planned episode is recorded, so that a run cut off by a crash lists its missing
+        episodes.
+        """
         if self._begun_with is None:
             self._begun_with = info
             self.save()
 
     def add(self, recording: Path) -> Attempt:
-        """Take a finished recording into run.json."""
+        """Add a finished recording to run.json."""
         line = external_line(recording)
         self.planned = [what for what in self.planned if what != planned_episode(line.episode_index)]
         self.extend([line])
         return line
 
     def extend(self, lines: Iterable[Attempt]) -> None:
-        """Take finished recordings into run.json, by their `external_line`."""
+        """Add finished recordings to run.json, by their `external_line`."""
         self.episodes = sorted([*self.episodes, *lines], key=lambda line: line.episode_index)
         self.save()
 
     def save(self, *, ended: bool = False) -> None:
-        """Write run.json, if there is anything to tell."""
+        """Write run.json if it has changed."""
         if (info := self.kind() or self._begun_with) is None:
             return
         session = replace(self._session, ended=utc_now() if ended else "")
@@ -178,7 +181,7 @@ class ExternalFolder:
 
 
 def _load(path: Path) -> RunFile:
-    """run.json; ConfigError where it is one, damaged or not, of another kind of run."""
+    """Read run.json; ConfigError if it belongs to another kind of run, even if damaged."""
     if json_object(path / RUN_NAME) and not is_external_run(path):
         raise ConfigError(f"The folder holds a run of another kind: choose another folder: {path}")
     return load_any_run_file(path)
@@ -186,20 +189,20 @@ def _load(path: Path) -> RunFile:
 
 @contextmanager
 def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[ExternalFolder]:
-    """Open, continue or begin a run, locked until the context ends; arguments as of `ExternalFolder`.
+    """Open, continue or begin a run, locked until the context ends; arguments as in `ExternalFolder`.
 
     Raises:
-        ConfigError: The folder is in use, holds another kind of run or somebody's files, also by the name of a
-            recording, or cannot be written to.
+        ConfigError: The folder is in use, holds another kind of run or foreign files (also under a recording's name),
+        or is not writable.
         RecordingError: One of its recordings is damaged.
     """
     path = path.absolute()
     was_there = path.exists()
     if was_there and not path.is_dir():
-        raise ConfigError(f"This is a file, no folder for a run: choose another: {path}")
+        raise ConfigError(f"A run needs a folder, and this is a file: choose another path: {path}")
     if path.is_dir() and not is_external_run(path):
         if (path / RUN_NAME).exists():
-            with suppress(DamagedRunFileError):  # whose recordings know what it said
+            with suppress(DamagedRunFileError):  # its recordings have the same information
                 _load(path)
         refuse_strangers(path, (EPISODES, DATASET, IMPORT_NAME, LOCK_NAME))
     make_folder(path / EPISODES)
@@ -213,14 +216,14 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
             if folder._begun_with is not None and not folder.episodes:
                 (path / RUN_NAME).unlink(missing_ok=True)
             if not was_there and not (path / RUN_NAME).exists():
-                with suppress(OSError):  # of what is in it: a recording, or what is left of one
+                with suppress(OSError):  # only a recording or an unfinished one is removed
                     (path / EPISODES).rmdir()
                     (path / LOCK_NAME).unlink()
                     path.rmdir()
 
 
 def is_cut_off(path: Path) -> bool:
-    """Check whether the last import into a run was ended before it had taken in all that it was given."""
+    """Check whether the last import into a run ended before it had imported everything."""
     run = json_object(path / RUN_NAME)
     sessions = run.get("sessions")
     last = sessions[-1] if isinstance(sessions, list) and sessions else None
@@ -228,28 +231,28 @@ def is_cut_off(path: Path) -> bool:
 
 
 def _refuse_foreign(path: Path) -> None:
-    """Raise ConfigError for something that has a recording's name, and is none."""
+    """Raise ConfigError for an entry with a recording's name that is not a recording."""
     if not path.is_file() or not RECORDING.recognises(path):
         raise ConfigError(f"This is not a recording and is in the way, move it elsewhere: {path}")
 
 
 def planned_episode(episode_index: int) -> str:
-    """What an episode is called among those that an import plans."""
+    """Name of an episode among those that an import plans."""
     return f"episode {episode_index}"
 
 
 def episode_path(run: Path, episode_index: int) -> Path:
-    """Where the recording of an episode goes."""
+    """Path of an episode's recording."""
     return run / EPISODES / recording_name(episode_index, 0, success=True)
 
 
 def external_line(file: Path) -> Attempt:
-    """The line of run.json that a recording speaks for; RecordingError when it is damaged."""
+    """Build a recording's line of run.json; RecordingError if it is damaged."""
     return replace(recorded_line(file)[0], file=f"{EPISODES}/{file.name}")
 
 
 def differences(there: EpisodeInfo, new: EpisodeInfo) -> list[str]:
-    """In what two episodes differ that one run or dataset must have in common, in words."""
+    """Describe the differences between two episodes in properties that a run or dataset must share."""
     traits = [("robot", there.robot_name, new.robot_name), ("fps", str(there.fps), str(new.fps))]
     for kind, old_ones, new_ones in (
         ("feature", _features(there), _features(new)),

@@ -1,7 +1,7 @@
-"""What a path is: a recording, a run, a dataset, something of another program, nothing, or something unreadable.
+"""Identify a path: a recording, a run, a dataset, another program's file, nothing, or something unreadable.
 
-Every command that is given a path asks here, so that all of them take the same things and refuse the rest in the same
-words. Nothing is opened that could block: a FIFO, a socket or a device is named as what it is.
+Every command with a path argument uses this module, so that all accept the same inputs and reject others with the same
+messages. Nothing that could block is opened: FIFOs, sockets and devices are reported by kind.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ PathKind = str
 is not a run), "hdf5", "rosbag", the kind of an extension's reader, "nothing" or "unreadable"."""
 
 EPISODE_FOLDERS: tuple[PathKind, ...] = ("run", "recordings", "evaluation")
-"""What holds recordings, in itself or in episodes/ and failed/."""
+"""Kinds that hold recordings, directly or in episodes/ and failed/."""
 
 EVALUATION_NAME = "evaluation.json"
 
@@ -45,11 +45,11 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
 }
 """What each kind is called, and what to do where it was not expected."""
 ROSBAG2 = "metadata.yaml"
-"""In a folder that is a bag of rosbag2."""
+"""File that marks a folder as a bag of rosbag2."""
 BAG_SUFFIXES = (".db3", ".bag", ".mcap.zstd", ".db3.zstd")
-"""Of files that are bags, beside .mcap, which may be a recording."""
+"""Suffixes of bags, besides .mcap, which may be a recording."""
 OUR_METADATA = b"demorec."
-"""How the names of our recordings' metadata begin."""
+"""Prefix of the metadata names in demorec's recordings."""
 SQLITE_MAGIC = b"SQLite format 3\0"
 ROS1_MAGIC = b"#ROSBAG V"
 _HEAD_BYTES = 1 << 16
@@ -67,24 +67,24 @@ _MARKS: tuple[tuple[str, PathKind], ...] = (
     (EVALUATION_NAME, "evaluation"),
     (ROSBAG2, "rosbag"),
 )
-"""The file by whose presence a folder is known."""
+"""Files that identify a kind of folder."""
 
-NOT_UTF8 = "This name has bytes that are not UTF-8, which not every library can open: rename it"
+NOT_UTF8 = "This name has bytes that are not UTF-8, which some libraries cannot open: rename it"
 
 
 @dataclass(frozen=True, kw_only=True)
 class Found:
-    """What a path is.
+    """Kind and content of a path.
 
     Attributes:
-        path: As it was given.
-        kind: What is there.
-        reason: Of "nothing" and "unreadable": why, as a sentence without its end.
-        recordings: Finished recordings, in order: of a run or an evaluation those in episodes/, of any other folder
-            those in itself and in episodes/; of a recording itself.
+        path: The given path.
+        kind: Its kind.
+        reason: Reason for "nothing" and "unreadable", as a sentence without its end.
+        recordings: Finished recordings, in order: for a run or an evaluation those in episodes/, for any other folder
+        those in it and in episodes/; for a recording itself.
         failed: Recordings of failed attempts, in failed/.
-        unfinished: What is still being recorded, or was when a process was killed, and has not been made again since:
-            in the folder itself, in episodes/ and in folders of unfinished/.
+        unfinished: Recordings in progress, or cut off by a kill and not made again since: in the folder itself, in
+        episodes/ and in folders of unfinished/.
     """
 
     path: Path
@@ -96,21 +96,19 @@ class Found:
 
     @property
     def left(self) -> str:
-        """What is unfinished, and what to do about it, as a sentence without its end; "" for nothing."""
+        """Unfinished recordings and what to do about them, as a sentence without its end; "" if there are none."""
         if not self.unfinished:
             return ""
         first, count = shlex.quote(str(self.unfinished[0])), len(self.unfinished)
         what, it = ("a recording is", "it") if count == 1 else (f"{count} recordings are", "the first")
-        return (
-            f"{what} unfinished (being made, or left by a crash): demorec recover {first} keeps what is whole in {it}"
-        )
+        return f"{what} unfinished (in progress, or left by a crash): demorec recover {first} keeps the rest of {it}"
 
 
 def find(path: Path) -> Found:
-    """What a path is: files are known by their first bytes, or else by their suffix, folders by what they hold.
+    """Identify a path: files by their first bytes or else their suffix, folders by their content.
 
     Raises:
-        ResourceError: This machine lacks what it takes to look.
+        ResourceError: The machine lacks the resources to check it.
     """
     if not is_utf8(path):
         return Found(path=path, kind="unreadable", reason=NOT_UTF8)
@@ -122,16 +120,14 @@ def find(path: Path) -> Found:
                 return Found(path=odd[0], kind="unreadable", reason=NOT_UTF8)
             return found
         if not stat.S_ISREG(mode):
-            return Found(path=path, kind="unreadable", reason=f"This is {irregular_kind(mode)}, no file and no folder")
+            return Found(path=path, kind="unreadable", reason=f"This is {irregular_kind(mode)}, not a file or folder")
         return _file(path)
     except FileNotFoundError:
         if path.is_symlink():
             return Found(path=path, kind="nothing", reason="This is a link whose target is missing")
         part = path.with_name(f"{path.name}.part")
         left = Found(path=path, kind="unfinished", unfinished=(part,) if _is_there(part) else ()).left
-        return Found(
-            path=path, kind="nothing", reason="; ".join(filter(None, ("There is no such file or folder", left)))
-        )
+        return Found(path=path, kind="nothing", reason="; ".join(filter(None, ("No such file or folder", left))))
     except OSError as error:
         if (lack := resource_error(error, path)) is not None:
             raise lack from error
@@ -158,11 +154,11 @@ def _words(kind: PathKind) -> tuple[str, str]:
 
 
 def expect(path: Path, *kinds: PathKind) -> Found:
-    """What a path is, if it is of one of these kinds and, as a folder of episodes, has a recording.
+    """Identify a path that must be of one of these kinds and, if it is a folder of episodes, hold a recording.
 
     Raises:
-        ConfigError: It is something else, nothing, or cannot be read.
-        ResourceError: As `find`.
+        ConfigError: It has another kind, is missing, or cannot be read.
+        ResourceError: As in `find`.
     """
     found = find(path)
     if found.reason:
@@ -172,7 +168,7 @@ def expect(path: Path, *kinds: PathKind) -> Found:
         if kinds == ("dataset",) and found.kind == "run":
             inside = path / DATASET
             advice = (
-                f"; its dataset is {inside}" if _is_there(inside / INFO_PATH) else "; demorec export makes one of it"
+                f"; its dataset is {inside}" if _is_there(inside / INFO_PATH) else "; demorec export converts it to one"
             )
         allowed = " or ".join(filter(None, (", ".join(taken[:-1]), taken[-1])))
         raise ConfigError(f"Expected {allowed}, found {name}{advice}: {path}")
@@ -180,10 +176,10 @@ def expect(path: Path, *kinds: PathKind) -> Found:
 
 
 def expect_recordings(found: Found, files: Sequence[Path]) -> None:
-    """Raise ConfigError when `files`, those that a command takes of what was found, are none."""
+    """Raise ConfigError if `files`, the recordings that a command selected from `found`, is empty."""
     if files:
         return
-    only = " but failed attempts, in failed/" if found.failed else ""
+    only = " except failed attempts, in failed/" if found.failed else ""
     left = f"; {found.left}" if found.left else ""
     raise ConfigError(f"There is no finished recording in {_words(found.kind)[0]}{only}{left}: {found.path}")
 
@@ -199,15 +195,16 @@ def _file(path: Path) -> Found:
         if kind == "recording" and _is_foreign(file):
             kind = "rosbag"
     if kind is None:
-        reason = "The file is no recording (.mcap), HDF5 file or bag" if head else "The file is empty"
+        reason = "The file is not a recording (.mcap), HDF5 file or bag" if head else "The file is empty"
         return Found(path=path, kind="nothing", reason=reason)
     return Found(path=path, kind=kind, recordings=(path,) if kind == "recording" else ())
 
 
 def _is_foreign(file: BinaryIO) -> bool:
-    """Whether an MCAP file begins as others write them: with records, but without the metadata that all of ours have.
+    """Whether an MCAP file begins as another program writes it: with records but without demorec's metadata.
 
-    Ours have them in front and name them again at the end, so that one damaged place makes no bag of a recording.
+    demorec's recordings have this metadata at the start and again at the end, so that one damaged place does not turn a
+    recording into a bag.
     """
     file.seek(0)
     head = file.read(_HEAD_BYTES)
@@ -233,7 +230,7 @@ def _folder(path: Path) -> Found:
         places += _entries(path / UNFINISHED)
     parts: list[Path] = []
     for place in places:
-        with suppress(OSError):  # what cannot be seen of these is no reason to refuse the rest
+        with suppress(OSError):  # an unreadable entry is no reason to refuse the rest
             parts += [file for file in _entries(place) if file.name.endswith(".mcap.part")]
     unfinished = tuple(p for p in parts if not {p.name.removesuffix(".mcap.part"), p.name.partition(".")[0]} & made)
     found = Found(path=path, kind=kind or "recordings", recordings=recordings, failed=failed, unfinished=unfinished)
@@ -243,7 +240,7 @@ def _folder(path: Path) -> Found:
 
 
 def _holds_bags(path: Path, recordings: Sequence[Path]) -> bool:
-    """Whether a folder holds bags: as files, or as folders of rosbag2."""
+    """Whether a folder holds bags: files, or folders of rosbag2."""
     if recordings:
         with suppress(OSError, ValueError), open_regular(recordings[0]) as file:
             return _is_foreign(file)
@@ -252,7 +249,7 @@ def _holds_bags(path: Path, recordings: Sequence[Path]) -> bool:
 
 
 def _is_there(path: Path) -> bool:
-    """Whether there is anything of that name; OSError when that cannot be seen."""
+    """Whether a path exists; OSError if that cannot be determined."""
     try:
         path.lstat()
     except (FileNotFoundError, NotADirectoryError):
@@ -265,7 +262,7 @@ def _recordings_in(folder: Path) -> tuple[Path, ...]:
 
 
 def _entries(folder: Path) -> tuple[Path, ...]:
-    """What is in a folder, in order; nothing where there is none."""
+    """Entries of a folder, in order; empty if it is missing."""
     try:
         return tuple(sorted(folder.iterdir()))
     except (FileNotFoundError, NotADirectoryError):
@@ -273,12 +270,12 @@ def _entries(folder: Path) -> tuple[Path, ...]:
 
 
 def _nothing_in(found: Found, entries: Sequence[str]) -> str:
-    """Why a folder is taken for nothing, with what may have been meant."""
+    """Reason why a folder counts as "nothing", with suggestions."""
     reason = f"The folder holds no recording (*.mcap), run ({RUN_NAME}) or dataset ({INFO_PATH})"
     if found.left:
         return f"{reason}; {found.left}"
     path = found.path
     for what, marks in (("runs", (RUN_NAME, EPISODES)), ("datasets", (INFO_PATH,))):
         if below := sorted(name for name in entries if any(_is_there(path / name / mark) for mark in marks)):
-            return f"{reason}; it holds {what}, name one ({shown(below)})"
+            return f"{reason}; it holds {what}: name one ({shown(below)})"
     return reason

@@ -1,4 +1,4 @@
-"""What a recording says of itself: its line of run.json, and what it was made with."""
+"""Read a recording's line of run.json, its config and its versions."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demorec.runs.run_file import Attempt
 
 
 def recorded_line(path: Path) -> tuple[Attempt, EpisodeInfo]:
-    """Read all of a recording: its line of run.json, with the bare name as its `file`, and what is known of it.
+    """Read a whole recording: its line of run.json, with the bare name as its `file`, and its info.
 
     Raises:
         RecordingError: It is damaged.
@@ -43,15 +43,15 @@ def recorded_line(path: Path) -> tuple[Attempt, EpisodeInfo]:
 
 
 def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[str, str]]:
-    """Read all of a finished recording: nothing that run.json says of it is taken on trust.
+    """Read a whole finished recording without relying on run.json.
 
     Returns:
-        The line of run.json that it speaks for, with the bare name as its `file`; the config that it was made with, as
-        plain data; and package -> version of what decided the bits.
+        Its line of run.json, with the bare name as its `file`; its config as plain data; and package -> version of the
+        packages that decided the bits.
 
     Raises:
-        RecordingError: It is no complete recording of an episode that demorec simulated.
-        NotGeneratedError: It was rendered or replayed, or a policy made it.
+        RecordingError: It is not a complete recording of a simulated episode.
+        NotGeneratedError: It is a render, a replay or a policy rollout.
     """
     attempt, info = recorded_line(path)
     if info.simulation is None:
@@ -64,11 +64,11 @@ def inspect_recording(path: Path) -> tuple[Attempt, Mapping[str, Any], Mapping[s
 
 
 def place_recording(made: Path, target: Path) -> None:
-    """Move a finished recording to its place in a run, where only a recording of the same episode is replaced.
+    """Move a finished recording into a run, where it may replace only a recording of the same episode.
 
     Raises:
-        ConfigError: Another file has appeared there. It stays, and so does the recording.
-        OSError: The folder cannot be written to.
+        ConfigError: Another file has appeared there. Both files stay.
+        OSError: The folder is not writable.
     """
     try:
         take_name(made, target)

@@ -1,8 +1,8 @@
-"""run.json: what a run is, what it is made with, and how far it is; one line per episode, replaced atomically.
+"""run.json: identity, options and progress of a run; one line per episode, replaced atomically.
 
-The recordings are the truth and this file their table of contents: a line that a crash lost is read back from its
-recording. What decides the data (config, versions) is kept apart from what does not (machine, times). A run whose
-episodes demorec did not generate is one without a `Generation`.
+The recordings are authoritative, and this file is their index: a line lost in a crash is restored from its recording.
+Options that decide the data (config, versions) are separate from those that do not (machine, times). A run of external
+episodes has no `Generation`.
 """
 
 from __future__ import annotations
@@ -26,35 +26,36 @@ RUN_FORMAT = 1
 MAX_EPISODES = 10_000_000
 EPISODES, FAILED, UNFINISHED, DATASET = "episodes", "failed", "unfinished", "dataset"
 _EXTERNAL = "collected"
-"""The "kind" that run.json has where the episodes are external; see `demorec.runs.external`."""
+"""The "kind" in run.json for external episodes; see `demorec.runs.external`."""
 IMPORT_NAME = "import.json"
-"""Beside run.json: what `demorec import` read, and what it found in it (`demorec.extensions.imports.import_file`)."""
+"""File next to run.json with the sources and findings of `demorec import`
+(`demorec.extensions.imports.import_file`).
+"""
 STARTING = "starting"
-"""What a worker does before its first frame, once: it compiles, or loads, and fills caches that later episodes find."""
+"""One-time work of a worker before its first frame: compiling or loading, and filling caches for later episodes."""
 
 
 class DamagedRunFileError(DemorecError):
-    """run.json is there but cannot be read; the recordings tell what it held."""
+    """run.json exists but cannot be read; the recordings have the same information."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Attempt:
-    """One attempt at one episode that has come to its end: a line of run.json.
+    """A finished attempt at one episode: a line of run.json.
 
     Attributes:
-        episode_index, attempt: Which.
-        seed: Root seed; with index and attempt it gives every random number (demorec.core.seeding).
-        success: Whether every check of the task passed; None when nobody said.
-        file: Recording, relative to the run's folder; "" when no scene could be laid out, so that nothing was
-            recorded.
-        sha256: Of the file.
-        digest: Of its content (states, actions, packets, metadata that matter).
-        num_frames, num_bytes: Of the recording.
-        phase, reason: Of the failure; "" on success.
-        seconds: stage -> CPU seconds: "simulation", "rendering", "recording", and "starting" for the first
-            attempt of a worker. Not part of any digest.
-        instruction: In words, of an external episode.
-        drops: Of an external episode: "frames" or camera -> how many of them could not be taken.
+        episode_index, attempt: Numbers of the episode and the attempt.
+        seed: Root seed, which with index and attempt determines every random number (demorec.core.seeding).
+        success: Whether every check of the task passed; None if unknown.
+        file: Recording, relative to the run's folder; "" if no scene could be laid out, so that there is no recording.
+        sha256: Hash of the file.
+        digest: Hash of its content (states, actions, packets, relevant metadata).
+        num_frames, num_bytes: Size of the recording.
+        phase, reason: Phase and reason of the failure; "" on success.
+        seconds: stage -> CPU seconds: "simulation", "rendering", "recording", and "starting" for a worker's first
+        attempt. Not part of any digest.
+        instruction: Instruction in words, of an external episode.
+        drops: "frames" or camera -> number of frames or images that could not be recorded, of an external episode.
     """
 
     episode_index: int
@@ -76,7 +77,7 @@ class Attempt:
 _EXTERNAL_LINE = (
     "episode_index", "instruction", "success", "file", "sha256", "digest", "num_frames", "num_bytes", "drops", "reason"
 )  # fmt: skip
-"""What the line of an external episode says; that of an attempt at a generated one says all but the last of these."""
+"""Keys in the line of an external episode; a line of a generated attempt has all but the last."""
 _LINE = tuple(one.name for one in fields(Attempt) if one.name not in ("instruction", "drops"))
 
 
@@ -98,7 +99,7 @@ class RunSession:
 
 @dataclass(frozen=True, kw_only=True)
 class ExportRecord:
-    """The dataset that was made from this run: of which content, with which options, as what."""
+    """The dataset exported from this run: content digest, options and path."""
 
     run_digest: str
     repo_id: str
@@ -108,15 +109,15 @@ class ExportRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class Generation:
-    """What a run that demorec generates is made with, and how far it shall go.
+    """Options, versions and extent of a run that demorec generates.
 
     Attributes:
-        config: What decides the data.
-        versions: package -> version, of what decides the bits.
-        num_episodes: How many successes were asked for last: of the episodes 0 to num_episodes - 1.
-        beyond: As `RunFile.attempts`, of later episodes, which were made when more was asked for. They stay, and are no
-            part of the run: not of its digest, not of its dataset.
-        export: The dataset made from it, if any.
+        config: Options that decide the data.
+        versions: package -> version, of the packages that decide the bits.
+        num_episodes: Number of successes last requested: episodes 0 to num_episodes - 1.
+        beyond: Attempts at later episodes, from an earlier request for more. They stay, but are not part of the run's
+        digest or dataset.
+        export: The dataset exported from it, if any.
     """
 
     config: GenerateConfig
@@ -128,16 +129,14 @@ class Generation:
 
 @dataclass(frozen=True, kw_only=True)
 class RunFile:
-    """The content of run.json.
+    """Content of run.json.
 
     Attributes:
-        generation: None of a run whose episodes are external; its values, read as those of the run, raise ConfigError
-            then.
-        robot, fps: Of external episodes: name of the robot, nominal frames per second.
-        planned: Of external episodes: bags, or episodes of a dataset, that the last import was given and has not taken
-            in yet, in words.
-        attempts: Every finished attempt at the episodes that are asked for, ordered by episode and attempt.
-        sessions: Every start of the command, or of a program that added episodes.
+        generation: None for a run of external episodes; reading its values then raises ConfigError.
+        robot, fps: Name of the robot and nominal frames per second, of external episodes.
+        planned: Names of bags or dataset episodes that the last import was given and has not imported yet.
+        attempts: Every finished attempt at the requested episodes, ordered by episode and attempt.
+        sessions: Every start of the command or of a program that added episodes.
     """
 
     generation: Generation | None = None
@@ -149,53 +148,53 @@ class RunFile:
 
     @property
     def generated(self) -> Generation:
-        """The generation; ConfigError for a run whose episodes are external."""
+        """The generation; ConfigError for a run of external episodes."""
         if self.generation is None:
             raise ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
         return self.generation
 
     @property
     def config(self) -> GenerateConfig:
-        """The configuration of the generation."""
+        """Configuration of the generation."""
         return self.generated.config
 
     @property
     def versions(self) -> Mapping[str, str]:
-        """The versions of the generation."""
+        """Versions of the generation."""
         return self.generated.versions
 
     @property
     def num_episodes(self) -> int:
-        """The number of successes asked for last."""
+        """Number of successes last requested."""
         return self.generated.num_episodes
 
     @property
     def beyond(self) -> tuple[Attempt, ...]:
-        """The attempts at later episodes than asked for."""
+        """Attempts at episodes beyond the requested ones."""
         return self.generated.beyond
 
     @property
     def export(self) -> ExportRecord | None:
-        """The dataset made from the run."""
+        """Dataset exported from the run."""
         return self.generated.export
 
     def with_generation(self, **changes: Any) -> RunFile:
-        """Return the same run with other values of its generation, which it must have."""
+        """Return the run with changed values of its generation, which must exist."""
         return replace(self, generation=replace(self.generated, **changes))
 
     @property
     def config_digest(self) -> str:
-        """Of the config: equal digests and versions, equal episodes."""
+        """Digest of the config: equal digests and versions give equal episodes."""
         return digest(self.config)
 
     @property
     def successes(self) -> tuple[Attempt, ...]:
-        """The attempts that made an episode."""
+        """Attempts that produced an episode."""
         return tuple(a for a in self.attempts if a.success)
 
     @property
     def failures(self) -> tuple[Attempt, ...]:
-        """The attempts that did not."""
+        """Attempts that failed."""
         return tuple(a for a in self.attempts if not a.success)
 
     @property
@@ -207,7 +206,7 @@ class RunFile:
 
     @property
     def num_missing(self) -> int:
-        """Episodes that are neither there nor given up; of external episodes, what is planned."""
+        """Number of requested episodes neither finished nor given up; for external episodes, the number planned."""
         if self.generation is None:
             return len(self.planned)
         return max(0, self.num_episodes - len(self.successes) - len(self.given_up))
@@ -219,7 +218,7 @@ class RunFile:
 
     @property
     def unfinished(self) -> str:
-        """What is missing, as a sentence without its end; "" for a complete run."""
+        """Missing episodes, as a sentence without its end; "" for a complete run."""
         if self.is_complete:
             return ""
         if self.generation is None:
@@ -230,7 +229,7 @@ class RunFile:
 
     @property
     def digest(self) -> str:
-        """Content digest of the run: of config and attempts, in order; not of times, machines or versions."""
+        """Content digest of the run: config and attempts in order, but not times, machines or versions."""
         if self.generation is None:
             lines = [f"{a.episode_index} {a.success} {a.digest}" for a in self.attempts]
         else:
@@ -240,18 +239,18 @@ class RunFile:
 
     @property
     def known(self) -> tuple[Attempt, ...]:
-        """Every finished attempt, those beyond what was asked for included."""
+        """Every finished attempt, including those beyond the requested episodes."""
         return self.attempts + self.beyond
 
     def with_attempts(self, attempts: Iterable[Attempt]) -> RunFile:
-        """This run with these attempts, in order; those of later episodes than asked for are `beyond`."""
+        """Return the run with these attempts, in order; those beyond the requested episodes are `beyond`."""
         ordered = sorted(attempts, key=lambda a: (a.episode_index, a.attempt))
         within = tuple(a for a in ordered if a.episode_index < self.num_episodes)
         beyond = tuple(a for a in ordered if a.episode_index >= self.num_episodes)
         return replace(self.with_generation(beyond=beyond), attempts=within)
 
     def plain(self) -> dict[str, Any]:
-        """All of it as plain data."""
+        """The content as plain data."""
         plain: dict[str, Any] = to_plain(self)
         if self.generation is None:
             about = {key: plain[key] for key in ("robot", "fps", "planned")}
@@ -268,7 +267,7 @@ def _lines(attempts: Iterable[Attempt], keys: Iterable[str]) -> list[dict[str, A
 
 
 def save_run_file(run: RunFile, folder: Path) -> None:
-    """Replace run.json in one step: a reader or a crash sees the old or the new one, never a mixture."""
+    """Replace run.json atomically: a reader sees the old or the new file, also after a crash."""
     plain, head = run.plain(), dict[str, Any](format=RUN_FORMAT)
     if run.generation is None:
         lines = plain.pop("episodes")
@@ -284,7 +283,7 @@ def save_run_file(run: RunFile, folder: Path) -> None:
 
 
 def is_external_run(folder: Path) -> bool:
-    """Whether the folder has a run.json of a run whose episodes are external."""
+    """Whether the folder has the run.json of a run of external episodes."""
     return json_object(folder / RUN_NAME).get("kind") == _EXTERNAL
 
 
@@ -292,8 +291,8 @@ def load_run_file(folder: Path) -> RunFile:
     """Read run.json of a run that demorec generated.
 
     Raises:
-        ConfigError: There is none, or it is of a newer format, or of external episodes.
-        DamagedRunFileError: It is no run file.
+        ConfigError: The file is missing, has a newer format, or lists external episodes.
+        DamagedRunFileError: It is not a valid run file.
     """
     run = load_any_run_file(folder)
     if run.generation is None:
@@ -304,12 +303,12 @@ def load_run_file(folder: Path) -> RunFile:
 
 
 def load_any_run_file(folder: Path) -> RunFile:
-    """Read run.json, whatever the run's episodes are; errors as of `load_run_file`."""
+    """Read run.json of any run; errors as in `load_run_file`."""
     path = folder / RUN_NAME
     try:
         plain = read_json_limited(path, MAX_JSON_BYTES)
         if not isinstance(plain, dict):
-            raise ValueError("no JSON object")
+            raise ValueError("not a JSON object")
         if (version := plain.pop("format")) > RUN_FORMAT:
             raise ConfigError(f"run.json has format {str(version)[:40]}, this demorec knows up to {RUN_FORMAT}: {path}")
         lines, sessions = plain.pop("episodes"), plain.pop("sessions", [])
@@ -325,7 +324,7 @@ def load_any_run_file(folder: Path) -> RunFile:
         _refuse_impossible(run)
         return run.with_attempts(run.attempts)
     except FileNotFoundError as error:
-        raise ConfigError(f"No run.json, so this is no run of generate-dataset: {folder}") from error
+        raise ConfigError(f"This is not a run of generate-dataset, because run.json is missing: {folder}") from error
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         damaged = DamagedRunFileError(f"run.json is damaged ({describe_error(error)}): {path}")
         raise resource_error(error, path) or damaged from error
@@ -338,37 +337,39 @@ def recording_name(episode_index: int, attempt: int, *, success: bool | None) ->
 
 
 def utc_now() -> str:
-    """In ISO 8601."""
+    """Current UTC time in ISO 8601."""
     return datetime.now(UTC).isoformat(timespec="milliseconds")
 
 
 def refuse_strangers(folder: Path, own: Collection[str]) -> None:
-    """Raise ConfigError for a folder that holds other things than what a run writes, of these names."""
+    """Raise ConfigError if a folder contains entries other than these, which a run writes."""
     strangers = sorted(p.name for p in folder.iterdir() if p.name not in own and not p.name.startswith(RUN_NAME))
     if strangers:
-        raise ConfigError(f"The folder holds files that are of no run ({shown(strangers)}): choose another: {folder}")
+        raise ConfigError(
+            f"The folder holds files that are not part of a run ({shown(strangers)}): choose another: {folder}"
+        )
 
 
 def _refuse_impossible(run: RunFile) -> None:
-    """Raise ValueError for numbers that generate-dataset never writes: others would be counted up to, for ever."""
+    """Raise ValueError for numbers that generate-dataset never writes; larger ones would cause endless loops."""
     if not 1 <= run.num_episodes <= MAX_EPISODES:
         raise ValueError(f"num_episodes is {run.num_episodes}, allowed are 1 to {MAX_EPISODES:,}")
     seen: set[tuple[int, int]] = set()
     for line in run.attempts:
         which = f"episode {line.episode_index}, attempt {line.attempt}"
         if not 0 <= line.episode_index < MAX_EPISODES or not 0 <= line.attempt < run.config.max_attempts:
-            raise ValueError(f"a line is of {which}, beyond {MAX_EPISODES:,} or max_attempts")
+            raise ValueError(f"a line has {which}, beyond {MAX_EPISODES:,} or max_attempts")
         if (line.episode_index, line.attempt) in seen:
-            raise ValueError(f"two lines are of {which}")
+            raise ValueError(f"two lines have {which}")
         seen.add((line.episode_index, line.attempt))
         name = recording_name(line.episode_index, line.attempt, success=line.success)
         place = f"{EPISODES if line.success else FAILED}/{name}"
         if line.file != place and (line.file or line.success):
-            raise ValueError(f"the line of {which} names the file {line.file!r} instead of {place}")
+            raise ValueError(f"the line of {which} has the file {line.file!r} instead of {place}")
 
 
 def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """One line an attempt, and one for each episode that has not been tried yet."""
+    """Yield one line per attempt, and one for each episode without an attempt."""
     tried: set[int] = set()
     given_up = set(run.given_up)
     for line in attempts:

@@ -50,7 +50,7 @@ def test_a_run_stands_for_its_dataset(tmp_path: Path, capsys: pytest.CaptureFixt
     assert exit_code("dataset", "drop", run, "--episodes", "2:2", "--out", tmp_path / "none") == 2
     assert "Episodes are numbers and ranges, such as 0,3,5:9, not '2:2'" in capsys.readouterr().err
     assert exit_code("dataset", "select", run / "run.json", "--episodes", "1", "--out", tmp_path / "two") == 2
-    assert "The file is no recording" in capsys.readouterr().err
+    assert "The file is not a recording" in capsys.readouterr().err
 
 
 @pytest.fixture
@@ -70,7 +70,7 @@ def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
     before = files_of(cups)
     words = ("dataset", "split", "cups", "--shares", "a=0.6,b=0.4", "--out")
     assert exit_code(*words, "cups") == 2
-    assert "Nothing else is written into a dataset" in capsys.readouterr().err
+    assert "A new file inside a dataset would prevent" in capsys.readouterr().err
     write_foreign(cups.parent / "parts" / "b")
     assert exit_code(*words, "parts") == 2
     assert "choose --overwrite or another --out" in capsys.readouterr().err
@@ -81,7 +81,7 @@ def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
     assert "3 of 5 episodes, 24 of 40 frames: parts/a" in printed
     assert "2 of 5 episodes, 16 of 40 frames: parts/b" in printed
     assert exit_code("dataset", "select", "parts", "--episodes", "0", "--out", "x") == 2
-    assert "it holds datasets, name one (a, b): parts" in capsys.readouterr().err
+    assert "it holds datasets: name one (a, b): parts" in capsys.readouterr().err
 
 
 def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -168,7 +168,7 @@ def test_a_path_that_looks_like_a_flag_is_told_how_to_be_written(
     with pytest.raises(SystemExit) as ended:
         main(["info", "-run"])
     assert ended.value.code == 2
-    assert "is written ./-run" in capsys.readouterr().err
+    assert "write a path that begins with a dash as ./-run" in capsys.readouterr().err
 
 
 def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -408,7 +408,7 @@ KEPT: dict[str, dict[str, str]] = {
         "link.html": "this command reads it",
         "lock.html": "lock.html",
     },
-    "report dataset --out": {"dataset/report.html": "Nothing else is written into a dataset"},
+    "report dataset --out": {"dataset/report.html": "A new file inside a dataset would prevent"},
     **{f"export {exporter} alone.mcap --out": {"lock": "lock"} for exporter in EXPORTERS.names()},
 }
 """Command -> what it shall not write over, and words of the reason."""
@@ -549,7 +549,7 @@ def test_nothing_is_written_into_another_run_or_dataset(
     *words, source, flag = command.split()
     (place / target).parent.mkdir(parents=True, exist_ok=True)
     assert exit_code(*words, place / source, flag, place / target) == 2
-    assert "Nothing else is written into" in capsys.readouterr().err
+    assert "would prevent it from being replaced" in capsys.readouterr().err
     assert files_of(place) == before
 
 
@@ -592,7 +592,7 @@ def test_a_copy_needs_a_place_beside_its_original(
     monkeypatch.setattr(reproducing, "read_original", lambda path: original(source=source))
     before = files_of(place / "runs")
     assert exit_code("generate", "--config", source, "--out", place / out) == 2
-    assert "needs a place of its own" in capsys.readouterr().err
+    assert "needs a separate folder" in capsys.readouterr().err
     assert files_of(place / "runs") == before
 
 

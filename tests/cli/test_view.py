@@ -40,7 +40,7 @@ def run_folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     ("flags", "words"),
     [
-        ((), "There is no such file"),
+        ((), "No such file"),
         (("--save", "x.mp4"), "writes a .rrd file"),
         (("--port", "80"), "--port belongs to --web"),
         (("--web", "--save", "x.rrd"), "--web serves"),
@@ -59,12 +59,12 @@ def test_bad_requests_are_one_sentence(
 @pytest.mark.parametrize(
     ("name", "flags", "words"),
     [
-        ("video.mp4", (), "The file is no recording (.mcap)"),
+        ("video.mp4", (), "The file is not a recording (.mcap)"),
         ("cut.mcap.part", (), "demorec recover"),
         ("folder", (), "The folder holds no recording"),
-        ("runs", (), "it holds runs, name one (cubes)"),
-        ("saved.rrd", ("--compare",), "is shown as it is"),
-        ("nothing.rrd", (), "There is no such file"),
+        ("runs", (), "it holds runs: name one (cubes)"),
+        ("saved.rrd", ("--compare",), "is shown unchanged"),
+        ("nothing.rrd", (), "No such file"),
         ("episode.mcap", ("--screenshot", "x.png", "--at", "-1"), "--at -1 is out of range: choose 0 to 0.133 s"),
         ("episode.mcap", ("--screenshot", "x.png", "--at", "999"), "--at 999 is out of range: choose 0 to 0.133 s"),
     ],

@@ -58,13 +58,13 @@ def make_hdf5(path: Path) -> None:
 
 
 ODD: tuple[tuple[Callable[[Path], None], str], ...] = (
-    (make_fifo, "This is a FIFO, no file and no folder"),
-    (make_socket, "This is a socket, no file and no folder"),
-    (make_device, "This is a device, no file and no folder"),
+    (make_fifo, "This is a FIFO, not a file or folder"),
+    (make_socket, "This is a socket, not a file or folder"),
+    (make_device, "This is a device, not a file or folder"),
     (make_dangling, "This is a link whose target is missing"),
     (make_loop, "This cannot be read (Too many levels of symbolic links)"),
     (make_empty_folder, "The folder holds no recording (*.mcap), run (run.json) or dataset (meta/info.json)"),
-    (make_nothing, "There is no such file or folder"),
+    (make_nothing, "No such file or folder"),
     (make_hdf5, "Expected a r"),
 )
 
@@ -210,8 +210,8 @@ def test_what_a_kill_left_is_named_with_what_to_do(
     exit_code(command, after_a_kill, *flags)
     told = capsys.readouterr()
     assert (
-        "Left out: a recording is unfinished (being made, or left by a crash): demorec recover "
-        f"'{after_a_kill}/episodes/episode_000001.mcap.part' keeps what is whole in it."
+        "Left out: a recording is unfinished (in progress, or left by a crash): demorec recover "
+        f"'{after_a_kill}/episodes/episode_000001.mcap.part' keeps the rest of it."
     ) in told.out + told.err
 
 
@@ -223,7 +223,7 @@ def test_where_nothing_else_is_it_is_named_too(
     (after_a_kill / "episodes/episode_000000.mcap").unlink()
     assert exit_code(command, after_a_kill / asked) == 2
     told = capsys.readouterr().err
-    assert f"demorec recover '{after_a_kill}/episodes/episode_000001.mcap.part' keeps what is whole in" in told
+    assert f"demorec recover '{after_a_kill}/episodes/episode_000001.mcap.part' keeps the rest of" in told
     assert ("a recording is unfinished" if asked else "2 recordings are unfinished") in told
 
 

@@ -173,7 +173,7 @@ def test_the_commands_take_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     with find_episodes([run])[0].open() as episode:
         assert list(episode.depth) == ["wrist_depth"]
     assert exit_code("export", "lerobot", run, "--out", tmp_path / "plain", "--no-verify") == 0
-    assert "left out unless --depth asks for them: camera wrist_depth" in capsys.readouterr().out
+    assert "left out without --depth: camera wrist_depth" in capsys.readouterr().out
 
 
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {

@@ -464,8 +464,8 @@ def test_jpeg_files_must_be_whole(name: str, tmp_path: Path, capsys: pytest.Capt
     [
         (("import", "hdf5"), "Name an HDF5 file"),
         (("import", "hdf5", "demo.hdf5"), "An import needs --mapping and --out"),
-        (("import", "hdf5", "demo.toml", "--suggest"), "The file is no recording"),
-        (("import", "hdf5", "none.hdf5", "--suggest"), "There is no such file"),
+        (("import", "hdf5", "demo.toml", "--suggest"), "The file is not a recording"),
+        (("import", "hdf5", "none.hdf5", "--suggest"), "No such file"),
         (("import", "hdf5", "other.hdf5", "--suggest"), "The layout is not robomimic's or Isaac Lab's"),
         (("import", "hdf5", "demo.hdf5", "demo.hdf5", "--mapping", "demo.toml", "--out", "run"), "given twice"),
         (("import", "hdf5", "demo.hdf5", "--mapping", "bad.toml", "--out", "run"), "Did you mean 'dataset'?"),

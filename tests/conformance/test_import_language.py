@@ -166,7 +166,7 @@ def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.Ca
     capsys.readouterr()
     words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "--no-verify")
     assert exit_code(*words) == 0
-    told = "No subtask is known, so none is written, in episode_000001.mcap."
+    told = "No subtasks are known, so none are written, for episode_000001.mcap."
     assert told in capsys.readouterr().out
     assert [len(row["language_persistent"]) for row in rows_of(tmp_path / "dataset")].count(0) == len(
         [row for row in rows_of(tmp_path / "dataset") if row["episode_index"] == 1]

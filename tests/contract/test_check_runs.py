@@ -139,7 +139,7 @@ def test_a_recording_that_a_killed_run_has_not_listed_yet(run: Path, complete: b
         edit_json(run / "run.json", lambda data: data.update(num_episodes=9))
     (found,) = checked(run, "run", only=["run_files"]).results
     assert "episode_000007.mcap is not in run.json" in found.detail
-    assert ("the command that began the run takes it in" in found.detail) != complete
+    assert ("the command that began the run adds it" in found.detail) != complete
 
 
 def test_an_episode_twice_is_a_copy(run: Path) -> None:

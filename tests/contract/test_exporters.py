@@ -72,7 +72,7 @@ def test_what_it_makes_is_known(exporter: str, run: Path, tmp_path: Path) -> Non
     assert kind not in ("nothing", "unreadable")
     assert name_of(kind)
     if out.is_dir():
-        with pytest.raises(ConfigError, match="Nothing else is written into a dataset"):
+        with pytest.raises(ConfigError, match="A new file inside a dataset would prevent"):
             refuse_inside([out / "inner"])
 
 

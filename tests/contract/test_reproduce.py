@@ -83,7 +83,7 @@ def test_another_episode_flag_beside_a_run_is_refused(
 ) -> None:
     assert exit_code("generate", "--config", run / "run.json", "--out", tmp_path / "copy", *flags) == 2
     said = capsys.readouterr().err
-    assert f"again as they are: leave out {named}." in said
+    assert f"again unchanged: leave out {named}." in said
     assert not (tmp_path / "copy").exists()
 
 

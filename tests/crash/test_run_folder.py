@@ -80,7 +80,7 @@ def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path: Path) -
     (stranger / "thesis.tex").write_text("mine")
     before = content_of(tmp_path)
     for overwrite in (False, True):
-        with pytest.raises(ConfigError, match="of no run"):
+        with pytest.raises(ConfigError, match="not part of a run"):
             run_fake(stranger, overwrite=overwrite)
     with pytest.raises(ConfigError, match="holds another run"):
         run_fake(run, seed=1)

@@ -147,7 +147,7 @@ def test_an_import_records_what_the_user_names(tmp_path: Path, capsys: Capture) 
     assert exit_code("info", run) == 0
     assert "action    wanted (4 elements)" in capsys.readouterr().out
     assert exit_code("import", "lerobot", root, "--out", run) == 2  # another import, since the roles differ
-    assert "Another recording is there already" in capsys.readouterr().err
+    assert "Another recording exists already" in capsys.readouterr().err
 
 
 def test_what_the_user_names_counts_more_than_what_an_import_recorded(tmp_path: Path, capsys: Capture) -> None:

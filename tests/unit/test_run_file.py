@@ -107,10 +107,10 @@ def edit(path: Path, change: Callable[[Any], object]) -> None:
         (lambda run: run["episodes"][0].update(episode_index=-1), "episode -1"),
         (lambda run: run["episodes"][0].update(attempt=10**9), "attempt 1000000000"),
         (lambda run: run["episodes"][0].update(attempt=-1), "attempt -1"),
-        (lambda run: run["episodes"][0].update(episode_index=10**6), "names the file"),
-        (lambda run: run["episodes"][0].update(file="../../elsewhere.mcap"), "names the file '../../elsewhere.mcap'"),
-        (lambda run: run["episodes"][0].update(file=""), "names the file ''"),
-        (lambda run: run["episodes"].append(run["episodes"][0]), "two lines are of episode 0, attempt 0"),
+        (lambda run: run["episodes"][0].update(episode_index=10**6), "has the file"),
+        (lambda run: run["episodes"][0].update(file="../../elsewhere.mcap"), "has the file '../../elsewhere.mcap'"),
+        (lambda run: run["episodes"][0].update(file=""), "has the file ''"),
+        (lambda run: run["episodes"].append(run["episodes"][0]), "two lines have episode 0, attempt 0"),
     ],
 )
 def test_numbers_that_no_run_has_are_damage(tmp_path: Path, change: Callable[[Any], object], words: str) -> None:

@@ -1,1 +1,1 @@
-"""What the commands have in common: flags and files of them, what is said on a terminal, and how far a command is."""
+"""Shared parts of the commands: flags and their files, output to a terminal, and progress."""

@@ -1,7 +1,7 @@
-"""How the fields of a command become flags, and how its help is laid out.
+"""Turn the fields of a command into flags, and lay out its help.
 
-tyro draws the help; the rules here decide what it says: optional values show their type alone, a default is shown only
-where it is a value, and texts are broken where the terminal ends.
+tyro renders the help by these rules: optional values show only their type, a default is shown only if it is a value,
+and lines are wrapped at the terminal's width.
 """
 
 from __future__ import annotations
@@ -45,34 +45,34 @@ FLAG_TYPES = ConstructorRegistry()
 
 _HOME = re.compile(r"^(--[\w-]+=|)~(?=/|$)")
 _NARROWEST = 40
-"""Columns; on a narrower terminal lines are broken there, as tyro breaks the table of flags."""
+"""Minimum columns; a narrower terminal wraps lines itself, like tyro's table of flags."""
 _UNWRITABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode's categories of control characters, of bytes that are not UTF-8, and of ends of lines and paragraphs."""
 _HELP_ALL = "--help-all"
 _left_out: dict[str, bool] = {}
 """Field that the help of the command that is being parsed leaves out -> whether the command has it."""
 _HINTED = object()
-"""Marks a type for which tyro's own rule is asked."""
+"""Marks a type that tyro's own rule handles."""
 
 
 def terminal_width() -> int:
-    """Columns of the terminal, or of COLUMNS, or 80."""
+    """Columns of the terminal, or COLUMNS, or 80."""
     return max(_NARROWEST, shutil.get_terminal_size().columns)
 
 
 def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
-    """An instance of the command from its flags; `command.defaults(args)`, where there is one, has their defaults.
+    """Parse the flags into an instance of the command; `command.defaults(args)`, if it exists, has their defaults.
 
     Args:
         command: A dataclass.
-        args: Of the command line.
+        args: Arguments of the command line.
         prog: Name of the program.
 
     Raises:
-        SystemExit: 0 after --help, 2 after a wrong flag, which is reported first.
+        SystemExit: 0 after --help, 2 after reporting a wrong flag.
     """
     defaults = command.defaults(args) if hasattr(command, "defaults") else MISSING_NONPROP
-    # ~ within quotes and in --out=~/new, which bash leaves as it is
+    # bash does not expand ~ within quotes and in --out=~/new
     args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
     asks_for_help = bool({"-h", "--help", _HELP_ALL} & set(args))
     leaves_out = asks_for_help and _HELP_ALL not in args
@@ -84,7 +84,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
         with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err), _leaving_out(rare) as hidden:
             parsed = tyro.cli(
                 command,
-                args=["--help"] if asks_for_help else args,  # else usage would lack what stands in front of it
+                args=["--help"] if asks_for_help else args,  # otherwise usage would lack the preceding words
                 prog=prog,
                 description=inspect.cleandoc(command.__doc__ or ""),
                 default=defaults,
@@ -98,7 +98,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
             say(f"{prog} {_HELP_ALL} shows {sum(hidden.values())} more options.")
         for word in args if end.code else ():
             if word.startswith("-") and Path(word).exists():
-                tell(f"{prog}: a path that begins with a dash is written ./{word}")
+                tell(f"{prog}: write a path that begins with a dash as ./{word}")
         raise
     check_targets(parsed)
     return parsed
@@ -116,7 +116,7 @@ def _leaving_out(names: frozenset[str]) -> Iterator[Mapping[str, bool]]:
 
 
 def _laid_out(page: str, width: int) -> list[str]:
-    """tyro's help, which breaks its boxes alone, in lines that fit; indented ones (examples) stay."""
+    """Fit tyro's help, which wraps only its boxes, to the width; indented lines (examples) stay."""
     lines: list[str] = []
     for line in page.splitlines():
         lines += [line] if line.startswith(" ") else textwrap.wrap(line, width, break_on_hyphens=False) or [""]
@@ -126,7 +126,7 @@ def _laid_out(page: str, width: int) -> list[str]:
 
 @FLAG_TYPES.struct_rule
 def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
-    """A dataclass as tyro has it, with each text in one paragraph and a hint at the default where that is a value."""
+    """tyro's dataclass rule, with each help text in one paragraph and a hint if the default is a value."""
     if _HINTED in info.markers:
         return None
     spec = ConstructorRegistry.get_struct_spec(dataclasses.replace(info, markers=(*info.markers, _HINTED)))
@@ -159,20 +159,18 @@ def _whole_number(word: str) -> int:
 
 
 def _line_of_text(word: str) -> str:
-    """A word that may be written into a file of lines (YAML, JSON, TOML), encoded as UTF-8."""
+    """Read a word that may be written into a line-based file (YAML, JSON, TOML) in UTF-8."""
     if any(unicodedata.category(character) in _UNWRITABLE for character in word):
         raise ValueError(f"{printable(word)!r} is not one line of text: it has a line end or another control character")
     return word
 
 
 def _path(word: str) -> Path:
-    """Read a path. Its errors pass through tyro, which would not repeat the reason where several paths may be given."""
-    if not word:  # Python would take it for the current folder
-        raise ConfigError(
-            "One of the paths is empty (an unset variable of the shell?): the current folder is written as ."
-        )
+    """Read a path. tyro's own error would omit the reason if several paths are allowed."""
+    if not word:  # Path("") would be the current folder
+        raise ConfigError("One of the paths is empty (an unset shell variable?): write the current folder as .")
     if "\0" in word:
-        raise ConfigError(f"A path has no zero byte: {word}")
+        raise ConfigError(f"A path cannot contain a zero byte: {word}")
     return Path(word)
 
 
@@ -182,12 +180,14 @@ _VALUE_OF: Mapping[Any, Callable[[str], Any]] = {
     str: _line_of_text,
     Path: _path,
 }
-"""Type of an option, or of one of its values -> what reads a word of the command line, ValueError for a wrong one."""
+"""Type of an option or of one of its values -> parser of a word of the command line, which raises ValueError."""
 
 
 @FLAG_TYPES.primitive_rule
 def _value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--noise FLOAT`; `--workers INT` and `--codec {auto,h264,av1}` with auto for None, else shown as `{None}|INT`."""
+    """`--noise FLOAT`; `--workers INT` and `--codec {auto,h264,av1}` with auto for None, which tyro would show as
+    `{None}|INT`.
+    """
     optional = _kind_beside_none(info.type)
     kind = info.type if optional is None else optional
     choices = ("auto", *get_args(kind)) if optional is not None and get_origin(kind) is Literal else None
@@ -240,7 +240,7 @@ def _optional_pair(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | N
 
 @FLAG_TYPES.primitive_rule
 def _optional_words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--language [STR ...]` where leaving the flag away (None) is another thing than giving it without a value."""
+    """`--language [STR ...]` where omitting the flag (None) differs from giving it without a value."""
     if _kind_beside_none(info.type) != tuple[str, ...]:
         return None
     return PrimitiveConstructorSpec(
@@ -259,11 +259,11 @@ def _kind_beside_none(kind: Any) -> Any:
 
 
 Allow = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="MODULE", help_behavior_hint="(may be given again)")]
-"""One module or package each time, since paths may follow."""
+"""One module or package per flag, because paths may follow."""
 
 
 def allowed_modules(names: tuple[str, ...]) -> tuple[str, ...]:
-    """What --allow names; ConfigError where that can be no module."""
+    """Names of --allow; ConfigError if one is not a valid module name."""
     for name in names:
         if not is_module_name(name):
             parts = split_name(name)

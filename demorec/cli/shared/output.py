@@ -1,7 +1,7 @@
-"""The only way of the commands to a terminal: whole lines and tables, in which nothing foreign can act.
+"""The only output of commands to a terminal: whole lines and tables in which foreign text cannot act.
 
-A file name, a task or a message of a recording may hold escape codes or line ends; `printable` spells them out in
-every line that is written here. `print` is forbidden in the package (ruff's T20).
+A file name, a task or a message of a recording may contain escape codes or line ends; `printable` escapes them in every
+line that is written here. `print` is forbidden in the package (ruff's T20).
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ class OutputError(DemorecError):
 
 
 _names: dict[str, str] = {}
-"""Path of a run that is no user's -> what the user named, while such runs are read."""
+"""Path of a temporary run -> the user's name for it, while such runs are read."""
 _EPISODE_FILE = r"(?:/episodes/episode_0*(\d+)\.mcap)?"
 
 
 @contextlib.contextmanager
 def renamed(names: Mapping[str, str]) -> Iterator[Callable[[Any], Any]]:
-    """Let all that is written say `names[path]` for a path, and "NAME: episode 3" for a recording in it.
+    """Print `names[path]` for a path, and "NAME: episode 3" for a recording in it.
 
-    Gives what does so: to texts, and to those in lists and dicts.
+    Yields the function that renames, in texts and in nested lists and dicts of texts.
     """
     _names.update(names)
     try:
@@ -61,7 +61,7 @@ def _in_users_words(value: Any) -> Any:
 
 
 def say(*lines: str) -> None:
-    """Write lines to standard output, the answer of a command.
+    """Write lines to standard output, which is for the command's answer.
 
     Raises:
         OutputError: They cannot be written.
@@ -71,27 +71,27 @@ def say(*lines: str) -> None:
 
 
 def say_json(value: object) -> None:
-    """Write a value as JSON to standard output; characters beyond ASCII are escaped by JSON itself."""
+    """Write a value as JSON to standard output; non-ASCII characters are escaped by JSON."""
     say(*json.dumps(_in_users_words(value), indent=2).splitlines())
 
 
 def tell(*lines: str) -> None:
-    """Write lines to standard error: what a person should know beside the answer. Never fails."""
-    with contextlib.suppress(OSError, OutputError):  # when nobody is left to be told
+    """Write lines to standard error: notes besides the answer. Never fails."""
+    with contextlib.suppress(OSError, OutputError):  # when the terminal is closed
         _write(sys.stderr, lines)
 
 
 def counted(count: int, noun: str) -> str:
-    """A number of things: "1 episode", "2 episodes"."""
+    """Count with a noun: "1 episode", "2 episodes"."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
     text = "".join(f"{printable(_in_users_words(line))}\n" for line in lines)
     encoding = stream.encoding or "utf-8"
-    text = text.encode(encoding, "backslashreplace").decode(encoding)  # a terminal of another alphabet
+    text = text.encode(encoding, "backslashreplace").decode(encoding)  # the terminal has another encoding
     try:
-        with tqdm.external_write_mode(file=stream):  # progress bars step aside
+        with tqdm.external_write_mode(file=stream):  # clears progress bars while writing
             stream.write(text)
             stream.flush()
     except OSError as error:
@@ -102,7 +102,7 @@ def _write(stream: TextIO, lines: tuple[str, ...]) -> None:
 
 
 class PrintableFormatter(logging.Formatter):
-    """Log lines, as harmless as all others; those of libraries begin with their level, ours are sentences."""
+    """Formatter that escapes log lines; those of libraries begin with their level, demorec's are sentences."""
 
     def format(self, record: logging.LogRecord) -> str:
         """One line, or several for a traceback, each made printable."""
@@ -111,7 +111,7 @@ class PrintableFormatter(logging.Formatter):
 
 
 def aligned(rows: Iterable[Sequence[str]]) -> list[str]:
-    """Columns of equal width, two spaces between them, on a terminal that shows `printable` text."""
+    """Join columns of equal width by two spaces, for a terminal that shows `printable` text."""
     table = [[printable(cell) for cell in row] for row in rows]
     widths = [max(map(display_width, column)) for column in zip(*table, strict=True)]
     return [
@@ -121,7 +121,7 @@ def aligned(rows: Iterable[Sequence[str]]) -> list[str]:
 
 
 def size_in_words(num_bytes: float) -> str:
-    """Bytes in the unit that reads best."""
+    """Format bytes in the most readable unit."""
     for unit, factor in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6)):
         if num_bytes >= factor:
             return f"{num_bytes / factor:.1f} {unit}"

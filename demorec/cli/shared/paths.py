@@ -1,4 +1,4 @@
-"""What commands read, recordings or not; and where they must not write, since they read it."""
+"""Inputs of commands, recordings or not, and the places where a command must not write because it reads them."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ Readable = Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_R
 MappingFile = Annotated[
     Path | None,
     arg(
-        help="Mapping file, as demorec import takes it, for bags and other formats that need one (auto: the one that "
-        "demorec import --suggest writes, if it leaves nothing to decide)."
+        help="Mapping file, as for demorec import, for bags and other formats that need one (auto: the output "
+        "of demorec import --suggest, if it is complete)."
     ),
 ]
 _PARTS = (EPISODES, FAILED, UNFINISHED)
 
 
 def need_paths(paths: Sequence[Path], command: str) -> None:
-    """Raise ConfigError when no path is given; `command` names one that takes all that can be shown."""
+    """Raise ConfigError if no path is given; `command` is a command that accepts all readable paths."""
     if not paths:
         raise ConfigError(
             f"No path is given: name a recording, a run or a dataset, e.g. demorec {command} recordings/demo."
@@ -41,39 +41,39 @@ def need_paths(paths: Sequence[Path], command: str) -> None:
 
 
 def tell_unfinished(paths: Iterable[Path]) -> None:
-    """Name what is unfinished in what the user has named, which the command leaves out."""
+    """Print the unfinished recordings among the user's paths, which the command leaves out."""
     tell(*(f"Left out: {left}." for path in paths if (left := find(path).left)))
 
 
 def tell_incomplete(paths: Iterable[Path]) -> None:
-    """Name what unfinished runs lack, of which the command takes what is there."""
+    """Print what unfinished runs lack; the command uses their finished part."""
     for path in paths:
         if json_object(path / RUN_NAME).get("complete") is False:
-            with suppress(DemorecError):  # reported where the run is read
+            with suppress(DemorecError):  # reported when the run is read
                 tell(f"Note: {load_any_run_file(path).unfinished}: {path}")
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
-    """Of recordings, runs and datasets: those files and folders in which an image may be a part of the data.
+    """Files and folders of recordings, runs and datasets in which an image may be part of the data.
 
-    A run's own folder is none: an .rrd file or an image beside its recordings may be replaced.
+    A run's own folder is not among them: an .rrd file or an image next to its recordings may be replaced.
     """
     return [path / DATASET if find(path).kind in EPISODE_FOLDERS else path for path in paths]
 
 
 def refuse_sources(paths: Sequence[Path], targets: Sequence[Path], *, do: str) -> None:
-    """Raise ConfigError when a recording that is to be made would lie in, or replace, what the same command reads.
+    """Raise ConfigError if a new recording would be inside, or replace, an input of the same command.
 
-    So it is when one would replace another.
+    Also raises if one new recording would replace another.
 
     Args:
-        paths: As the user named them: recordings, runs, folders of recordings, datasets. A run counts as a whole,
-            also where only one of its recordings is named.
-        targets: Of the new recordings.
-        do: What is done with each: "render".
+        paths: The user's paths: recordings, runs, folders of recordings, datasets. A run counts as a whole, even if
+        only one of its recordings is named.
+        targets: Paths of the new recordings.
+        do: The command's verb: "render".
     """
     if len(set(targets)) != len(targets):
-        raise ConfigError(f"Two recordings have the same name and would get into each other's way: {do} them apart.")
+        raise ConfigError(f"Two recordings have the same name and would overwrite each other: {do} them apart.")
     sources = [run_of(path) or path for path in paths]
     for target in targets:
         reason = use_as_source(target.resolve(), sources)
@@ -83,9 +83,9 @@ def refuse_sources(paths: Sequence[Path], targets: Sequence[Path], *, do: str) -
 
 
 def refuse_inside(targets: Iterable[Path]) -> None:
-    """Raise ConfigError when something new would lie inside of a dataset, or in a part of a run or an evaluation.
+    """Raise ConfigError if a target is inside a dataset, or inside a part of a run or an evaluation.
 
-    Whatever a person puts there is foreign to it, and would keep it from being replaced ever after.
+    Such a file would be foreign there, and would prevent the folder from being replaced later.
     """
     for target in targets:
         resolved = target.resolve()
@@ -94,13 +94,13 @@ def refuse_inside(targets: Iterable[Path]) -> None:
             is_part = place.name in _PARTS and any((whole / name).is_file() for name in (RUN_NAME, EVALUATION_NAME))
             if is_part or (place != resolved and DATASET_KIND.recognises(place)):
                 raise ConfigError(
-                    f"Nothing else is written into {'a run' if is_part else 'a dataset'}, since it could not be "
-                    f"replaced then: choose a place outside of {place}: {target}"
+                    f"A new file inside {'a run' if is_part else 'a dataset'} would prevent it from being "
+                    f"replaced: choose a path outside {place}: {target}"
                 )
 
 
 def run_of(recording: Path) -> Path | None:
-    """The run that a recording belongs to by its place; None for one elsewhere."""
+    """Run whose folder contains a recording; None if there is none."""
     folder = recording.resolve().parent
     return folder.parent if folder.name in (EPISODES, FAILED) else None
 
@@ -109,18 +109,18 @@ def run_of(recording: Path) -> Path | None:
 def reading(
     paths: Sequence[Path], mapping: Path | None, *, imports_datasets: bool = False
 ) -> Iterator[tuple[Path, ...]]:
-    """What to read in the place of each path; until the context is left, all output names the user's paths.
+    """Yield the paths to read instead of the given ones; inside the context, all output names the user's paths.
 
     Imported files (`demorec.runs.foreign`) are read through a temporary run. No output names that run:
     its episodes are called "demo.hdf5: episode 3".
 
     Args:
-        paths: As the user named them.
-        mapping: Of `--mapping`.
-        imports_datasets: Whether the command takes datasets as recordings.
+        paths: The user's paths.
+        mapping: Value of `--mapping`.
+        imports_datasets: Whether the command reads datasets as recordings.
 
     Raises:
-        ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
+        ConfigError: A mapping is missing, impossible or given without need, or the disk is too small.
         DemorecError: A path cannot be read.
     """
     if mapping is None and not any(import_kind(path, imports_datasets) for path in paths):

@@ -1,4 +1,4 @@
-"""How far a command is: a bar on a terminal, now and then a line in a log file (Slurm, nohup, CI)."""
+"""Progress of a command: a bar on a terminal, occasional lines in a log file (Slurm, nohup, CI)."""
 
 from __future__ import annotations
 
@@ -14,31 +14,31 @@ from demorec.cli.shared.output import tell
 from demorec.core.files import Closing
 
 _QUIET_S = 10.0
-"""Time before the first line, and between the first ones: what is over by then needs none."""
+"""Time before the first line and between the first lines; a shorter job prints none."""
 _SHARE = 0.05
-"""Share of the time that has passed after which the next line is due."""
+"""Part of the elapsed time after which the next line is due."""
 _LONGEST_S = 300.0
-"""Longest time without a line."""
+"""Maximum time without a line."""
 _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
-"""Without tqdm's own time that is left, which counts the start as work."""
+"""Without tqdm's own estimate of the remaining time, which counts the start as work."""
 
 
 class ProgressBar(Closing):
-    """Counts what is done of one job; a context manager.
+    """Progress counter of one job; a context manager.
 
-    On a terminal a bar. Elsewhere a line every ten seconds, in a long job every 5 % of the time that has passed, but
-    at least every five minutes. The time that is left is counted from the first end on, when all that has to start has
-    started, and shown after one more round.
+    Shows a bar on a terminal. Elsewhere it prints a line every ten seconds, in a long job after each 5 % of the elapsed
+    time, at least every five minutes. The remaining time is estimated from the first finished item on, because workers
+    have started by then, and is shown after one more round.
 
     Args:
-        title: What is being done, as in "exporting".
-        total: How many things there are; 0 when it is not known yet.
-        done: How many of them were done before.
-        unit: What one of them is called.
-        at_once: How many of them are worked on at the same time.
-        is_terminal: Whether a person watches (default: whether standard error is a terminal).
-        clock: Seconds, monotonic.
-        quiet: Time before the first line, seconds.
+        title: Activity, as in "exporting".
+        total: Number of items; 0 while unknown.
+        done: Number of items finished before this call.
+        unit: Noun for one item.
+        at_once: Number of items processed at the same time.
+        is_terminal: Whether to show a bar (default: whether standard error is a terminal).
+        clock: Monotonic time in seconds.
+        quiet: Time before the first line, s.
     """
 
     def __init__(
@@ -56,7 +56,7 @@ class ProgressBar(Closing):
         self._title, self._unit, self._clock, self._quiet = title, unit, clock, quiet
         self.done, self.total = done, total
         self._at_once = at_once
-        self._first_end: tuple[float, int] | None = None  # when, and how many were done then
+        self._first_end: tuple[float, int] | None = None  # time, and the number of finished items
         self._note = ""
         self._started = self._last_line = clock()
         watched = sys.stderr.isatty() if is_terminal is None else is_terminal
@@ -70,7 +70,7 @@ class ProgressBar(Closing):
             self._writer.start()
 
     def close(self) -> None:
-        """Take the bar off the terminal's last line, let no line follow; harmless when called twice."""
+        """Remove the bar from the terminal and print no further lines; idempotent."""
         self._closed.set()
         if self._writer is not None:
             self._writer.join()
@@ -78,11 +78,11 @@ class ProgressBar(Closing):
             self._bar.close()
 
     def advance(self) -> None:
-        """One more is done."""
+        """Count one more finished item."""
         self.set(self.done + 1)
 
     def set(self, done: int, total: int | None = None) -> None:
-        """So many are done, of `total` if that is known only now."""
+        """Set the number of finished items, and `total` if only now known."""
         if self._first_end is None and done > self.done:
             self._first_end = self._clock(), done
         self.done = done
@@ -94,18 +94,18 @@ class ProgressBar(Closing):
             self._bar.update(done - self._bar.n)
 
     def note(self, text: str) -> None:
-        """Something to be shown with the count from now on: "2 failed attempts"."""
+        """Set the text shown with the count: "2 failed attempts"."""
         self._note = text
         if self._bar is not None:
             self._bar.set_postfix_str(self._last_words())
 
     def _write_lines(self) -> None:
-        """However long one of the things takes: a thread of its own."""
-        while not self._closed.wait(self._quiet / 9):  # so that a line is hardly later than it should be
+        """Write lines from a separate thread, independent of the time that an item takes."""
+        while not self._closed.wait(self._quiet / 9):  # so that a line is hardly late
             self.write_line_if_due()
 
     def write_line_if_due(self) -> None:
-        """Write how far the job is, unless that was done a short time ago."""
+        """Write a line unless the last one was written recently."""
         now = self._clock()
         if now - self._last_line < max(self._quiet, min(_LONGEST_S, _SHARE * (now - self._started))):
             return
@@ -117,7 +117,7 @@ class ProgressBar(Closing):
         tell(", ".join(filter(None, (f"{self._title}: {how_far}", passed, self._last_words()))))
 
     def _last_words(self) -> str:
-        """How much time is left, if that can be estimated, and the note."""
+        """The estimated remaining time, if known, and the note."""
         words = [self._note] if self._note else []
         if self._first_end is not None and self.done < self.total:
             began, done_then = self._first_end
@@ -128,7 +128,7 @@ class ProgressBar(Closing):
 
 
 def duration(seconds: float) -> str:
-    """Seconds in the unit that reads best."""
+    """Format seconds in the most readable unit."""
     for unit, factor in (("days", 86400.0), ("h", 3600.0), ("min", 60.0)):
         if seconds >= 2 * factor:
             return f"{seconds / factor:.1f} {unit}"

@@ -1,4 +1,4 @@
-"""Lines about the roles of features: what was taken for what, and what is known of it."""
+"""Lines about the roles of features: the role of each, and its known properties."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MAX_NAMES = 4
 
 
 def roles_as_plain(roles: Roles) -> dict[str, Any]:
-    """The roles as JSON has them."""
+    """The roles as data for JSON."""
     return {
         "of": dict(roles.of),
         "state": list(roles.state),
@@ -29,7 +29,7 @@ def roles_as_plain(roles: Roles) -> dict[str, Any]:
 
 
 def role_facts(roles: Roles) -> Iterator[tuple[str, str]]:
-    """(name, value) of what has no role, of state, action and grippers."""
+    """(name, value) of the features without a role, state, action and grippers."""
     if roles.unknown:
         yield _NO_ROLE, ", ".join(roles.unknown)
     for role, parts in (("state", roles.state), ("action", roles.action)):
@@ -39,18 +39,18 @@ def role_facts(roles: Roles) -> Iterator[tuple[str, str]]:
 
 
 def _not_found(role: str) -> str:
-    """What is said of a state or an action that no feature is."""
+    """Text for a missing state or action."""
     return f"not found: --{role} FEATURE names it"
 
 
 def _grippers(roles: Roles) -> list[str]:
-    """Elements of the state that are grippers."""
+    """Names of the state's elements that are grippers."""
     elements = zip(roles.elements(roles.state), roles.grippers().tolist(), strict=True)
     return [name for name, is_gripper in elements if is_gripper]
 
 
 def roles_of_dataset(path: Path, named: NamedRoles) -> Roles | None:
-    """The roles of its features; None where info.json cannot be understood."""
+    """Roles of a dataset's features; None if info.json cannot be interpreted."""
     from demorec.datasets.lerobot.folder import LeRobotFolder
 
     try:
@@ -60,7 +60,7 @@ def roles_of_dataset(path: Path, named: NamedRoles) -> Roles | None:
 
 
 def roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
-    """The roles in an external run, whose recordings all have the same features; None without a readable one."""
+    """Roles of an external run, whose recordings share their features; None if no recording is readable."""
     from demorec.episode.roles import roles_of_recording
     from demorec.mcap import open_recording
 
@@ -74,12 +74,12 @@ def roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
 
 
 def feature_rows(path: Path, info: Mapping[str, Any], roles: Roles | None) -> list[tuple[str, ...]]:
-    """A row for each feature of a dataset below a head: those without a role first, counters last.
+    """A row for each feature of a dataset, after a header: features without a role first, counters last.
 
     Args:
-        path: Its folder.
-        info: What info.json says, as it is.
-        roles: The role of each feature; None where info.json cannot be understood.
+        path: The dataset's folder.
+        info: Content of info.json, unchecked.
+        roles: Role of each feature; None if info.json cannot be interpreted.
     """
     types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
     if roles is None:
@@ -103,7 +103,7 @@ def feature_rows(path: Path, info: Mapping[str, Any], roles: Roles | None) -> li
 
 
 def recording_features(features: Sequence[Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """What is known of each feature; those without a role come first."""
+    """Known properties of each feature; features without a role come first."""
     roles = {feature["role"] for feature in features}
     facts = [(role, _not_found(role)) for role in ("state", "action") if role not in roles]
     for feature in sorted(features, key=lambda feature: feature["role"] is not None):
@@ -122,7 +122,7 @@ def _feature(feature: Mapping[str, Any]) -> Iterator[str]:
 
 
 def _elements_in_words(names: Sequence[str]) -> str:
-    """Names of the elements of a vector in a line; the first and the last one of many."""
+    """Names of a vector's elements in one line; only the first and the last if there are many."""
     if is_numbered(names):
         return "unnamed" if len(names) > 1 else ""
     return ", ".join(names) if len(names) <= _MAX_NAMES else f"{names[0]} .. {names[-1]}"

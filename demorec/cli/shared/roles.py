@@ -1,4 +1,4 @@
-"""The flags by which commands that read other people's data let the user name features' roles and an arm's servos."""
+"""Flags by which users name features' roles and an arm's servos, for commands that read third-party data."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _GripperNames = Annotated[tuple[str, ...], UseAppendAction, arg(metavar="NAME")]
 
 @dataclass(frozen=True, kw_only=True)
 class RoleFlags:
-    """Features whose role the user names, of data that demorec did not simulate."""
+    """Features whose role the user names, in data that demorec did not simulate."""
 
     state: _Features = ()
-    """Feature that is the robot's state (auto: by its name); given several times, they are joined."""
+    """Feature with the robot's state (auto: by its name); repeat the flag to join several."""
     action: _Features = ()
-    """Feature that is the action (auto: by its name); given several times, they are joined."""
+    """Feature with the action (auto: by its name); repeat the flag to join several."""
     gripper: _GripperNames = ()
-    """Feature, or element of the state, that is a gripper (auto: by its name)."""
+    """Feature or state element with the gripper's position (auto: by its name)."""
 
     @property
     def named(self) -> NamedRoles:
-        """The flags for code that reads the data."""
+        """The flags as `NamedRoles`."""
         from demorec.episode.roles import NamedRoles
 
         return NamedRoles(state=self.state, action=self.action, gripper=self.gripper)
@@ -42,18 +42,18 @@ NamedByFlags = Annotated[RoleFlags, arg(name="")]
 
 @dataclass(frozen=True, kw_only=True)
 class MotorFlags:
-    """The servos of a real arm, whose values LeRobot recorded as state and action."""
+    """The servos of a real arm whose values LeRobot recorded as state and action."""
 
     motor_units: MotorUnits | None = None
-    """For a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): whether its joints are in
-    degrees, LeRobot's default, or scaled to -100..100 of their ranges. The dataset itself does not say so."""
+    """Joint units of a dataset that LeRobot recorded with an SO-101 (shoulder_pan.pos to gripper.pos): degrees,
+    LeRobot's default, or -100..100 of each joint's range. The dataset does not record the units.
+    """
     calibration: Path | None = None
-    """With --motor-units: the file that LeRobot saved of the arm's servos (auto: an arm that is built as its URDF
-    says)."""
+    """With --motor-units: LeRobot's calibration file of the arm (auto: an arm that matches its URDF)."""
 
     @property
     def named(self) -> Motors | None:
-        """The servos; None without --motor-units. Raises ConfigError for a calibration that is none of theirs."""
+        """The servos; None without --motor-units. Raises ConfigError if the calibration does not match them."""
         from demorec.robots.so101 import SO101_FOLLOWER
 
         if self.motor_units is not None:
