@@ -1,6 +1,6 @@
 """Words and numbers derived from a recording: subtasks, plans, memories, motions, wordings, progress and boxes.
 
-Everything follows from what was recorded (phases, events, poses, the scene as data); nothing is guessed.
+Everything is derived from the recording (phases, events, poses, the scene as data); nothing is guessed.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ KINDS: tuple[LanguageKind, ...] = get_args(LanguageKind)
 
 @dataclass(frozen=True, kw_only=True)
 class Statement:
-    """One sentence, true from a row of the dataset on until the next one of its kind.
+    """One sentence, valid from a dataset row until the next one of its kind.
 
     Attributes:
         row: Row of the episode, from 0.
-        kind: Subject of the sentence.
+        kind: Kind of the sentence.
         text: The sentence.
     """
 
@@ -33,6 +33,6 @@ BoxEntry = tuple[int, str, Mapping[str, Any]]
 """Row of a box in its episode, the kind of its object, and its other values by COCO's names.
 
 `bbox` is (x, y, width, height) of the pixels that show the object, `area` their number. `visible_fraction` is that
-number over the area, px, of the whole outline, hidden parts and those beyond the image's edge included; None for a
-shape whose outline is not known (meshes, URDFs), or behind the camera. `color` is a word, or "".
+number divided by the area, px, of the whole outline, including hidden parts and those beyond the image's edge; None for
+a shape with unknown outline (meshes, URDFs) or behind the camera. `color` is a word, or "".
 """

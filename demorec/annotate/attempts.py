@@ -1,4 +1,4 @@
-"""Timeline of an episode: segments of one phase, and the attempts at goals that they belong to."""
+"""Timeline of an episode: segments of one phase, grouped into attempts at goals."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 AttemptEnd = Literal["placed", "missed", "dropped", "misplaced", "unfinished"]
 _FAILURES: dict[str, AttemptEnd] = {"miss": "missed", "drop": "dropped"}
 _MAX_PLACED_DISTANCE_M = 0.02
-"""Distance of an object from its goal after the last attempt, up to which it counts as placed."""
+"""Maximum distance of an object from its goal after the last attempt to count as placed."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,8 +49,8 @@ class PhaseSegment:
 
     Attributes:
         first, end: The first frame, and the one after the last.
-        phase: As recorded; "" where there is none.
-        attempt: The attempt that it belongs to.
+        phase: As recorded; "" if missing.
+        attempt: Enclosing attempt.
         is_deliberate_miss: Whether these frames are part of a deliberate miss.
     """
 
@@ -63,7 +63,7 @@ class PhaseSegment:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeTimeline:
-    """A whole episode.
+    """Timeline of a whole episode.
 
     Attributes:
         attempts: In order of time.
@@ -75,7 +75,7 @@ class EpisodeTimeline:
 
     @property
     def is_dropped(self) -> bool:
-        """Whether objects are released from a height: the phases have no lowering."""
+        """Whether objects are released from a height, i.e. no phase lowers them."""
         phases = {segment.phase for segment in self.segments}
         return "release" in phases and "lower" not in phases and "carry" in phases
 
@@ -83,7 +83,7 @@ class EpisodeTimeline:
 def episode_timeline(recording: Recording) -> EpisodeTimeline:
     """Return attempts and segments of a recording.
 
-    An attempt begins where the script announced a grasp; a recording without such events is one attempt at its only
+    An attempt begins when the script announces a grasp; a recording without such events is one attempt at its only
     goal.
 
     Raises:
@@ -131,11 +131,11 @@ def _attempts(recording: Recording, trajectory: Trajectory, scene: Scene) -> lis
 
 
 def _next_attempt(attempts: list[GoalAttempt], name: str, frame: int, goals: Sequence[Goal]) -> GoalAttempt:
-    """Return the attempt that a new grasp begins; close the one before it."""
+    """Return the attempt that begins with a new grasp; close the previous one."""
     if not attempts:
         return GoalAttempt(first=frame, goal=_goal_of(name, goals, 0))
     before = attempts[-1]
-    if before.end == "unfinished":  # no failure was recorded, so the script went on to the next goal
+    if before.end == "unfinished":  # no failure was recorded, so the script continued with the next goal
         before = attempts[-1] = replace(before, end="placed")
     if before.end == "placed":
         return GoalAttempt(first=frame, goal=_goal_of(name, goals, 0 if before.goal is None else before.goal + 1))
@@ -143,7 +143,7 @@ def _next_attempt(attempts: list[GoalAttempt], name: str, frame: int, goals: Seq
 
 
 def _goal_of(name: str, goals: Sequence[Goal], first: int) -> int | None:
-    """Return the first goal from `first` on whose object has that name."""
+    """Return the first goal, from index `first`, whose object has that name."""
     return next((index for index in range(first, len(goals)) if goals[index].object == name), None)
 
 

@@ -1,6 +1,6 @@
 """Bounding boxes of the objects in segmentation images.
 
-Pixels are counted from 0, x to the right and y down. Boxes are of what is visible: occluded parts are not in them.
+Pixels are counted from 0, x to the right and y down. Boxes enclose visible pixels only, not occluded parts.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from demorec.episode.words import nouns_of
 from demorec.mcap import Recording
 
 _RIM_POINTS = 48
-"""Points on the rim of a cylinder."""
+"""Number of points on the rim of a cylinder."""
 
 
 def seen_objects(recording: Recording, rows: NDArray[np.intp], camera: SceneCamera) -> Iterator[BoxEntry]:
-    """Yield everything that a camera with segmentation sees in the given frames, row by row.
+    """Yield every object that a camera with segmentation sees in the given frames, row by row.
 
     Raises:
         RecordingError: The recording is damaged.
@@ -71,9 +71,9 @@ def _box(shown: NDArray[np.bool_]) -> list[int]:
 
 
 def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, world_from_body: Array) -> float | None:
-    """Return the area, px, of the whole outline of a convex body, as if nothing hid it and the image had no edge.
+    """Return the area, px, of a convex body's whole outline, ignoring occlusion and the image's edges.
 
-    None for a mesh or a URDF, and for a body that is not wholly before the camera.
+    None for a mesh or a URDF, and for a body not completely in front of the camera.
     """
     points = _rim(shape)
     if points is None:
@@ -82,10 +82,10 @@ def outline_area(camera: SceneCamera, world_from_camera: Array, shape: Shape, wo
     pixels = _project(camera, world_from_camera, pose.apply(points))
     if not bool(np.isfinite(pixels).all()):
         return None
-    from scipy.spatial import ConvexHull, QhullError  # takes a while to load
+    from scipy.spatial import ConvexHull, QhullError  # slow to import
 
     try:
-        return float(ConvexHull(pixels).volume)  # in the plane, that is its area
+        return float(ConvexHull(pixels).volume)  # in 2D, the volume is the area
     except QhullError:  # all points on one line
         return 0.0
 
@@ -100,13 +100,13 @@ def _project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Ar
 
 
 def _rim(shape: Shape) -> Array | None:
-    """Return points (N, 3) on a body, in its own frame, whose convex hull it is; None for other shapes."""
+    """Return points (N, 3) in the body's frame whose convex hull is the body; None for other shapes."""
     if shape.kind == "box":
         signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         return np.asarray(signs * np.array(shape.size))
     if shape.kind == "cylinder":
         angles = np.arange(_RIM_POINTS) * 2 * math.pi / _RIM_POINTS
-        # As large as the circle, which a polygon within it is not.
+        # The polygon gets the circle's area; an inscribed one would be smaller.
         radius = shape.size[0] * math.sqrt((2 * math.pi / _RIM_POINTS) / math.sin(2 * math.pi / _RIM_POINTS))
         half = shape.size[1] / 2
         rim = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=1)

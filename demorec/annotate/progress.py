@@ -1,7 +1,7 @@
-"""How far an episode has come: stages as SARM (arXiv 2509.25358) has them, from the true phases of the script.
+"""Progress within an episode: SARM's stages (arXiv 2509.25358), from the script's true phases.
 
-A stage is one phase in the service of one goal. What undoes progress belongs to the stage that must be done again:
-after a miss, a drop or a bad placement the next approach begins, so that progress falls back to where it was.
+A stage is one phase for one goal. Frames that undo progress belong to the stage to be repeated: after a miss, a drop or
+a bad placement the next approach begins, so that progress falls back.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ _ALSO = {
     "carry": "transport",
     "recover": "approach",
 }
-"""The tutorial's words for the same, and what a failure leads back to."""
+"""The tutorial's names for the same stages, and the stages to repeat after a failure."""
 WHOLE_TASK = "task"
-"""The only stage of an episode whose phases nobody knows."""
+"""The only stage of an episode with unknown phases."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -59,11 +59,12 @@ def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
 
 
 def dense_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageRun]:
-    """The stages of an episode's rows, in order of time; one alone where the phases are not those of our skills.
+    """Return the stages of an episode's rows, in order of time; a single stage if the phases are not those of demorec's
+    skills.
 
     Args:
         timeline: Timeline of the recording.
-        rows: (T,) which of its frames the dataset has.
+        rows: (T,) recorded frame of each dataset row.
     """
     names = [_stage_of(segment) for segment in timeline.segments]
     if not all(names):
@@ -75,7 +76,7 @@ def dense_runs(timeline: EpisodeTimeline, rows: NDArray[np.intp]) -> list[StageR
 
 
 def _stage_of(segment: PhaseSegment) -> str:
-    """Name of the stage that a segment belongs to, "" when nobody knows."""
+    """Name of a segment's stage, "" if unknown."""
     phase, attempt = _ALSO.get(segment.phase, segment.phase), segment.attempt
     if phase not in _STAGES or attempt.goal is None:
         return ""
@@ -85,7 +86,7 @@ def _stage_of(segment: PhaseSegment) -> str:
 
 
 def proportions(episodes: Sequence[Sequence[StageRun]], stages: Sequence[str]) -> dict[str, float]:
-    """Stage -> mean share of it in the time of an episode, of those episodes that have it; they sum up to one."""
+    """Stage -> mean share of an episode's time, over the episodes that have it; the shares sum to one."""
     shares: dict[str, list[float]] = {stage: [] for stage in stages}
     for runs in episodes:
         total = sum(run.last - run.first + 1 for run in runs)
@@ -98,12 +99,12 @@ def proportions(episodes: Sequence[Sequence[StageRun]], stages: Sequence[str]) -
 
 
 def progress(runs: Sequence[StageRun], stages: Sequence[str], share: dict[str, float]) -> Array:
-    """(T,) progress in 0..1: what the stages before take of the whole, and within a stage evenly over its rows.
+    """(T,) progress in 0..1: the sum of the preceding stages' shares, plus a linear increase within the stage.
 
     Args:
-        runs: Of one episode, in order, without gaps.
-        stages: Of this episode, in the order in which they shall be done.
-        share: Stage -> its share of the whole.
+        runs: Runs of one episode, in order, without gaps.
+        stages: Stages of this episode, in intended order.
+        share: Stage -> share of the whole.
     """
     weights = np.array([share.get(stage, 0.0) for stage in stages])
     total = float(weights.sum())

@@ -1,8 +1,8 @@
-"""Things of a scene, phrases that refer to them ("the smaller red cube"), and the resolver of such phrases.
+"""Objects of a scene, phrases that refer to them ("the smaller red cube"), and the resolver of such phrases.
 
-The resolver reads words alone and looks at the scene; it knows nothing of who made a phrase and why. What cannot be
-told apart by a clear margin refers to nothing, so that no phrase leans on a millimetre. Left and right are the
-robot's: it looks along the x axis of its base frame, left is +y.
+The resolver sees only the words and the scene, not the source of a phrase. A phrase refers to an object only by a clear
+margin, so that none depends on a millimetre. Left and right are the robot's: it looks along its base frame's x axis,
+and left is +y.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from demorec.episode.scene import Goal, Scene
 from demorec.episode.words import COLOR_WORDS, nouns_of
 
 MIN_GAP = 0.04
-"""By how much, metres, one thing must be farther to a side, or nearer, than the next one to be called so."""
+"""Minimum distance, metres, by which an object must be farther to a side, or nearer, than the next one."""
 MIN_SIZE_RATIO = 1.15
-"""By what factor one thing must be larger than the next one to be called so."""
+"""Minimum ratio by which an object must be larger than the next one."""
 _AT_THE_PLACE = 0.01
-"""How far, metres, the middle of a mark may be from a goal that is meant to be on it."""
+"""Maximum distance, metres, of a mark's centre from a goal on that mark."""
 
 _IN_FRONT = ("left", "right", "leftmost", "rightmost", "middle", "smaller", "larger", "smallest", "largest")
 _BEHIND = ("nearest to the robot", "farthest from the robot")
@@ -35,12 +35,12 @@ class NamedThing:
     """One body of the scene.
 
     Attributes:
-        name: Of the body.
-        nouns: What it may be called, the usual word first.
-        color: The word for its colour, or "".
-        size: Its largest extent, metres.
-        position: (3,) of its middle in the robot's base frame (x forward, y to the left, z up), metres.
-        height: Of its bounding box, metres.
+        name: Name of the body.
+        nouns: Possible nouns, the usual one first.
+        color: Word for its colour, or "".
+        size: Largest extent, metres.
+        position: (3,) centre in the robot's base frame (x forward, y left, z up), metres.
+        height: Height of its bounding box, metres.
         can_be_held: Whether it is movable.
     """
 
@@ -54,23 +54,23 @@ class NamedThing:
 
     @property
     def noun(self) -> str:
-        """The usual word."""
+        """The usual noun."""
         return self.nouns[0]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Surroundings:
-    """All things at one moment, the floor and what else only carries the scene left out."""
+    """All objects at one moment, except the floor and other supports."""
 
     things: tuple[NamedThing, ...]
 
     @cached_property
     def nouns(self) -> frozenset[str]:
-        """What any of them may be called."""
+        """All possible nouns of these objects."""
         return frozenset(noun for thing in self.things for noun in thing.nouns)
 
     def thing(self, name: str) -> NamedThing:
-        """The thing of that name; KeyError when there is none."""
+        """The object with that name; KeyError if missing."""
         for thing in self.things:
             if thing.name == name:
                 return thing
@@ -81,8 +81,8 @@ def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None
     """Return the objects of a scene at one moment.
 
     Args:
-        scene: At the episode's start.
-        world_from_object: Body -> (7,) pose (xyz, quaternion xyzw); the scene's own where left out.
+        scene: Scene at the episode's start.
+        world_from_object: Body -> (7,) pose (xyz, quaternion xyzw); bodies left out keep the scene's pose.
     """
     moved = world_from_object or {}
     base_from_world = scene.robot.world_from_base.inverse()
@@ -106,7 +106,7 @@ def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None
 
 
 def place_of(scene: Scene, goal: Goal) -> str:
-    """Name of the body that a goal puts its object onto or into, a mark at its place, or ""."""
+    """Name of the body on or in which a goal puts its object, such as a mark, or ""."""
     if goal.onto:
         return goal.onto
     wanted: Pose = scene.world_from_goal(goal)
@@ -118,28 +118,28 @@ def place_of(scene: Scene, goal: Goal) -> str:
 
 
 def resolve(phrase: str, situation: Surroundings) -> frozenset[str]:
-    """Names of the things that a phrase refers to: one for "the ...", all that fit for "every ...".
+    """Names of the objects that a phrase refers to: one for "the ...", all matching ones for "every ...".
 
-    Nothing when the phrase is none of this grammar, or when it could mean several things: ARTICLE [ORDER] [COLOUR]
-    NOUN [nearest to the robot | farthest from the robot], where ARTICLE is "the" or "every".
+    Empty if the phrase does not fit the grammar, or is ambiguous. Grammar: ARTICLE [ORDER] [COLOUR] NOUN [nearest to
+    the robot | farthest from the robot], where ARTICLE is "the" or "every".
     """
     match = _grammar(situation.nouns).fullmatch(phrase.strip().lower())
     return frozenset() if match is None else _resolved(match, situation)
 
 
 def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozenset[str]]]:
-    """Each phrase of a text that refers to something, and what it refers to; nothing where that is unclear."""
+    """Yield each phrase of a text and the objects that it refers to; an ambiguous phrase has none."""
     for match in _grammar(situation.nouns).finditer(text.lower()):
         yield match[0], _resolved(match, situation)
 
 
 def phrases_for(name: str, situation: Surroundings) -> Iterator[str]:
-    """Every phrase of the grammar that refers to this thing and nothing else; the plainest with a colour come first."""
+    """Yield every phrase of the grammar that refers to this object alone, the simplest with a colour first."""
     thing = situation.thing(name)
     for noun in thing.nouns:
         for colored in ([f"{thing.color} {noun}"] if thing.color else []) + [noun]:
             plain = f"the {colored}"
-            if resolve(plain, situation) == {name}:  # where the plain words suffice, nobody says more
+            if resolve(plain, situation) == {name}:  # if the plain noun is unambiguous, longer phrases are unnatural
                 yield plain
                 continue
             candidates = [f"the {order} {colored}" for order in _IN_FRONT]
@@ -150,7 +150,7 @@ def phrases_for(name: str, situation: Surroundings) -> Iterator[str]:
 
 
 def phrase_for(name: str, situation: Surroundings) -> str:
-    """The plainest phrase for a thing; "a red cube" where none tells it from the others."""
+    """The simplest phrase for an object; "a red cube" if none is unambiguous."""
     for found in phrases_for(name, situation):
         return found
     thing = situation.thing(name)
@@ -182,7 +182,7 @@ def _resolved(match: re.Match[str], situation: Surroundings) -> frozenset[str]:
 
 
 def _ordered(order: str, things: Sequence[NamedThing]) -> list[NamedThing]:
-    """The one thing that is first in an order; none when it is not so by the margin, or when there are too few."""
+    """The first object in an order; empty if it is not first by the margin, or there are too few objects."""
     if order == "middle":
         return _middle(things)
     at_least, at_most, sign, measure, margin = _ORDERS[order]
@@ -192,18 +192,18 @@ def _ordered(order: str, things: Sequence[NamedThing]) -> list[NamedThing]:
 
 
 def _first(things: Sequence[NamedThing], value: Callable[[NamedThing], float], margin: float) -> list[NamedThing]:
-    """The one of the smallest value, or none when the next one is not larger by the margin."""
+    """The object with the smallest value; empty if the next one is not larger by the margin."""
     ordered = sorted(things, key=value)
     return ordered[:1] if value(ordered[1]) - value(ordered[0]) >= margin else []
 
 
 def _middle(things: Sequence[NamedThing]) -> list[NamedThing]:
-    """Of three in a row: the one between the others."""
+    """The middle one of three objects in a row."""
     if len(things) != 3:
         return []
 
     def detour(thing: NamedThing) -> float:
-        """How much longer the way between the other two is by way of this one, metres."""
+        """Extra length of the path between the other two if it passes this one, metres."""
         a, b = (other.position[:2].tolist() for other in things if other is not thing)
         here = thing.position[:2].tolist()
         return math.dist(a, here) + math.dist(here, b) - math.dist(a, b)
@@ -237,5 +237,6 @@ _ORDERS: dict[str, tuple[int, float, int, Callable[[NamedThing], float], float]]
     "nearest to the robot": (2, math.inf, 1, _distance, MIN_GAP),
     "farthest from the robot": (2, math.inf, -1, _distance, MIN_GAP),
 }
-"""Word -> of how many things it is said, at least and at most; whether the chosen one has least (1) or most (-1) of
-what; and by how much."""
+"""Word -> minimum and maximum number of objects to which it applies; the quantity, whose smallest (1) or largest (-1)
+value is chosen; and the margin.
+"""

@@ -1,4 +1,4 @@
-"""All statements about one recording, row by row as a language column holds them."""
+"""All statements about one recording, row by row, as in a language column."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from demorec.mcap import Recording
 def episode_statements(
     recording: Recording, rows: NDArray[np.intp], kinds: Collection[LanguageKind]
 ) -> list[Statement]:
-    """Return the statements of the wanted kinds, in the order of the rows; those of one row in the order of `KINDS`.
+    """Return the statements of the requested kinds in row order; within a row, in the order of `KINDS`.
 
     Args:
-        recording: With its events.
-        rows: (T,) frames of the recording that the dataset has.
-        kinds: Wanted kinds, as far as the recording supports them.
+        recording: Recording with its events.
+        rows: (T,) recorded frame of each dataset row.
+        kinds: Requested kinds; those that the recording does not support are left out.
 
     Raises:
         RecordingError: The recording is damaged.
@@ -59,7 +59,7 @@ class _Annotator:
         return situation(self._scene, poses)
 
     def _row_of(self, frame: int) -> int:
-        """Return the first row of the dataset that is not before a frame; T when there is none."""
+        """Return the first row at or after a frame; T if all are earlier."""
         return int(np.searchsorted(self._rows, frame))
 
     def _segment_rows(self) -> Iterator[tuple[PhaseSegment, int, int]]:
@@ -92,7 +92,7 @@ class _Annotator:
         latest: dict[int, Statement] = {}
         for frame, text in memories(self._timeline, self._words, is_dropped=self._timeline.is_dropped):
             row = self._row_of(frame)
-            if row < len(self._rows):  # of two that fall into one row, the later one holds
+            if row < len(self._rows):  # if two segments begin in one row, the later one applies
                 latest[row] = Statement(row=row, kind="memory", text=text)
         yield from latest.values()
 

@@ -32,12 +32,12 @@ _MISSING = {
     "lift": "lift the empty gripper, having missed {object} on purpose",
 }
 _AGAIN = ("approach", "descend", "close")
-"""Phases of a later attempt in which the subtask says that it is one."""
+"""Phases of a later attempt whose subtask begins with "try again"."""
 _RECOVERY = {
     "missed": "open the gripper and rise after missing {object}",
     "dropped": "open the gripper and rise after dropping {object}",
 }
-# Half of the last digit that is printed.
+# Half of the last printed digit.
 _MIN_MOVE_M = 0.005
 _MIN_OPENING_CHANGE_M = 0.0025
 
@@ -48,9 +48,9 @@ class GoalWords:
 
     Attributes:
         object: "the red cube".
-        place: "the blue tray", or "its place" where the scene has nothing there.
-        into: "into", "onto" or "to": what goes before the place.
-        inside: "in", "on" or "at": where the object is in the end.
+        place: "the blue tray", or "its place" if the scene has no object there.
+        into: "into", "onto" or "to": preposition before the place.
+        inside: "in", "on" or "at": final position relative to the place.
     """
 
     object: str
@@ -60,7 +60,7 @@ class GoalWords:
 
 
 def goal_words(scene: Scene, goal_index: int | None, now: Surroundings) -> GoalWords:
-    """Words that tell object and place of a goal from all other things as they are now."""
+    """Phrases that distinguish a goal's object and place from all other objects at this moment."""
     if goal_index is None:
         return GoalWords(object="the object", place="its place", into="to", inside="at")
     goal = scene.goals[goal_index]
@@ -75,14 +75,14 @@ def goal_words(scene: Scene, goal_index: int | None, now: Surroundings) -> GoalW
 
 
 def prepositions(scene: Scene, place: str) -> tuple[str, str]:
-    """("into", "in") for a container, ("to", "at") for a place without a thing, ("onto", "on") for everything else."""
+    """("into", "in") for a container, ("to", "at") for a place without an object, ("onto", "on") otherwise."""
     if not place:
         return "to", "at"
     return ("into", "in") if nouns_of(scene.body(place))[0] in VESSELS else ("onto", "on")
 
 
 def subtask(segment: PhaseSegment, words: GoalWords, instruction: str, *, is_dropped: bool) -> str:
-    """Return the imperative for a segment; the instruction where the recording has no phase."""
+    """Return the imperative for a segment; the instruction if the recording has no phases."""
     phase, attempt = segment.phase, segment.attempt
     if phase == "recover":
         text = _RECOVERY.get(attempt.end, "open the gripper and rise")
@@ -102,7 +102,7 @@ def subtask(segment: PhaseSegment, words: GoalWords, instruction: str, *, is_dro
 
 
 def plan(goals: Sequence[GoalWords], *, is_dropped: bool, is_retry: bool) -> str:
-    """A numbered list of what remains to be done."""
+    """Return a numbered list of the remaining actions."""
     lines = []
     for index, words in enumerate(goals):
         again = " again" if is_retry and index == 0 else ""
@@ -113,11 +113,11 @@ def plan(goals: Sequence[GoalWords], *, is_dropped: bool, is_retry: bool) -> str
 
 
 def memories(timeline: EpisodeTimeline, words: dict[int, GoalWords], *, is_dropped: bool) -> Iterator[tuple[int, str]]:
-    """What was done so far, in the first person: (frame from which it is remembered, text).
+    """Yield (first frame, text) of the actions done by then, in the first person.
 
     Args:
         timeline: Timeline of the episode.
-        words: First frame of an attempt -> how its objects are called.
+        words: First frame of an attempt -> words for its objects.
         is_dropped: Whether objects are released from a height.
     """
     done: list[str] = []
@@ -152,11 +152,11 @@ def _failure(attempt: GoalAttempt, words: GoalWords) -> str:
 
 
 def motion(position: Array, opening: Array) -> str:
-    """How the TCP is displaced and what the gripper does from one moment to another, to whole centimetres.
+    """Describe the TCP displacement and the gripper motion between two moments, to whole centimetres.
 
     Args:
-        position: (2, 3) of the TCP before and after, base frame (x forward, y left, z up), metres.
-        opening: (2,) of the gripper, metres.
+        position: (2, 3) TCP before and after, base frame (x forward, y left, z up), metres.
+        opening: (2,) gripper opening before and after, metres.
     """
     parts = []
     for change, positive, negative in zip(
@@ -176,5 +176,5 @@ def motion(position: Array, opening: Array) -> str:
 
 
 def joined(parts: Sequence[str]) -> str:
-    """ "a", "a and b", "a, b and c"."""
+    """Join words as "a", "a and b", "a, b and c"."""
     return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"

@@ -1,7 +1,7 @@
-"""Many wordings of one task, each of which says the same and can mean nothing else in its scene.
+"""Wordings of one task that have the same meaning and are unambiguous in its scene.
 
-A wording is a template with phrases in it. What each phrase refers to is proved by the resolver
-(`demorec.annotate.referring`), which reads the finished text and knows nothing of the template.
+A wording is a template with phrases. The resolver (`demorec.annotate.referring`) proves each phrase: it reads the
+finished text and does not know the template.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from demorec.annotate.subtasks import joined, prepositions
 from demorec.episode.scene import Goal, Scene
 
 WORDINGS = 24
-"""How many wordings an episode gets; every task has so many."""
+"""Number of wordings per episode, the same for every task."""
 _ON = 0.01
-"""Metres of air below a thing that still stands on another."""
+"""Maximum gap below an object that still counts as resting on another, in metres."""
 
 _PUT = (
     "put {o} {p}",
@@ -55,7 +55,7 @@ _THEN = ("{a}, then {b}", "first {a}, then {b}", "{a}, and then {b}", "{a}; afte
 
 @dataclass(frozen=True, kw_only=True)
 class _Clause:
-    """What one goal is about: names of its object, its place and what the object stands on, "" for nothing."""
+    """Words of one goal: names of its object, its place and the object below, "" for none."""
 
     object: str
     place: str
@@ -63,13 +63,13 @@ class _Clause:
 
 
 def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, is_dropped: bool) -> list[str]:
-    """Up to `WORDINGS` different wordings, the recorded instruction first; each is proved to be unambiguous.
+    """Return up to `WORDINGS` different wordings, the recorded instruction first; each is proved unambiguous.
 
     Args:
-        scene: At the episode's start.
-        instruction: As recorded.
-        rng: Chooses among all wordings that are possible.
-        is_dropped: Whether objects are let fall rather than set down.
+        scene: Scene at the episode's start.
+        instruction: Recorded instruction.
+        rng: Chooses among all possible wordings.
+        is_dropped: Whether objects are dropped rather than set down.
     """
     start = situation(scene)
     clauses = [
@@ -81,7 +81,7 @@ def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, i
     order = rng.permutation(len(sentences))
     wanted = WORDINGS - 1
     chosen = [sentences[index] for index in order[:wanted]]
-    # The politeness of the first round differs from sentence to sentence; short of sentences, it multiplies them.
+    # The first round gives each sentence another polite form; further rounds are used if there are too few sentences.
     forms = rng.permutation(len(_POLITE))
     found = [instruction]
     for turn, (round_, index) in enumerate(product(range(len(_POLITE)), range(len(chosen)))):
@@ -95,7 +95,7 @@ def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, i
 
 
 def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bool:
-    """Whether each phrase of a wording refers to something definite, and all together to the things of the goals."""
+    """Whether each phrase of a wording is unambiguous and all together refer to the goals' objects."""
     found = [names for _, names in references(text, start)]
     wanted = {name for clause in clauses for name in (clause.object, clause.place) if name}
     allowed = wanted | {clause.base for clause in clauses}
@@ -103,7 +103,7 @@ def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bo
 
 
 def _base_of(goal: Goal, start: Surroundings) -> str:
-    """Name of the movable thing that a goal's object stands on, or ""."""
+    """Name of the movable object below a goal's object, or ""."""
     upper = start.thing(goal.object)
     for thing in start.things:
         offset = upper.position - thing.position
@@ -157,7 +157,7 @@ def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: b
 
 
 def _by_class(scene: Scene, clauses: Sequence[_Clause], start: Surroundings) -> Iterator[str]:
-    """Sentences that speak of all things of a kind at once, where several goals share a place: "every red cube"."""
+    """Sentences about all objects of a kind at once, if several goals share a place: "every red cube"."""
     places = list(dict.fromkeys(clause.place for clause in clauses))
     if len(places) == len(clauses) or not all(places):
         return

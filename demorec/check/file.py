@@ -126,7 +126,7 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
 
 
 @time_check(
-    measures="messages whose header timestamp differs from their log time",
+    measures="header timestamps that differ from the log time",
     unit="ms",
 )
 def stamps(episode: CheckedEpisode) -> Iterator[Found]:

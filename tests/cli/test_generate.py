@@ -84,7 +84,7 @@ def test_unknown_options_name_the_nearest(
     [
         ("num_episods = 3", "unknown key 'num_episods'. Did you mean 'num_episodes'?"),
         ("width = 224.5", "width: 224.5 is not a whole number"),
-        ('depth = "false"', "depth: 'false' is no boolean"),
+        ('depth = "false"', "depth: 'false' is not a boolean"),
         ('codec = "h265"', "codec"),
         ("seed = ", "is not valid TOML"),
         ("fps = 7", "fps is 7, which does not divide"),

@@ -75,12 +75,12 @@ def place(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 TARGETS = {
-    "runs/run": "this command reads something in it",
-    "runs/run/episodes": "this command reads",
-    "runs": "this command reads something in it",
-    "link_to_runs": "this command reads something in it",
-    ".": "this command reads something in it",
-    "..": "this command reads something in it",
+    "runs/run": "of this command something in it",
+    "runs/run/episodes": "of this command",
+    "runs": "of this command something in it",
+    "link_to_runs": "of this command something in it",
+    ".": "of this command something in it",
+    "..": "of this command something in it",
     "work": "it is the current folder",
     "repository": "it is a repository",
     "thesis": "it is not a LeRobot dataset",
@@ -392,20 +392,20 @@ KEPT: dict[str, dict[str, str]] = {
     "view alone.mcap --save": {
         "alone.rrd": "it is not a Rerun file",  # a recording under another name
         "thesis.rrd": "it is not a Rerun file",
-        "link.rrd": "this command reads it",
+        "link.rrd": "of this command it",
         "folder.rrd": "it is a folder",
         "dangling.rrd": "a link whose target is missing",
         "lock.rrd": "lock.rrd",
     },
     "view alone.mcap --screenshot": {
         "thesis.png": "it is not an image",
-        "link.png": "this command reads it",
+        "link.png": "of this command it",
         "lock.png": "lock.png",
     },
     "view dataset --screenshot": {FRAME: "it is inside an input of this command"},
     "report alone.mcap --out": {
         "thesis.html": "it is not a report",
-        "link.html": "this command reads it",
+        "link.html": "of this command it",
         "lock.html": "lock.html",
     },
     "report dataset --out": {"dataset/report.html": "A new file inside a dataset would prevent"},
@@ -501,7 +501,7 @@ def test_render_and_replay_never_replace_what_they_read(
         ((place / "runs/run/episodes/episode_000000.mcap",), place / "runs/run"),
     ):
         assert exit_code(command, *sources, "--out", out, "--overwrite") == 2
-        assert "this command reads" in capsys.readouterr().err
+        assert "of this command" in capsys.readouterr().err
     assert files_of(place.parent) == before
 
 

@@ -152,7 +152,7 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
 
 
 def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="No policy that LeRobot saved"):
+    with pytest.raises(ConfigError, match="Not a policy saved by LeRobot"):
         find_checkpoint(tmp_path)
     (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')
     with pytest.raises(ConfigError, match="--action"):

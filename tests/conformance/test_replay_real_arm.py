@@ -82,7 +82,7 @@ def test_an_imported_recording_says_its_units_itself(
     by_run = replayed(capsys, tmp_path / "run", "--robot", "so101")
     assert by_run == replayed(capsys, dataset, *DEGREES)
     assert exit_code("replay", *DEGREES, tmp_path / "run") == 2
-    assert "recordings say their units" in capsys.readouterr().err
+    assert "recordings have units" in capsys.readouterr().err
 
 
 @pytest.mark.slow
@@ -114,11 +114,11 @@ def test_an_offset_and_a_lag_show_in_their_joints(
     ("flags", "said"),
     [
         (("--robot", "so101"), "or --motor-units is missing"),
-        (("--robot", "panda", "--motor-units", "degrees"), "it is of another robot"),
+        (("--robot", "panda", "--motor-units", "degrees"), "they belong to another robot"),
         (("--motor-units", "degrees"), "add --robot so101"),
         ((*DEGREES, "--states"), "--states and --export-hz are for recordings with a scene"),
-        ((*DEGREES, "--view"), "leave --out, --view out"),
-        ((), "--robot replays what a real arm did"),
+        ((*DEGREES, "--view"), "leave out --out and --view"),
+        ((), "--robot replays a real arm's actions"),
     ],
 )
 def test_what_does_not_fit_is_refused_in_one_sentence(
@@ -136,7 +136,7 @@ def test_other_robots_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "leave --robot out" in capsys.readouterr().err
     assert exit_code("export", "lerobot", panda, "--no-verify", "--out", tmp_path / "d") == 0
     assert exit_code("replay", *DEGREES, tmp_path / "d") == 2
-    assert "of so101: it is of another robot" in " ".join(capsys.readouterr().err.split())
+    assert "of so101: they belong to another robot" in " ".join(capsys.readouterr().err.split())
 
 
 def test_the_jaw_turns_as_far_as_a_real_one(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -64,7 +64,7 @@ def test_whatever_a_module_raises_is_one_sentence(
 
 @pytest.mark.parametrize("name", ["os:abort", "builtins:exit", "demorec.core.errors:DemorecError", "fractions:math"])
 def test_things_of_another_kind_are_refused_and_not_called(name: str) -> None:
-    with pytest.raises(ConfigError, match=r"is no shape: it must be a subclass of numbers\.Number"):
+    with pytest.raises(ConfigError, match=r"is not a shape: it must be a subclass of numbers\.Number"):
         SHAPES.load(name, [name.partition(":")[0]])
 
 

@@ -149,7 +149,7 @@ def test_the_camera_is_chosen(run: Path, dataset: Path, capsys: pytest.CaptureFi
             assert alts
             assert all(f"camera {camera}," in alt for alt in alts)
         assert exit_code("report", path, "--no-checks", "--camera", "rear", "--out", tmp_path / "r.html") == 2
-        assert "the cameras are front, wrist" in capsys.readouterr().err
+        assert "available are front, wrist" in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
 
@@ -179,7 +179,7 @@ def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path)
     file.write_text(json.dumps(plain))
     found = report_on(other)
     for words in (
-        "No column next.success states which episodes succeeded.",
+        "Without a column next.success, the outcomes of the episodes are not known.",
         "It has no color images, so there are no filmstrips.",
         "No action found, so nothing was judged by it",
     ):
@@ -284,7 +284,7 @@ def test_workers_find_the_same(run: Path) -> None:
 def test_refusals(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, words in (
         ((run, "--out", tmp_path / "x.pdf"), "--out names an .html file"),
-        ((run, "--out", tmp_path / "no" / "x.html"), "there is no folder"),
+        ((run, "--out", tmp_path / "no" / "x.html"), "is missing"),
         ((run, "--out", tmp_path / "x.html", "--workers", "0"), "--workers is 0"),
         ((run, "--out", tmp_path / "x.html", "--no-checks", "--images"), "leave one of them out"),
     ):

@@ -1,1 +1,1 @@
-"""Recordings to one HDF5 file in robomimic's layout; the only importer of h5py."""
+"""Export recordings to one HDF5 file in robomimic's layout; the only importer of h5py."""

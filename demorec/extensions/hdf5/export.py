@@ -29,7 +29,7 @@ Hdf5Episode = ExportEpisode[Hdf5Options]
 def export_hdf5(
     sources: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None = None
 ) -> ExportReport:
-    """Write the recordings into the file `out`, completely or not at all. One image is in memory at a time.
+    """Write the recordings to the file `out`, completely or not at all. Only one image is in memory at a time.
 
     Args:
         sources: Recordings, runs, or folders of recordings.
@@ -38,9 +38,9 @@ def export_hdf5(
         progress: Called after every recording.
 
     Raises:
-        ConfigError: Impossible options, nothing to export, or a file in the way.
+        ConfigError: Impossible options, nothing to export, or an existing file.
         ExportError: Recordings that differ, a full disk. `out` is unchanged.
-        RecordingError: A recording is damaged, or lacks images that were asked for.
+        RecordingError: A recording is damaged, or lacks requested images.
     """
     options.validate()
     found = find_recordings(sources)
@@ -89,7 +89,7 @@ def _write(
 
 
 _NO_ENVIRONMENT = f"{ENVIRONMENT_PREFIX}collected"
-"""Stands for the environment of episodes that have none."""
+"""Environment name for episodes without one."""
 _GYM = 2
 """`EnvType.GYM_TYPE` of robomimic."""
 _ROBOSUITE = {
@@ -102,15 +102,15 @@ _ROBOSUITE = {
 
 
 def _add(data: h5py.Group, number: int, episode: Hdf5Episode) -> None:
-    """Append an episode: numbers at once, images one by one.
+    """Append an episode: numbers at once, images one at a time.
 
     Raises:
-        ConfigError: The episode has no actions, or two of its streams would get one name.
+        ConfigError: The episode has no actions, or two of its streams would get the same name.
         ExportError: It has no frames, a number that is not finite, or frames without an image.
         RecordingError: The recording is damaged.
     """
     demo = data.create_group(f"demo_{number}")
-    # A function of its own, since returning closes its groups, and HDF5 places the bytes that follow accordingly.
+    # A separate function, because its return closes the groups, which affects where HDF5 places the following bytes.
     _fill(demo, episode)
     if number == 0:
         data.attrs.update(_attributes(episode))
@@ -154,7 +154,7 @@ def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
 
 
 def _action_features(episode: Hdf5Episode) -> tuple[str, ...]:
-    """Find the features that are the action, whatever their names; several are joined in this order.
+    """Find the features of the action by role, not by name; several are joined in this order.
 
     Raises:
         ConfigError: The episode has no actions.
@@ -169,10 +169,10 @@ def _action_features(episode: Hdf5Episode) -> tuple[str, ...]:
 
 
 def _observation_names(episode: Hdf5Episode) -> dict[str, tuple[str, slice]]:
-    """Return observation -> feature and its elements: robosuite's names, or "force" for "observation.force".
+    """Return observation -> feature and element slice, with robosuite's names, or "force" for "observation.force".
 
     Raises:
-        ConfigError: The episode has no actions, or two streams would get one name.
+        ConfigError: The episode has no actions, or two streams would get the same name.
     """
     actions = _action_features(episode)
     known = {} if episode.scene is None else _ROBOSUITE
@@ -192,14 +192,14 @@ def _observation_names(episode: Hdf5Episode) -> dict[str, tuple[str, slice]]:
 
 
 def _image_names(episode: Hdf5Episode) -> list[str]:
-    """Return a name for each camera: "front_image", or for a depth camera the end of its feature's name."""
+    """Return a name for each camera: "front_image", or for a depth camera the last part of its feature's name."""
     return [
         camera.feature.removeprefix(IMAGE_PREFIX) + ("" if camera.is_depth else "_image") for camera in episode.cameras
     ]
 
 
 def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
-    """Return the attributes of `data`: arguments of robomimic's environment, rate and names of observations."""
+    """Return the attributes of `data`: arguments of robomimic's environment, rate and observation names."""
     info, options = episode.info, episode.options
     arguments: dict[str, object] = {
         "robot": info.robot_name,
@@ -224,7 +224,7 @@ def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
 
 
 def _states(episode: Hdf5Episode) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """(T, D) float64 state of the scene as recorded, and the names of its components.
+    """(T, D) float64 recorded state of the scene, and the names of its components.
 
     Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:
     xyz (m) and quaternion xyzw.
@@ -245,7 +245,7 @@ def _add_vectors(group: h5py.Group, name: str, values: NDArray[np.generic], comp
 def _add_images(
     group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
 ) -> None:
-    """Write (T, H, W, 3) uint8 colours or (T, H, W, 1) float32 distances; each image is a chunk."""
+    """Write (T, H, W, 3) uint8 colour or (T, H, W, 1) float32 depth images; each image is one chunk."""
     stored = group.create_dataset(
         name,
         shape,

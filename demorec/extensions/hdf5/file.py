@@ -1,4 +1,4 @@
-"""HDF5 files: made anew so that no failure harms, and known by their content, so that nothing else is ever replaced."""
+"""HDF5 files: written to a new file so that failures do no harm, and recognised by content before they are replaced."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from demorec.core.files import HDF5_MAGIC, open_regular
 from demorec.core.replacing import ReplaceableKind
 
 ENVIRONMENT_PREFIX = "demorec/"
-"""Beginning of `env_name` in `env_args`, which marks a file as an export."""
+"""Prefix of `env_name` in `env_args`, which marks a file as an export."""
 _PARTS: dict[str, tuple[str, ...]] = {
     "mask": (),
     "mask/train": (),
@@ -31,7 +31,7 @@ _PARTS: dict[str, tuple[str, ...]] = {
     "data/demo_N/obs": (),
     "data/demo_N/obs/NAME": ("names",),
 }
-"""Groups and datasets that an export writes -> their attributes. `observations` lists the NAMEs (JSON)."""
+"""Groups and datasets of an export -> their attributes. `observations` lists the NAMEs (JSON)."""
 _DEMO = re.compile(r"data/demo_\d+(?=/|$)")
 
 
@@ -79,9 +79,9 @@ DATASET = ReplaceableKind(
 
 
 class _Storage(io.FileIO):
-    """A file whose writes never fail: the first error is kept, and what is written after it goes nowhere.
+    """A file object with writes that never raise: it keeps the first error and discards later data.
 
-    The HDF5 library ends the process with a segmentation fault when it cannot write what it still holds on closing.
+    The HDF5 library ends the process with a segmentation fault if it cannot write its buffers on closing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -107,13 +107,13 @@ class _Storage(io.FileIO):
 
 
 class NewFile:
-    """Context manager: an HDF5 file at a path where nothing is yet.
+    """Context manager for an HDF5 file at a new path.
 
     Attributes:
         root: Its root group.
 
     Raises:
-        OSError: It cannot be written; so do `flush` and the end of the block.
+        OSError: It cannot be written; also raised by `flush` and at the end of the block.
     """
 
     def __init__(self, path: Path) -> None:
@@ -132,7 +132,7 @@ class NewFile:
             self._raise_error()
 
     def flush(self) -> None:
-        """Write what is still in memory; raise the error of any write since the last time."""
+        """Flush the buffers; raise the first error of any write since the last call."""
         self.root.flush()
         self._raise_error()
 

@@ -1,4 +1,4 @@
-"""What a user chooses about an export to HDF5."""
+"""Options of an export to HDF5."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from demorec.datasets.options import CommonOptions, Exporter
 
 @dataclass(frozen=True, kw_only=True)
 class Hdf5Options(CommonOptions):
-    """How recordings become an HDF5 file."""
+    """Options of an export to HDF5."""
 
     valid_share: float = 0.1
     """Share of the episodes that mask/valid names, spread evenly; mask/train names the others."""
@@ -21,7 +21,7 @@ class Hdf5Options(CommonOptions):
         """Raise ConfigError for impossible values."""
         super().validate()
         if not 0 <= self.valid_share < 1:
-            raise OptionError("valid_share", f"is {self.valid_share}, it must be at least 0 and below 1.")
+            raise OptionError("valid_share", f"is {self.valid_share}, allowed are 0 to below 1.")
         check_option("compression", self.compression, 0, 9)
 
 

@@ -1,4 +1,4 @@
-"""A policy in closed loop over held-out scenes: its success rate with an interval, and corrections by the expert."""
+"""Closed-loop runs of a policy in held-out scenes: its success rate with an interval, and corrections by the expert."""
 
 from __future__ import annotations
 
@@ -9,25 +9,28 @@ from demorec.core.errors import check_option
 
 @dataclass(frozen=True, kw_only=True)
 class TakeOver:
-    """When the expert takes over: at the first of these moments, and at the time limit always."""
+    """Conditions of a takeover by the expert: at the first that holds, and always at the time limit."""
 
     stuck_seconds: float = 2.0
     """Take over once the hand has kept still this long; 0: never."""
     after_seconds: float = 0.0
     """Take over once the policy has acted this long without success; 0: only at the time limit."""
     random_share: float = 0.0
-    """Share of the episodes in which the expert takes over at a random moment, whatever the policy does."""
+    """Share of the episodes in which the expert takes over at a random moment, regardless of the policy."""
     stray_metres: float = 0.05
     """Take over once the TCP that the policy commands is this far from the expert's path in the same scene, or an
-    object this far from where the expert would have it; 0: never."""
+    object this far from its place under the expert; 0: never.
+    """
     stray_radians: float = 0.5
-    """The same for the hand's direction; 0: never."""
+    """Take over once the hand's direction differs this much from the expert's; 0: never."""
     stray_seconds: float = 0.2
-    """How long the TCP must be that far off without a break."""
+    """How long the TCP must stay that far off."""
     noise: bool = True
-    """Let the expert send its commands with the exploration noise of demonstrations, beside clean labels."""
+    """Add the exploration noise of demonstrations to the expert's commands; labels stay clean."""
     hand_back: bool = False
-    """Let the policy act again once the expert has stopped the arm and brought it to where a script can begin."""
+    """Return control to the policy once the expert has stopped the arm and reached a state from which a script can
+    begin.
+    """
 
     def validate(self) -> None:
         """Raise OptionError for impossible values."""

@@ -1,4 +1,4 @@
-"""`demorec evaluate` and `demorec correct`: a policy acts in closed loop, alone or with the expert behind it."""
+"""`demorec evaluate` and `demorec correct`: run a policy in closed loop, alone or with the expert as fallback."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
 
 Split = Literal["all", "train", "eval"]
 _SCENES = ("task", "robot", "objects", "object_split", "split", "seed", "variation")
-"""Options of `GenerateConfig` that decide which scenes there are."""
+"""Options of `GenerateConfig` that decide the scenes."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RolloutFlags:
-    """Which policy, in which scenes, recorded how; each command has its own default of `split`."""
+    """Policy, scenes and recording options; each command has its own default of `split`."""
 
     rare_flags: ClassVar[frozenset[str]] = frozenset(
         {
@@ -60,7 +60,7 @@ class RolloutFlags:
     object_split: Split = "all"
     """Which shapes of the shelves: eval has those that generate-dataset --object-split train leaves out."""
     cameras: tuple[str, ...] = ()
-    """Cameras of your own that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
+    """Your own cameras that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
     num_episodes: int = 50
     """Number of scenes."""
     seed: int = 0
@@ -86,12 +86,12 @@ class RolloutFlags:
     allow: Allow = ()
     """A module or package of your own that may be imported for the cameras and steps that the policy names."""
     overwrite: bool = False
-    """Delete what this command made in the output folder before and start again."""
+    """Delete this command's earlier results in the output folder and start again."""
     split: Split = "eval"
     """As in generate-dataset."""
 
     def carry_out(self, policy: Path, out: Path, *, title: str, takeover: TakeOver | None = None) -> Evaluation:
-        """Let a policy act in every scene; the recordings go to `out`."""
+        """Run the policy in every scene and record to `out`."""
         check_option("num_episodes", self.num_episodes, 1, 1_000_000)
         check_option("workers", self.workers, 1, 1024)
         refuse_inside([out])
@@ -132,11 +132,11 @@ class RolloutFlags:
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluate(RolloutFlags):
-    """Run a policy saved by LeRobot on held-out scenes: success rate, where it fails, every rollout recorded.
+    """Run a policy saved by LeRobot in held-out scenes; report its success rate and failures, and record every rollout.
 
     An episode succeeds when the task's own strict conditions hold for five frames. Run the same command again to
-    continue where it stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed; their numbers
-    begin at 0 here and at its --seed there.
+    continue where it stopped. The scenes are those of lerobot-eval with --env.split and --env.scene_seed; they are
+    numbered from 0 here and from its --seed there.
 
     Examples:
       demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
@@ -230,11 +230,11 @@ def _compared(comparison: RateComparison, first: Path, second: Path) -> list[str
 
 @dataclass(frozen=True, kw_only=True)
 class Correct(RolloutFlags):
-    """Let a policy act until it strays, then let the scripted expert finish: demonstrations of what the policy lacks.
+    """Let a policy act until it strays, then let the scripted expert finish: demonstrations that the policy lacks.
 
-    The expert takes over when the policy strays from what the expert would do, gets stuck, runs out of time, or at a
-    random moment. It stops the arm, brings what the hand holds to its goal or releases it, and finishes the task or
-    hands back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
+    The expert takes over when the policy strays from the expert's trajectory, gets stuck or runs out of time, or at a
+    random moment. It stops the arm, brings a held object to its goal or releases it, and finishes the task or hands
+    back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
     replayed like any other. Run the same command again to continue where it stopped.
 
     Examples:
@@ -251,7 +251,7 @@ class Correct(RolloutFlags):
     def run(self) -> int:
         """Let both act, and report."""
         if self.policy is None:
-            raise ConfigError("There is no policy to correct: give --policy FOLDER.")
+            raise ConfigError("Missing the policy to correct: give --policy FOLDER.")
         self.takeover.validate()
         out = self.out or Path("corrections") / self.task.rpartition(":")[2]
         evaluation = self.carry_out(self.policy, out, title="correcting", takeover=self.takeover)

@@ -39,20 +39,20 @@ _PARTS = (EVALUATION_NAME, EPISODES, FAILED)
 
 @dataclass(frozen=True, kw_only=True)
 class Settings:
-    """What decides the result of an evaluation.
+    """Settings that decide the result of an evaluation.
 
     Attributes:
-        policy: Folder of the policy; only `policy_digest` decides the result, not the place.
-        policy_type: LeRobot's name of its kind ("act").
+        policy: Folder of the policy; its path does not affect the result, only `policy_digest` does.
+        policy_type: LeRobot's policy type ("act").
         policy_digest: SHA-256 of its config and weights, 16 hex digits.
-        config: Task, split, root seed, cameras: which scenes, seen how.
+        config: Task, split, root seed and cameras: the scenes and their views.
         action: Meaning of the policy's actions.
-        action_steps: Actions executed before it looks again; None: as trained.
+        action_steps: Actions executed before the next observation; None: as trained.
         privileged: Whether it sees observation.environment_state.
         sensed: Other observed features, which datasets have only when named.
-        state: What its observation.state holds.
+        state: Content of its observation.state.
         episode_length: Time limit; None: the environment's.
-        takeover: When the expert takes over from the policy; None: never, as an evaluation of the policy wants it.
+        takeover: When the expert takes over from the policy; None: never, for an evaluation of the policy alone.
     """
 
     policy: str
@@ -73,11 +73,11 @@ class Evaluation:
     """An evaluation, finished or not.
 
     Attributes:
-        settings: What decides the result.
-        rollouts: One line each, in the order of the episodes.
-        factors: Randomised values of the scene of each rollout.
-        versions: package -> version, of what decides scenes, rollouts and the policy's answers; none in evaluations of
-            older versions of demorec.
+        settings: Settings that decide the result.
+        rollouts: One line per rollout, in episode order.
+        factors: Randomised values of each rollout's scene.
+        versions: package -> version, of the packages that decide scenes, rollouts and the policy's actions; empty in
+        evaluations by older versions of demorec.
     """
 
     settings: Settings
@@ -87,7 +87,7 @@ class Evaluation:
 
     @property
     def rate(self) -> Rate:
-        """Of strict successes."""
+        """Rate of strict successes."""
         return Rate(successes=sum(bool(r.success) for r in self.rollouts), trials=len(self.rollouts))
 
     @property
@@ -102,7 +102,7 @@ def load_evaluation(folder: Path) -> Evaluation:
     try:
         return from_plain(read_json_object(path), Evaluation)
     except FileNotFoundError as error:
-        raise ConfigError(f"No {EVALUATION_NAME}, so this is no output of demorec evaluate: {folder}") from error
+        raise ConfigError(f"No {EVALUATION_NAME}, so this is not an output of demorec evaluate: {folder}") from error
     except (OSError, ValueError) as error:
         raise DemorecError(f"{EVALUATION_NAME} is damaged ({describe_error(error)}): {path}") from error
 
@@ -122,16 +122,16 @@ def open_evaluation(settings: Settings, out: Path, *, overwrite: bool) -> Iterat
 
 
 def _check_place(out: Path, *, overwrite: bool) -> None:
-    """Raise ConfigError for a folder that holds something other than an evaluation."""
+    """Raise ConfigError for a folder with content other than an evaluation."""
     is_free = not out.exists() or (out.is_dir() and {path.name for path in out.iterdir()} <= {LOCK_NAME})
     if not is_free and not (out / EVALUATION_NAME).is_file():
-        raise ConfigError(f"The folder holds something that is no evaluation, choose another --out: {out}")
+        raise ConfigError(f"The folder holds files that are not part of an evaluation, choose another --out: {out}")
     if overwrite and not is_free:
         check_replaceable(out, EVALUATION, overwrite=True)
 
 
 def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
-    """Make the folder and update its evaluation.json."""
+    """Create the folder and update its evaluation.json."""
     versions = _versions(settings.config)
     evaluation = Evaluation(settings=settings, versions=versions)
     if (out / EVALUATION_NAME).is_file():
@@ -192,7 +192,7 @@ def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[s
 
 
 def save_evaluation(evaluation: Evaluation, folder: Path) -> None:
-    """Replace evaluation.json in one step. Raises GenerationError or ConfigError if it cannot be written."""
+    """Replace evaluation.json atomically. Raises GenerationError or ConfigError if it cannot be written."""
     try:
         replace_text(folder / EVALUATION_NAME, json.dumps(to_plain(evaluation), indent=1, allow_nan=False))
     except OSError as error:

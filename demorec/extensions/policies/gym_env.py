@@ -240,7 +240,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return self.act(Step(action=self.command_for(action), phase=POLICY_PHASE))
 
     def command_for(self, action: NDArray[np.floating]) -> Action:
-        """Compute the command that `step` would send now. Deltas continue from it unless `act` sends another."""
+        """Compute the command that `step` would send now. Deltas are relative to it unless `act` sends another
+        command.
+        """
         _after_reset(self._session)
         values = np.asarray(action, dtype=np.float64)
         if values.shape != self.action_space.shape or not np.isfinite(values).all():
@@ -276,7 +278,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         return self._viewer.images()[self._render_camera].color
 
     def close(self) -> None:
-        """Free the simulator and the renderers; harmless when called twice."""
+        """Free the simulator and the renderers; idempotent."""
         try:
             self._simulators.close()
         finally:
@@ -284,7 +286,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._viewer = self._session = self._situation = None
 
     def _prepare(self, index: int, scene: Scene | None) -> PreparedEpisode:
-        """Prepare the first attempt at this episode that has a layout, as the generator does."""
+        """Prepare the first attempt at this episode that has a layout, as in generation."""
         for attempt in range(self.config.max_attempts):
             try:
                 episode = prepare(EpisodePlan(config=self.config, episode_index=index, attempt=attempt))

@@ -1,4 +1,4 @@
-"""A policy that LeRobot saved, ready to act in an environment; the only importer of torch and of LeRobot's policies."""
+"""A policy saved by LeRobot, ready to act in an environment; the only importer of torch and of LeRobot's policies."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ CONFIG_NAME, TRAIN_CONFIG_NAME = "config.json", "train_config.json"
 
 
 def find_checkpoint(path: Path) -> Path:
-    """The folder that holds config.json: `path`, its pretrained_model, or the last checkpoint of a training.
+    """Folder with config.json: `path`, its pretrained_model, or the last checkpoint of a training.
 
     Raises:
-        ConfigError: There is none.
+        ConfigError: No such folder.
     """
     for candidate in (path, path / "pretrained_model", path / "checkpoints" / "last" / "pretrained_model"):
         if (candidate / CONFIG_NAME).is_file():
             return candidate
     raise ConfigError(
-        f"No policy that LeRobot saved: there is no {CONFIG_NAME}; give the output folder of lerobot-train or a "
+        f"Not a policy saved by LeRobot, {CONFIG_NAME} is missing: give the output folder of lerobot-train or a "
         f"pretrained_model folder in it: {path}"
     )
 
@@ -54,7 +54,7 @@ def policy_inputs(checkpoint: Path) -> dict[str, tuple[int, ...]]:
     try:
         inputs = {name: _shape(value["shape"]) for name, value in (plain.get("input_features") or {}).items()}
         if any(len(shape) != 3 for name, shape in inputs.items() if name.startswith(IMAGE_PREFIX)):
-            raise ValueError("an image of other than three dimensions")
+            raise ValueError("an image without three dimensions")
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise ConfigError(f"The inputs of the policy cannot be used ({describe_error(error)}): {checkpoint}") from error
     return inputs
@@ -67,28 +67,28 @@ def _shape(value: object) -> tuple[int, ...]:
 
 
 def policy_digest(checkpoint: Path) -> str:
-    """The first 16 hex digits of the SHA-256 of the policy's config and weights."""
+    """First 16 hex digits of the SHA-256 of the policy's config and weights."""
     sha = hashlib.sha256()
     for path in sorted(checkpoint.iterdir()):
-        # The training's own settings name folders of the machine that trained.
+        # The training's settings name folders of the training machine.
         if path.suffix in (".json", ".safetensors") and path.name != TRAIN_CONFIG_NAME:
             sha.update(path.name.encode() + b"\0" + path.read_bytes())
     return sha.hexdigest()[:16]
 
 
 def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
-    """Refuse a policy whose processing steps are classes that nobody has allowed.
+    """Refuse a policy with processing steps of classes that the user has not allowed.
 
-    LeRobot's own steps go by a name of its registry; whatever a step's "class" names, LeRobot imports and calls.
+    LeRobot's own steps are registry names; LeRobot imports and calls anything named by a step's "class".
 
     Raises:
-        NotAllowedError: A step is of a module that is not among those `allowed`.
+        NotAllowedError: A step's module is not in `allowed`.
     """
     for path in sorted(checkpoint.glob("*.json")):
         try:
             steps = read_json_object(path).get("steps")
         except (OSError, ValueError):
-            continue  # LeRobot cannot read it either, and says so
+            continue  # LeRobot cannot read it either, and reports that
         for step in steps if isinstance(steps, list) else ():
             if not isinstance(step, dict) or "registry_name" in step or "class" not in step:
                 continue
@@ -96,13 +96,14 @@ def check_steps(checkpoint: Path, allowed: Iterable[str]) -> None:
             if not is_allowed(module, allowed):
                 raise NotAllowedError(
                     f"The policy names the code of a processing step, {step['class']!r}, instead of LeRobot's name of "
-                    f"one, and only you can say whether to run it: if you trust it, add --allow {module}: {path}"
+                    f"one, and only you can decide whether to run it: if you trust it, add --allow {module}: {path}"
                 )
 
 
 def trained_action(checkpoint: Path) -> ActionKind | None:
-    """What the policy's actions mean, from the names in the dataset that it was trained on; None if that is gone or in
-    motor units."""
+    """Meaning of the policy's actions, from the names in its training dataset; None if that is missing or in motor
+    units.
+    """
     try:
         root = read_json_object(checkpoint / TRAIN_CONFIG_NAME)["dataset"]["root"]
         info = read_json_object(Path(root) / INFO_PATH)
@@ -110,7 +111,7 @@ def trained_action(checkpoint: Path) -> ActionKind | None:
         first, *_, last = map(str, names if isinstance(names, list) else next(iter(names.values())))
     except (OSError, ValueError, KeyError, TypeError, IndexError, AttributeError, StopIteration):
         return None
-    if last == "gripper.pos":  # motor units, which no environment of ours takes
+    if last == "gripper.pos":  # motor units, which demorec's environments do not accept
         return None
     if first.endswith(".delta"):
         return "joint_increment"
@@ -121,12 +122,12 @@ class Policy:
     """Acts on one environment at a time.
 
     Args:
-        checkpoint: As of `find_checkpoint`.
-        action_steps: Actions of a chunk that are executed before the policy looks again; None: as trained.
+        checkpoint: As in `find_checkpoint`.
+        action_steps: Actions of a chunk executed before the next observation; None: as trained.
 
     Raises:
-        ConfigError: LeRobot cannot load it, or it has no such setting.
-        MissingDependencyError: LeRobot, or the package that registers this type of policy, is not installed.
+        ConfigError: LeRobot cannot load it, or it lacks this setting.
+        MissingDependencyError: LeRobot, or the package that registers this policy type, is not installed.
     """
 
     def __init__(self, checkpoint: Path, *, action_steps: int | None = None) -> None:
@@ -148,14 +149,14 @@ class Policy:
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint)
             config.device = "cpu"
-            with contextlib.redirect_stdout(io.StringIO()):  # LeRobot says where it loads weights from
+            with contextlib.redirect_stdout(io.StringIO()):  # LeRobot prints the source of the weights
                 self._policy = get_policy_class(config.type).from_pretrained(checkpoint, config=config)
             self._before, self._after = make_pre_post_processors(
                 policy_cfg=config,
                 pretrained_path=str(checkpoint),
                 preprocessor_overrides={"device_processor": {"device": "cpu"}},
             )
-        except Exception as error:  # whatever a foreign format may lack
+        except Exception as error:  # a foreign format can fail in any way
             raise ConfigError(f"LeRobot cannot load this policy ({describe_error(error)}): {checkpoint}") from error
         self.inputs = tuple(config.input_features)
         if action_steps is not None:
@@ -167,7 +168,7 @@ class Policy:
         self._policy.eval()
 
     def reset(self, seed: int) -> None:
-        """Begin an episode; policies that draw random numbers draw those of this seed."""
+        """Begin an episode; a policy that draws random numbers uses this seed."""
         self._torch.manual_seed(seed)
         self._policy.reset()
         for steps in (self._before, self._after):
@@ -183,14 +184,14 @@ class Policy:
 
 
 class _PluginErrors(logging.Filter):
-    """Collects the errors that LeRobot logs, each with its traceback, about plug-ins that it cannot import."""
+    """Logging filter that collects LeRobot's errors, with tracebacks, about plug-ins that it cannot import."""
 
     def __init__(self) -> None:
         super().__init__()
         self.errors: list[BaseException] = []
 
     def filter(self, record: logging.LogRecord) -> bool:
-        """Keep a record with an error from being logged."""
+        """Suppress a record with an error."""
         error = record.exc_info[1] if record.exc_info else None
         if error is not None:
             self.errors.append(error)
@@ -212,17 +213,17 @@ def _register_plugins() -> list[BaseException]:
 
 
 def _missing_plugin(kind: str, not_imported: Iterable[BaseException]) -> MissingDependencyError:
-    """The error for a policy of a type that no imported package registers."""
+    """Error for a policy type that no imported package registers."""
     feature = f"A policy of type {reprlib.repr(kind)}"
     for error in not_imported:
         if isinstance(error, ImportError) and error.name:
             return MissingDependencyError(feature, error.name, f"pip install {error.name}")
     name = f"lerobot_policy_{reprlib.repr(kind)[1:-1]}"
-    return MissingDependencyError(feature, name, "docs/install.md names demorec's own plug-ins")
+    return MissingDependencyError(feature, name, "docs/install.md lists demorec's plug-ins")
 
 
 def _batched(observation: dict[str, Any]) -> dict[str, Any]:
-    """With a leading axis of one."""
+    """Add a leading axis of size one."""
     return {
         key: _batched(value) if isinstance(value, dict) else np.ascontiguousarray(value)[np.newaxis]
         for key, value in observation.items()

@@ -1,10 +1,10 @@
-"""A policy over many held-out scenes, in parallel workers, every rollout recorded.
+"""Run a policy in many held-out scenes, in parallel workers, and record every rollout.
 
     OUT/evaluation.json              settings, one line per rollout
     OUT/episodes/episode_000000.mcap    successes
     OUT/failed/episode_000003.mcap      failures
 
-The recordings are ordinary ones (view, check, replay and export work on them); `action` is what the policy commanded.
+The recordings are ordinary ones (view, check, replay and export work on them); `action` is the policy's command.
 """
 
 from __future__ import annotations
@@ -75,17 +75,17 @@ def settings_for(
     episode_length: int | None = None,
     allowed: Sequence[str] = (),
 ) -> Settings:
-    """Fill in what the policy's folder states: its kind, its actions, its inputs, its cameras' sizes.
+    """Read the policy's type, actions, inputs and camera sizes from its folder.
 
     Args:
         policy: Folder of the policy.
-        config: The caller's own words: which scenes; its cameras are those of their own that the policy may see.
-        action, action_steps, episode_length: As of `Settings`; None: as trained, or the environment's.
-        allowed: The user's own modules that may be imported for what the policy names.
+        config: The caller's choice of scenes; its cameras are the user's own that the policy may see.
+        action, action_steps, episode_length: As in `Settings`; None: as trained, or the environment's.
+        allowed: The user's own modules that may be imported if the policy names them.
 
     Raises:
-        ConfigError: No policy, cameras that it needs and did not get, or actions of an unknown meaning.
-        NotAllowedError: The policy names something of a module that is not allowed.
+        ConfigError: No policy, missing cameras, or actions of an unknown meaning.
+        NotAllowedError: The policy names an object of a module that is not allowed.
     """
     checkpoint = find_checkpoint(policy)
     check_steps(checkpoint, allowed)
@@ -100,7 +100,7 @@ def settings_for(
     action = action or trained_action(checkpoint)
     if action is None:
         raise ConfigError(
-            "What the policy's actions mean is unknown, since the dataset it was trained on is gone or in motor units: "
+            "The meaning of the policy's actions is unknown, since its training dataset is gone or in motor units: "
             "give --action joint, joint_increment, ee or ee_delta (none is in motor units)."
         )
     config.validate()
@@ -119,7 +119,7 @@ def settings_for(
 
 
 def _state_kind(inputs: Mapping[str, tuple[int, ...]], robot: RobotSpec) -> StateKind:
-    """By how many numbers of observation.state the policy takes; "joint" for what is neither, which LeRobot refuses."""
+    """State kind by the size of the policy's observation.state; "joint" for any other size, which LeRobot rejects."""
     if STATE not in inputs:
         return "joint"
     return "joint_ee" if inputs[STATE] == (len(state_names(robot, "joint_ee")),) else "joint"
@@ -134,12 +134,12 @@ def evaluate(
     overwrite: bool = False,
     progress: Callable[[Evaluation], None] = lambda evaluation: None,
 ) -> Evaluation:
-    """Run the policy in episodes 0 .. num_episodes - 1; goes on where an evaluation in `out` stopped.
+    """Run the policy in episodes 0 .. num_episodes - 1; continues an evaluation in `out`.
 
     Raises:
-        ConfigError: Another evaluation, or something else, is in the folder, or another command writes there; or what
-            is to be overwritten is not an evaluation alone.
-        DemorecError: A rollout could not be carried out.
+        ConfigError: Another evaluation or other files are in the folder, another command writes there, or the folder to
+        overwrite holds more than an evaluation.
+        DemorecError: A rollout failed to run.
     """
     with open_evaluation(settings, out, overwrite=overwrite) as evaluation:
         return _with_missing(evaluation, out, num_episodes=num_episodes, workers=workers, progress=progress)
@@ -148,7 +148,7 @@ def evaluate(
 def _with_missing(
     evaluation: Evaluation, out: Path, *, num_episodes: int, workers: int, progress: Callable[[Evaluation], None]
 ) -> Evaluation:
-    """Run the policy in the episodes that an evaluation lacks."""
+    """Run the policy in the episodes missing from an evaluation."""
     config, done = evaluation.settings.config, evaluation.successes
     due = [EpisodePlan(config=config, episode_index=index) for index in range(num_episodes) if index not in done]
     with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
@@ -157,7 +157,7 @@ def _with_missing(
                 if report.kind == MissingDependencyError.__name__:
                     raise DemorecError(report.message)
                 raise report.error(
-                    f"Episode {report.plan.episode_index}: {report.message.rstrip('.')}; the same command goes on."
+                    f"Episode {report.plan.episode_index}: {report.message.rstrip('.')}; the same command continues."
                 )
             evaluation = with_rollouts(evaluation, [*evaluation.rollouts, report.attempt])
             save_evaluation(evaluation, out)
@@ -166,7 +166,7 @@ def _with_missing(
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Run the policy once and record it; the work of a worker (see `demorec.generate.executor.Maker`)."""
+    """Run the policy once and record it, in a worker (see `demorec.generate.executor.Maker`)."""
     settings, env, policy, world = _stage(folder)
     observation, _ = env.reset(seed=plan.episode_index)
     info, kind = env.info, "rollout"
@@ -212,9 +212,9 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
     )
 
 
-@functools.lru_cache(maxsize=1)  # a worker is of one evaluation
+@functools.lru_cache(maxsize=1)  # a worker serves one evaluation
 def _stage(folder: Path) -> tuple[Settings, DemorecEnv, Policy, World | None]:
-    """What decides, the environment, the policy and the world for rehearsals, kept from one rollout to the next."""
+    """Settings, environment, policy and the world for simulating the expert, kept between rollouts."""
     settings = load_evaluation(folder).settings
     env = DemorecEnv(
         config=settings.config,

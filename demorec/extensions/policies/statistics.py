@@ -1,4 +1,4 @@
-"""How sure a success rate is: intervals, comparisons and cells of the randomised ranges."""
+"""Uncertainty of a success rate: intervals, comparisons and cells of the randomised ranges."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class Rate:
 
     @property
     def value(self) -> float:
-        """k / n; not a number without trials."""
+        """k / n; NaN without trials."""
         return self.successes / self.trials if self.trials else math.nan
 
     @property
@@ -32,7 +32,7 @@ class Rate:
         n, p, z = self.trials, self.value, Z95
         centre = (p + z * z / (2 * n)) / (1 + z * z / n)
         half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
-        # At k = 0 and k = n the bounds are 0 and 1 but for rounding.
+        # At k = 0 and k = n the exact bounds are 0 and 1; the formula adds rounding errors.
         low = 0.0 if self.successes == 0 else max(0.0, centre - half)
         high = 1.0 if self.successes == n else min(1.0, centre + half)
         return low, high
@@ -46,15 +46,15 @@ class Rate:
 
 @dataclass(frozen=True, kw_only=True)
 class RateComparison:
-    """Two policies.
+    """Comparison of two policies.
 
     Attributes:
         first, second: Their rates, each over its own scenes.
         difference: second - first.
         interval: 95 % interval of the difference: Newcombe's hybrid score interval
             (https://doi.org/10.1002/(SICI)1097-0258(19980430)17:8<873::AID-SIM779>3.0.CO;2-I, method 10).
-        only_first, only_second: Scenes that both tried and only one solved.
-        p_value: Exact McNemar test over these scenes (two-sided); 1 without any.
+        only_first, only_second: Number of scenes that both attempted and only one solved.
+        p_value: Exact two-sided McNemar test over these scenes; 1 without such scenes.
     """
 
     first: Rate
@@ -89,7 +89,7 @@ def compare(first: Mapping[int, bool], second: Mapping[int, bool]) -> RateCompar
 
 
 def sign_test(k: int, m: int) -> float:
-    """Two-sided exact p-value of k against m under equal chances (the binomial form of McNemar's test)."""
+    """Two-sided exact p-value of k versus m under equal chances (the binomial form of McNemar's test)."""
     n = k + m
     tail = float(sum(math.comb(n, i) for i in range(min(k, m) + 1)) / 2**n)
     return min(1.0, 2.0 * tail)
@@ -106,7 +106,7 @@ class Cell:
 
 
 def cells(factors: Sequence[Mapping[str, float]], successes: Sequence[bool], *, parts: int = 3) -> tuple[Cell, ...]:
-    """Success by factor, each range cut into `parts` equal parts; factors that do not vary are left out."""
+    """Success by factor, with each range cut into `parts` equal parts; constant factors are left out."""
     found = []
     for name in dict.fromkeys(name for row in factors for name in row):
         values = [(row[name], success) for row, success in zip(factors, successes, strict=True) if name in row]
@@ -123,7 +123,7 @@ def cells(factors: Sequence[Mapping[str, float]], successes: Sequence[bool], *, 
 
 
 def factors_of(scene: Scene) -> dict[str, float]:
-    """What was randomised in a scene, as numbers: places, sizes, yaws and physics of the objects to be moved."""
+    """Randomised values of a scene as numbers: positions, sizes, yaws and physics of the objects to be moved."""
     values: dict[str, float] = {}
     for number, goal in enumerate(scene.goals):
         prefix = "" if len(scene.goals) == 1 else f"{number}."

@@ -1,8 +1,8 @@
-"""Who acts in a rollout, frame by frame: the policy, and where it is corrected the expert.
+"""Control of a rollout, frame by frame: the policy acts, and the expert corrects it.
 
-Where a policy goes wrong it is in states that no demonstration has. What the expert does from there is what the policy
-lacks (DAgger, Ross et al. 2011, https://arxiv.org/abs/1011.0686). Frames in which the policy acted have the phase
-"policy", all others are the expert's.
+A policy that errs reaches states that no demonstration has. The expert's actions from there are the data that the
+policy lacks (DAgger, Ross et al. 2011, https://arxiv.org/abs/1011.0686). The policy's frames have the phase "policy",
+all others are the expert's.
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ from demorec.tasks.success import goal_pose
 
 TAKE_OVER_EVENT, HAND_BACK_EVENT, _MESSAGE = "take_over", "hand_back", "the expert takes over: "
 _RECOVERY = (HALT_PHASE, TAKE_OVER, "recover", "perceive")
-"""Phases in which the expert is not yet back where demonstrations go."""
+"""Phases before the expert has returned to states that demonstrations have."""
 PHASES = ("reach", "lift", "transport", "place")
-"""reach: nothing was grasped; lift: grasped, never lifted; transport: lifted, never brought near its goal; place:
-brought there, but the conditions did not hold in the end."""
+"""reach: nothing was grasped; lift: grasped, but not lifted; transport: lifted, but not near its goal; place: near its
+goal, but the conditions did not hold at the end.
+"""
 
 GRASP_FORCE = 0.5
 LIFTED = 0.03
@@ -43,16 +44,16 @@ class Turns:
     """One rollout, from a reset environment to its end.
 
     Args:
-        env: Just reset.
-        policy: Acts first.
-        observation: What the reset gave.
-        seed: Of the policy, for each of its turns.
-        rules: When the expert takes over; None: never, and the policy acts until its time is up.
-        rehearsal_world: As of `Watch`.
+        env: Environment after a reset.
+        policy: Policy, which acts first.
+        observation: Observation of the reset.
+        seed: Seed of the policy for each of its turns.
+        rules: Conditions of a takeover; None: never, so that the policy acts until its time is over.
+        rehearsal_world: World of `Watch`.
 
     Attributes:
         success: Whether the task was done.
-        num_retries: How often the expert tried something again.
+        num_retries: Number of the expert's retries.
     """
 
     def __init__(
@@ -80,7 +81,7 @@ class Turns:
         self._stages = [0] * len(env.info.simulated.scene.goals)
 
     def frames(self) -> Iterator[Frame]:
-        """Each frame, once its command has been carried out."""
+        """Yield each frame after its command was executed."""
         reason = yield from self._policy_acts()
         while reason:
             handed_back = yield from self._expert_acts(reason)
@@ -89,7 +90,7 @@ class Turns:
             reason = yield from self._policy_acts(Event(name=HAND_BACK_EVENT, message="the policy acts again"))
 
     def _policy_acts(self, *events: Event) -> Generator[Frame, None, str]:
-        """Returns why the expert takes over; "" at the end of the rollout."""
+        """Return the reason for a takeover; "" at the end of the rollout."""
         env = self._env
         self._policy.reset(self._seed)
         if self._watch is not None:
@@ -105,7 +106,7 @@ class Turns:
                 return ""
 
     def _expert_acts(self, reason: str) -> Generator[Frame, None, bool]:
-        """Returns whether the policy shall act again."""
+        """Return whether the policy acts again."""
         world, behaviour, retries = self._env.world, self._behaviour, self.num_retries
         expert = Expert(world, behaviour)
         expert.note(TAKE_OVER_EVENT, f"{_MESSAGE}{reason}")
@@ -123,13 +124,13 @@ class Turns:
         return False
 
     def _steps(self, expert: Expert) -> Iterator[Step]:
-        """Until the task is done or given up; then a few that hold."""
+        """Yield steps until the task is done or given up, then a few that hold."""
         self._trouble = "", ""
         try:
             yield from self._env.episode.task.resume(expert)
         except ExpertFailure as error:
             self._trouble = error.phase, error.reason
-            yield expert.step()  # which carries the events that say why
+            yield expert.step()  # which carries the events with the reasons
             return
         for _ in range(SUCCESS_FRAMES):
             yield expert.step()
@@ -139,12 +140,12 @@ class Turns:
         goals = self._env.info.simulated.scene.goals
         self._stages = [max(stage, self._reached(goal, stage)) for goal, stage in zip(goals, self._stages, strict=True)]
         frame = self._env.situation.last_frame
-        assert frame is not None  # since there was a step
+        assert frame is not None  # because there was a step
         self._commands.append(frame.command)
         return frame
 
     def _reached(self, goal: Goal, stage: int) -> int:
-        """How many of `PHASES` an object has behind it, one more than before at most."""
+        """Number of `PHASES` that an object has passed, at most one more than before."""
         world = self._env.world
         held = world.grip_force(goal.object) > GRASP_FORCE
         position = world.pose(goal.object).position
@@ -156,8 +157,9 @@ class Turns:
         return 3 if math.dist(position[:2], goal_pose(world, goal).position[:2]) < NEAR_GOAL else 2
 
     def failure(self) -> tuple[str, str]:
-        """(phase, reason) of a rollout that failed, ("", "") of others: why the expert gave up; else the phase of the
-        object that came least far, and the name of the first condition that does not hold, or "time_limit"."""
+        """(phase, reason) of a failed rollout, ("", "") otherwise: the expert's reason for giving up; otherwise the
+        phase of the object with the least progress, and the first condition that does not hold, or "time_limit".
+        """
         if self.success or self._gave_up[1]:
             return ("", "") if self.success else self._gave_up
         reason = next((check.name for check in self._env.situation.checks if not check.passed), "time_limit")
@@ -165,14 +167,14 @@ class Turns:
 
 
 class TakenOver(NamedTuple):
-    """The corrections in a recording: why the expert took over, each time, and how many frames it acted in."""
+    """Corrections in a recording: the reason of each takeover, and the number of the expert's frames."""
 
     reasons: tuple[str, ...]
     num_frames: int
 
 
 def read_takeover(path: Path) -> TakenOver | None:
-    """Of the recording of a rollout; None where the policy acted to the end.
+    """Read the corrections of a rollout's recording; None if the policy acted to the end.
 
     Raises:
         RecordingError: It cannot be read.

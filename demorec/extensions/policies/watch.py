@@ -1,7 +1,7 @@
-"""Watches a policy, and decides when and why the expert takes over.
+"""Monitor of a policy that decides when and why the expert takes over.
 
-The expert has a script, and no action for every state: so its way is simulated beforehand in a world of its own, from
-the same state on, and a policy's commands are compared with the part of that way that it has reached.
+The expert has a script but no action for every state. Its trajectory is therefore simulated beforehand in a separate
+world from the same state, and the policy's commands are compared with the part of that trajectory that it has reached.
 """
 
 from __future__ import annotations
@@ -22,24 +22,26 @@ from demorec.tasks.script import Behaviour, ExpertFailure, Step
 from demorec.tasks.skills import Expert
 
 _AHEAD_SECONDS = 1.0
-"""How far ahead on the expert's way a policy may be from one frame to the next."""
+"""Maximum progress along the expert's trajectory from one frame to the next, s."""
 _SAME_PLACE = 0.001
-"""Metres within which two places of the way are one; the later one counts, since the expert also waits."""
+"""Maximum distance, metres, between two places that count as the same; the later one is used, because the expert also
+waits.
+"""
 
 
 def correcting_behaviour(episode: PreparedEpisode, *, noise: bool) -> Behaviour:
-    """How the expert does it in an episode that it takes over: without a miss on purpose, with `noise` or without."""
+    """The expert's behaviour when it takes over an episode: no deliberate misses, with or without `noise`."""
     behaviour = replace(episode.behaviour, miss_x=0.0, miss_y=0.0)
     return behaviour if noise else replace(behaviour, action_noise=0.0)
 
 
 class Rehearsal:
-    """The expert's way from a state on.
+    """The expert's simulated trajectory from a state.
 
     Args:
-        world: Of the episode's robot; it is reset.
-        episode: Whose scene and task.
-        commands: What was sent since the episode's start; the way begins after them.
+        world: World of the episode's robot; it is reset.
+        episode: Episode with the scene and task.
+        commands: Commands sent since the episode's start; the trajectory begins after them.
     """
 
     def __init__(self, world: World, episode: PreparedEpisode, commands: Sequence[Action]) -> None:
@@ -63,12 +65,13 @@ class Rehearsal:
         self._reached = 0
 
     def distance(self, observation: Observation, command: Action) -> tuple[float, float, float]:
-        """How far a policy is that commands this now; to be asked once a frame, since the way is followed forward.
+        """Compare a policy's command with the expert's; call once per frame, because the trajectory is followed
+        forward.
 
         Returns:
-            Metres from the TCP that it commands to the nearest one that the expert commands within the next second;
-            radians between the directions of the hand there; and metres from the objects to where the expert has them
-            at the same place of its way, the largest.
+            Distance, m, from the commanded TCP to the nearest TCP that the expert commands within the next second;
+            angle, rad, between the hand directions there; and the largest distance, m, of an object from its position
+            at the same place of the expert's trajectory.
         """
         window = slice(self._reached, self._reached + self._ahead)
         off = np.abs(self._places[window] - _place(observation)).sum(axis=1)
@@ -84,7 +87,7 @@ class Rehearsal:
 
 
 def _steps(world: World, episode: PreparedEpisode, *, is_start: bool) -> Iterator[Step]:
-    """What the expert does until it is done or gives up."""
+    """Steps of the expert until it is done or gives up."""
     expert = Expert(world, correcting_behaviour(episode, noise=False))
     try:
         yield from episode.task.script(expert) if is_start else episode.task.resume(expert)
@@ -93,24 +96,24 @@ def _steps(world: World, episode: PreparedEpisode, *, is_start: bool) -> Iterato
 
 
 def _place(observation: Observation) -> Array:
-    """(4,) TCP position and opening, metres: where on a way somebody is."""
+    """(4,) TCP position and opening, metres: a place on a trajectory."""
     return np.array([*observation.base_from_tcp.position, observation.gripper_width])
 
 
 _STILL_METRES = 0.005
-"""Maximum range of a stuck hand's TCP along each axis."""
+"""Maximum range of a stuck hand's TCP along each axis, metres."""
 _STILL_WIDTH = 0.002
-"""Maximum range of its opening, metres."""
+"""Maximum range of a stuck hand's opening, metres."""
 
 
 class Watch:
-    """Watches a policy in one episode; a function of the episode and of what the policy does.
+    """Monitor of a policy in one episode; a function of the episode and the policy's actions.
 
     Args:
-        rules: When the expert takes over.
-        episode: Whose random stream says at which moment, if at a random one.
+        rules: Conditions of a takeover.
+        episode: Episode whose random stream determines a random moment.
         max_frames: Time limit of the policy.
-        world: In which the expert's way is rehearsed; needed only where straying counts.
+        world: World in which the expert's trajectory is simulated; needed only for the straying conditions.
     """
 
     def __init__(
@@ -128,20 +131,22 @@ class Watch:
         self._rehearsal: Rehearsal | None = None
 
     def begin(self, commands: Sequence[Action]) -> None:
-        """The policy begins to act, or acts again, after these commands of the episode."""
+        """Start monitoring when the policy begins to act, or acts again, after these commands of the episode."""
         self._past.clear()
         self._astray = 0
         if commands:
-            self._moment = self._limit  # the random moment has been
+            self._moment = self._limit  # the random moment has passed
         if self._world is not None and (self._rules.stray_metres or self._rules.stray_radians):
             self._rehearsal = Rehearsal(self._world, self._episode, commands)
 
     def is_over(self, situation: Situation) -> bool:
-        """Whether the policy has had its time."""
+        """Whether the policy's time is over."""
         return situation.frame_index >= self._limit
 
     def reason(self, situation: Situation, command: Action) -> str:
-        """Why the expert takes over instead of this command; "" while the policy goes on. To be asked once a frame."""
+        """Reason why the expert takes over instead of this command; "" while the policy continues. Call once
+        per frame.
+        """
         observation = situation.observation
         self._past.append(_place(observation))
         if self.is_over(situation):

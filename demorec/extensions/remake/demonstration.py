@@ -1,8 +1,8 @@
 """Recordings, and episodes of datasets, opened for replay, and the options of a replay.
 
-Datasets have float32 actions of any kind; their scenes come from the sidecar. The data of a real arm are its numbers
-alone: the simulated arm starts in the same state, on an empty table, and is sent the same actions. Its distance from
-the recorded states shows how well the simulator (or the calibration) fits that arm.
+Datasets have float32 actions of any kind; their scenes come from the sidecar. A real arm's data has numbers only: the
+simulated arm starts in the same state, on an empty table, and receives the same actions. Its distance from the recorded
+states shows how well the simulator (or the calibration) matches that arm.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ if TYPE_CHECKING:
 
 JOINTS, OPENING, EE_POSE, POSE_OF = "joint positions", "gripper opening", "the EE pose", "the pose of "
 _LEAST_HZ = Physics.hz
-"""Minimum rate of the physics in the replay of a real arm, with a whole number of steps per frame."""
+"""Minimum physics rate in the replay of a real arm, with a whole number of steps per frame."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayOptions:
-    """How actions are sent.
+    """Options of a replay.
 
     Attributes:
-        states: Place the recorded states one after the other, without physics, instead of sending actions.
-        export_hz: Commands a second; divides the recording's rate. None: the recorded rate.
+        states: Place the recorded states in sequence, without physics, instead of sending actions.
+        export_hz: Commands per second; divides the recording's rate. None: the recorded rate.
         noise: Standard deviation of Gaussian noise on every joint target, rad.
-        delay: Steps by which every command comes late.
-        seed: Of the noise.
+        delay: Number of steps by which every command is delayed.
+        seed: Seed of the noise.
         allowed: The user's own modules that may be imported for the demonstrations.
-        robot: Simulated arm for the actions of a real one; None: that of each recorded scene.
+        robot: Simulated arm for a real arm's actions; None: the robot of each recorded scene.
         motors: Servos of states and actions in datasets, if the user names them.
-        named: Roles that the user names, of features of a real arm.
+        named: Roles that the user names, for features of a real arm.
     """
 
     states: bool = False
@@ -76,13 +76,13 @@ class ReplayOptions:
         if self.robot is not None and (self.states or self.export_hz):
             raise ConfigError("--states and --export-hz are for recordings with a scene: leave them out with --robot.")
         if self.motors is not None and self.robot is None:
-            raise ConfigError("--motor-units says how the dataset of a real arm is to be read: add --robot so101.")
+            raise ConfigError("--motor-units is for the dataset of a real arm: add --robot so101.")
         if self.named and self.robot is None:
-            raise ConfigError("--state, --action and --gripper say how the data of a real arm are read: add --robot.")
+            raise ConfigError("--state, --action and --gripper are for the data of a real arm: add --robot.")
 
     @property
     def changes(self) -> str:
-        """How the commands differ from the recorded ones, for a replay's origin; "" for a plain replay."""
+        """Changes of the commands, for a replay's origin; "" if unchanged."""
         if self.states:
             return " by its states"
         changes = [("noise", self.noise), ("seed", self.noise and self.seed), ("delay", self.delay)]
@@ -99,21 +99,21 @@ class Demonstration:
     """An episode to replay: a start, commands, and recorded states.
 
     Attributes:
-        name: Of the file or of the dataset's episode.
+        name: Name of the file or of the dataset's episode.
         info: The recorded scene and robot.
-        fps: Commands a second.
-        commands: What to send, one a step; of a recording.
-        actions: (T, D) what to send is decoded from these; of a dataset.
+        fps: Commands per second.
+        commands: Recorded commands, one per step; of a recording.
+        actions: (T, D) from which the commands are decoded; of a dataset.
         action_kind: Meaning of `actions`; None with `commands`.
-        compared: Name, as of `seen_in` -> (T, D) recorded before each command; of a dataset the opening and the joints
-            of the arm alone.
-        outcome: How it ended when it was recorded; without a final state where that is not compared, None if unknown.
-        tolerance: Difference up to which a state counts as the same: 0 for float64, rounding for float32.
-        source: The recording's file; None for an episode of a dataset.
-        digest: Of its content.
-        recorded: The recorded frames, without images, where every one of them is replayed.
-        gave_up: Whether the recording shows the reason of its failure (`gave_up`).
-        is_measured: Whether the states are those of a real arm, which no simulated one has to the bit.
+        compared: Name in `seen_in` -> (T, D) recorded before each command; for a dataset only the opening and the arm's
+        joints.
+        outcome: Recorded outcome, without a final state if that is not compared; None if unknown.
+        tolerance: Maximum difference of equal states: 0 for float64, rounding for float32.
+        source: File of the recording; None for an episode of a dataset.
+        digest: Digest of its content.
+        recorded: Recorded frames without images, if every one is replayed.
+        gave_up: Whether the recording gives the reason of its failure (`gave_up`).
+        is_measured: Whether the states are a real arm's, which no simulation reproduces bit-exactly.
     """
 
     name: str
@@ -133,12 +133,12 @@ class Demonstration:
 
     @property
     def success(self) -> bool | None:
-        """Whether it succeeded when it was recorded; None if unknown."""
+        """Recorded success; None if unknown."""
         return None if self.outcome is None else self.outcome.success
 
     @property
     def num_steps(self) -> int:
-        """T."""
+        """Number of steps, T."""
         return len(self.compared[JOINTS])
 
     @property
@@ -148,7 +148,7 @@ class Demonstration:
 
 
 def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstration:
-    """A recording to be replayed.
+    """Open a recording for replay.
 
     Raises:
         RecordingError: It is damaged or empty.
@@ -164,11 +164,11 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         raise OptionError("export_hz", f"is {fps}, which does not divide the recording's {info.fps}: use {divisors}.")
     stride = info.fps // fps
     rows = np.arange(0, trajectory.num_frames, stride)
-    # As the export does: where the arm shall be when the next observation is taken.
+    # Same as in the export: the target at the time of the next observation.
     sent = np.minimum(rows + stride - 1, trajectory.num_frames - 1)
     outcome = recording.outcome
     seen = [seen_in(observation_at(trajectory, int(row))) for row in rows]
-    # Without physics only the states that a world can be put in, and what follows from them.
+    # Without physics, only the states that can be set and those that follow from them.
     compared = [n for n in seen[0] if not options.states or n in (JOINTS, OPENING, EE_POSE) or n.startswith(POSE_OF)]
     return Demonstration(
         name=recording.path.name,
@@ -177,7 +177,7 @@ def open_demonstration(recording: Recording, options: ReplayOptions) -> Demonstr
         commands=tuple(action_at(trajectory, int(row), "command") for row in sent),
         compared={name: np.array([values[name] for values in seen]) for name in compared},
         outcome=outcome if outcome is None or stride == 1 else replace(outcome, final_state_digest=""),
-        # Placing a body normalises its quaternion once more.
+        # Placing a body normalises its quaternion again.
         tolerance=1e-9 if options.states else 0.0,
         digest=recording.digest(),
         recorded=() if stride > 1 else tuple(frames_of(trajectory, recording.events(), recording.joint_samples())),
@@ -193,7 +193,7 @@ def _sensed_here(info: EpisodeInfo) -> EpisodeInfo:
 
 
 def seen_in(observation: Observation) -> dict[str, Array]:
-    """All that is sensed, in words -> (D,)."""
+    """All sensed quantities: name -> (D,)."""
     return {
         JOINTS: observation.joint_position,
         OPENING: np.array([observation.gripper_width]),
@@ -207,15 +207,15 @@ def seen_in(observation: Observation) -> dict[str, Array]:
 
 
 def open_file(path: Path, options: ReplayOptions) -> Demonstration:
-    """A recording's file to be replayed; errors as `open_demonstration` or, with a robot, `demonstration_of`."""
+    """Open a recording's file for replay; errors as in `open_demonstration` or, with a robot, `demonstration_of`."""
     if options.robot is not None:
         from demorec.extensions.remake.motion import motion_of_features
 
         with open_recording(path) as recording:
             if options.motors is not None:
-                raise ConfigError(f"--motor-units belongs to datasets, recordings say their units: {path}")
+                raise ConfigError(f"--motor-units is for datasets, recordings have units: {path}")
             if recording.info.simulation is not None:
-                raise ConfigError(f"The recording has an arm and a scene of its own: leave --robot out: {path}")
+                raise ConfigError(f"The recording has its own arm and scene: leave out --robot: {path}")
             info, table = recording.info, recording.table()
             motion = motion_of_features(table.features, info.features, info.fps, info.urdf, named=options.named)
         return demonstration_of(motion, options.robot, name=path.name, where=path, episode_index=info.episode_index)
@@ -226,23 +226,25 @@ def open_file(path: Path, options: ReplayOptions) -> Demonstration:
 def dataset_demonstrations(
     path: Path, wanted: Callable[[int], bool], options: ReplayOptions
 ) -> Iterator[Demonstration]:
-    """The episodes of an exported dataset, by what its sidecar keeps of their scenes.
+    """Yield the episodes of an exported dataset, with the scenes from its sidecar.
 
     Args:
         path: The dataset.
-        wanted: Whether an episode, by its number in the dataset, is wanted.
-        options: How it will be replayed.
+        wanted: Whether to yield the episode with a number.
+        options: Options of the replay.
 
     Raises:
-        ConfigError: The dataset has no sidecar of ours, other actions, or the options make no sense for it; with a
-            robot, as `demonstration_of`.
+        ConfigError: The dataset has no sidecar of demorec or unknown actions, or the options do not apply to it; with a
+        robot, as in `demonstration_of`.
         ExportError: It is damaged.
     """
     from demorec.check.dataset import CheckedDataset
     from demorec.extensions.remake.motion import motions_of_dataset
 
     if options.states or options.export_hz:
-        raise ConfigError("--states and --export-hz are for recordings: a dataset has no full states and one rate.")
+        raise ConfigError(
+            "--states and --export-hz are for recordings: a dataset has no full states and a single rate."
+        )
     dataset = CheckedDataset(path, motors=options.motors, named=options.named)
     if missing := dataset.folder.missing:
         raise ExportError(missing)
@@ -257,7 +259,7 @@ def dataset_demonstrations(
         return
     if not dataset.sidecar:
         raise ConfigError(
-            f"The dataset does not say how its scenes were (no demorec/episodes): --robot replays what a real arm did: "
+            f"The dataset does not record its scenes (no demorec/episodes): --robot replays a real arm's actions: "
             f"{path}"
         )
     dataset.check_simulated()
@@ -268,7 +270,7 @@ def dataset_demonstrations(
         number, rows, row, info = each.number, each.rows, each.kept, each.info
         kind = next((kind for kind in get_args(ActionKind) if action_names(info.simulated.robot, kind) == names), None)
         if kind is None:
-            raise ConfigError(f"The dataset's actions are none that demorec writes, so they cannot be replayed: {path}")
+            raise ConfigError(f"The dataset's actions were not written by demorec and cannot be replayed: {path}")
         state, arm = rows[STATE].astype(np.float64), len(info.simulated.robot.arm_joints)
         yield Demonstration(
             name=f"{path.name}_episode_{number:06d}",
@@ -286,23 +288,23 @@ def dataset_demonstrations(
 def demonstration_of(
     motion: RobotMotion | None, robot: RobotSpec, *, name: str, where: Path, episode_index: int
 ) -> Demonstration:
-    """The actions of a real arm in an episode, for a simulated arm of its kind.
+    """Prepare the actions of a real arm in an episode for a simulated arm of its kind.
 
     Args:
-        motion: Of the episode; None for one without a state.
+        motion: Motion in the episode; None without a state.
         robot: The simulated arm.
-        name: Of the demonstration.
+        name: Name of the demonstration.
         where: Its file or dataset, for messages.
         episode_index: Number of the episode.
 
     Raises:
-        ConfigError: The joints of its state are not known to be those of the robot, or some have no action.
+        ConfigError: The joints of its state are not known to be the robot's, or some have no action.
     """
     from demorec.tasks.furniture import table_and_floor
 
     if motion is None or motion.action is None:
         raise ConfigError(
-            f"There is no state with an action of the same elements to replay (--state, --action name them): {where}"
+            f"No state and action with the same elements to replay (--state, --action name them): {where}"
         )
     state, action = (_of_robot(values, motion, robot, where) for values in (motion.state, motion.action))
     if np.isnan(action).any():
@@ -340,7 +342,9 @@ def demonstration_of(
 
 
 def _of_robot(values: Array, motion: RobotMotion, robot: RobotSpec, where: Path) -> Array:
-    """(T, n_arm + 1) positions of the arm's joints, rad, and opening of the gripper, m, of (T, D) of a motion."""
+    """Convert (T, D) of a motion to (T, n_arm + 1): positions of the arm's joints, rad, and opening of the
+    gripper, m.
+    """
     from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS
     from demorec.extensions.remake.motion import GRIPPER
 
@@ -350,7 +354,7 @@ def _of_robot(values: Array, motion: RobotMotion, robot: RobotSpec, where: Path)
         motors = ", or --motor-units is missing" if robot.name in IN_MOTOR_UNITS else ""
         raise ConfigError(
             f"The elements of the state ({', '.join(motion.names)}) are not known to be the joints "
-            f"{', '.join(missing)} of {robot.name}: it is of another robot{motors}: {where}"
+            f"{', '.join(missing)} of {robot.name}: they belong to another robot{motors}: {where}"
         )
     arm = values[:, [motion.joints.index(joint) for joint in robot.arm_joints]]
     if GRIPPER in motion.names:

@@ -1,4 +1,6 @@
-"""The actions of a demonstration into the simulator, recorded if wanted; every state compared with the recorded one."""
+"""Send the actions of a demonstration to the simulator, record them if requested, and compare every state with the
+recorded one.
+"""
 
 from __future__ import annotations
 
@@ -31,27 +33,27 @@ from demorec.sim.world import World
 
 @dataclass(frozen=True, kw_only=True)
 class ReplayReport:
-    """How a replay compares with the recording.
+    """Comparison of a replay with the recording.
 
     Attributes:
         name: Name of the demonstration.
-        num_steps: Commands sent.
-        is_bitwise: Whether full float64 states were compared, so that nothing may differ.
+        num_steps: Number of commands sent.
+        is_bitwise: Whether full float64 states were compared and must be bit-exact.
         compared: Names of the compared quantities.
-        is_identical: No bit of any of this differs, nor of the final state's digest and the conditions of a recording's
-            outcome (float32 datasets: no more than rounding).
-        first_difference: First step with another state, and what differed there; None when none does.
-        joint_error, joint_error_step: Largest difference of an arm joint, rad, and where.
+        is_identical: All of this, the final state's digest and the conditions of a recording's outcome are bit-exact
+        (float32 datasets: equal up to rounding).
+        first_difference: First step with a different state, and the quantity; None if all are equal.
+        joint_error, joint_error_step: Largest difference of an arm joint, rad, and its step.
         gripper_error: Largest difference of the opening, m.
         object_error, object_error_step, object_error_name: Largest distance of an object from its recorded place, m.
-        compares_objects: Whether the places of objects were recorded; a dataset has none.
-        recorded_success, success: Of the task, then and now; None where that is not known or not judged.
-        is_outcome_as_recorded: Both are the same, or one is not known. A failure whose reason the recording shows (the
-            expert gave up) stays one though the conditions hold.
-        failed_checks: Conditions that do not hold now.
+        compares_objects: Whether object positions were recorded; datasets have none.
+        recorded_success, success: Success of the recording and of the replay; None if unknown or not judged.
+        is_outcome_as_recorded: Both are equal, or one is unknown. A failure with a recorded reason (the expert gave up)
+        remains one even if the conditions hold.
+        failed_checks: Conditions that do not hold in the replay.
         unreachable: Number of steps with a pose out of reach (the arm held its last target).
-        tracking: Joint of the arm (rad) or "gripper" (m) -> median and largest difference from what was measured of a
-            real one; empty for simulated episodes.
+        tracking: Arm joint (rad) or "gripper" (m) -> median and largest difference from a real arm's measurements;
+        empty for simulated episodes.
     """
 
     name: str
@@ -86,14 +88,14 @@ def replay(
     """Send the actions of a demonstration and compare.
 
     Args:
-        demonstration: What to do.
-        world: Of its robot and rate (`World(info.simulated.robot, fps=demonstration.fps)`); is reset.
-        options: How.
-        painter: For the images of the frames, or None.
-        sink: Is given every frame of the replay before its command is sent.
+        demonstration: Demonstration to replay.
+        world: World of its robot and rate (`World(info.simulated.robot, fps=demonstration.fps)`); it is reset.
+        options: Options of the replay.
+        painter: Draws the frames' images; None for none.
+        sink: Called with every frame of the replay before its command is sent.
 
     Returns:
-        The report, and how the replay ended; with `states`, which judge nothing, how the recording did.
+        The report, and the outcome of the replay; with `states`, which judges nothing, the recorded outcome.
     """
     d = demonstration
     task = None if options.states or d.is_measured else TASKS.load(d.info.simulated.task, options.allowed)()
@@ -109,7 +111,7 @@ def replay(
 
 
 class DemonstrationAgent:
-    """Sends the recorded commands as the options say: late, with noise, or unchanged."""
+    """Agent that sends the recorded commands, delayed, with noise or unchanged."""
 
     num_retries = 0
 
@@ -120,11 +122,11 @@ class DemonstrationAgent:
 
     @property
     def num_unreachable(self) -> int:
-        """Number of steps with a pose out of reach, or a target that is not a number."""
+        """Number of steps with an unreachable pose, or a target that is not finite."""
         return self._num_held + (0 if self._decoder is None else self._decoder.num_unreachable)
 
     def decide(self, world: World) -> Iterator[Step]:
-        """See `demorec.loop.Agent`; label, phase and events are those of the recorded frame, if there is one."""
+        """See `demorec.loop.Agent`; label, phase and events are taken from the recorded frame, if any."""
         recorded = chain(self._demonstration.recorded, repeat(None))
         for command in self._sent(world):
             yield _step(command, next(recorded))
@@ -137,7 +139,7 @@ class DemonstrationAgent:
         for _ in range(options.delay):
             yield world.hold()
         for command in self._commands(world):
-            if not np.isfinite(command.joint_target).all():  # of a damaged dataset: the arm stays where it is
+            if not np.isfinite(command.joint_target).all():  # from a damaged dataset: the arm stays in place
                 self._num_held += 1
                 command = replace(world.hold(), gripper_target=command.gripper_target)
             if options.noise > 0.0:
@@ -171,7 +173,7 @@ def _step(command: Action, recorded: Frame | None) -> Step:
 
 
 def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
-    """The recorded states one after the other, without physics."""
+    """Yield frames with the recorded states in sequence, without physics."""
     session.reset()
     for step, recorded in zip(range(d.num_steps), chain(d.recorded, repeat(None)), strict=False):
         session.place(
@@ -246,14 +248,14 @@ def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[flo
 
 
 def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessCheck]) -> str:
-    """The first condition that is not the recorded one."""
+    """The first condition that differs from the recorded one."""
     pairs = zip_longest(now, recorded)
     return next(f"the condition {(one or other).name}" for one, other in pairs if one != other)
 
 
 def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Array]:
     """Compared quantity -> (T, D), replayed minus recorded values."""
-    width = d.compared[JOINTS].shape[1]  # of a dataset the arm's alone
+    width = d.compared[JOINTS].shape[1]  # datasets have only the arm's joints
     now = [seen_in(observation) | {JOINTS: observation.joint_position[:width]} for observation in seen]
     return {
         name: np.array([values[name] for values in now]) - recorded[: len(seen)]
@@ -265,9 +267,9 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: boo
     """Whether a replay agrees with the recording.
 
     Args:
-        report: Of the replay.
-        tolerance: Differences (m, rad) up to which states count as the same; of what a real arm did, 0 is no limit.
-        bitwise: Whether the states must be the same; otherwise (changed commands) the outcome alone counts.
+        report: Report of the replay.
+        tolerance: Maximum difference (m, rad) of equal states; for a real arm's data, 0 means unlimited.
+        bitwise: Whether the states must be equal; otherwise (changed commands) only the outcome counts.
     """
     if report.tracking and tolerance:
         return max(report.joint_error, report.gripper_error) <= tolerance
@@ -280,25 +282,25 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: boo
 def replay_all(
     demonstrations: Iterable[Demonstration], options: ReplayOptions, *, out: Path | None = None, overwrite: bool = False
 ) -> Iterator[tuple[ReplayReport, tuple[Path, Path] | None]]:
-    """Replay one after the other, in one world as long as robot and rate stay the same.
+    """Replay in sequence, in one world as long as robot and rate stay the same.
 
     Args:
-        demonstrations: What to replay.
-        options: How.
+        demonstrations: Demonstrations to replay.
+        options: Options of the replay.
         out: Folder for recordings of the replays; None records nothing.
         overwrite: Whether recordings there may be replaced.
 
     Yields:
-        The report, and (recording, recording of its replay) where one was made.
+        The report, and (recording, recording of its replay) if one was made.
 
     Raises:
-        NotAllowedError: A demonstration's task is of a module that `options` do not allow.
+        NotAllowedError: A demonstration's task is in a module that `options` do not allow.
     """
     allow_models(options.allowed)
     with closing(SimulatorCache()) as simulators:
         for demonstration in demonstrations:
             if not (options.states or demonstration.is_measured):
-                TASKS.check_name(demonstration.info.simulated.task, options.allowed)  # before anything is made
+                TASKS.check_name(demonstration.info.simulated.task, options.allowed)  # before anything is created
             if out is not None:
                 yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
                 continue
@@ -308,20 +310,20 @@ def replay_all(
 def record_replay(
     demonstration: Demonstration, simulators: SimulatorCache, options: ReplayOptions, out: Path, *, overwrite: bool
 ) -> tuple[ReplayReport, tuple[Path, Path] | None]:
-    """Replay and record it, with images of the recording's cameras, into a file of the same name in `out`.
+    """Replay and record it, with images of the recording's cameras, to a file with the same name in `out`.
 
-    A recording that the same call has made before stays as it is, unless it is to be replaced.
+    A recording that the same call has already made stays, unless it is to be replaced.
 
     Returns:
-        As `replay_all` yields.
+        As in `replay_all`.
 
     Raises:
-        ConfigError: The new recording would replace the one that is replayed, or one of that name is there already.
+        ConfigError: The new recording would replace its own source, or a file with that name exists already.
     """
     d = demonstration
     path = out / (d.name if d.source is not None else f"{d.name}.mcap")
     if d.source is not None and path.resolve() == d.source.resolve():
-        raise ConfigError(f"The replay would replace the recording itself, choose another --out: {out}")
+        raise ConfigError(f"The replay would replace its own source: choose another --out: {out}")
     view = recorded_view(d.info)
     make_folder(out)
     behaviour = view_behaviour(d.info, view)
@@ -340,7 +342,7 @@ def record_replay(
 
 
 def _replay_blind(d: Demonstration, simulators: SimulatorCache, options: ReplayOptions) -> ReplayReport:
-    """Replay it without images."""
+    """Replay without images."""
     blind = replace(d.info.simulated.scene, cameras=())
     info = with_simulation(replace(d.info, fps=d.fps), scene=blind, config={})
     world, _ = simulators.acquire(info)

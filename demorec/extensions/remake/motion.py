@@ -21,19 +21,19 @@ if TYPE_CHECKING:
     from demorec.check.dataset import CheckedDataset
 
 GRIPPER = "gripper.width"
-"""The element that is the opening of a simulated gripper, metres."""
+"""Element with the opening of a simulated gripper, metres."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RobotMotion:
-    """The motion of a robot in one episode; elements are those of the state.
+    """Motion of a robot in one episode; elements are those of the state.
 
     Attributes:
         fps: Frames per second.
-        names: Of the D elements.
-        state: (T, D) rad or m where the joint is known, otherwise as recorded.
-        action: (T, D) of the same elements and units, NaN where an element has none; None for no element.
-        joints: (D,) of the URDF, "" where it is not known; empty where none is.
+        names: Names of the D elements.
+        state: (T, D) rad or m if the joint is known, otherwise as recorded.
+        action: (T, D) in the same elements and units, NaN for elements without an action; None if no element has one.
+        joints: (D,) joint names of the URDF, "" if unknown; empty if all are unknown.
     """
 
     fps: float
@@ -46,13 +46,13 @@ class RobotMotion:
 def motion_of_features(
     features: Mapping[str, NDArray[Any]], described: Iterable[Feature], fps: float, urdf: str, *, named: NamedRoles
 ) -> RobotMotion | None:
-    """The motion in arrays (T, D) by their names; None without a state.
+    """Build the motion from named arrays (T, D); None without a state.
 
     Args:
         features: Name -> recorded values, (T, D).
-        described: Names, units and joints of each.
+        described: Names, units and joints of each feature.
         fps: Frames per second.
-        urdf: Text of the robot's description; "" for the robot whose joints the state's names are.
+        urdf: Text of the robot's URDF; "" to take joints from the state's names.
         named: Features whose role the user names.
     """
     known = {feature.name: feature for feature in described}
@@ -80,7 +80,7 @@ def motions_of_dataset(dataset: CheckedDataset) -> Iterator[RobotMotion]:
 
 
 def _arms(dataset: CheckedDataset) -> dict[int, DatasetRobot]:
-    """Episode -> its arm, where the sidecar has it or the user has named its servos."""
+    """Episode -> its arm, if the sidecar has it or the user has named its servos."""
     roles = dataset.roles
     if dataset.motors is not None and roles.elements(roles.state) == dataset.motors.names:
         return dict.fromkeys(range(len(dataset.folder.listed)), robot_of_motors(dataset.motors))
@@ -89,13 +89,13 @@ def _arms(dataset: CheckedDataset) -> dict[int, DatasetRobot]:
 
 
 def _joints(parts: Sequence[Feature]) -> tuple[str, ...]:
-    """The joints of the elements of joined features, empty where none is known."""
+    """The joints of joined features' elements, empty if none is known."""
     joints = tuple(joint for part in parts for joint in part.joints or ("",) * len(part.names))
     return joints if any(joints) else ()
 
 
 def _named_joints(names: Sequence[str], urdf: str) -> tuple[str, ...]:
-    """Joints that elements are named after, or follow in the order of the URDF (its text, "" for none)."""
+    """Joints named like the elements, or in the URDF's order (its text, "" for none)."""
     if not urdf:
         robot = recognised_robot(tuple(names))
         return () if robot is None else tuple(robot.record.joints[STATE])
@@ -123,14 +123,14 @@ def _motion(
 
 
 def _joined(parts: Sequence[str], features: Mapping[str, NDArray[Any]], described: Mapping[str, Feature]) -> Array:
-    """(T, D) of features one behind the other, each in SI by its own units: a leader may record degrees."""
+    """(T, D) of concatenated features, each in SI by its own units: a leader may record degrees."""
     return np.concatenate([described[part].in_si(features[part]) for part in parts], axis=1)
 
 
 def _same_elements(
     parts: Sequence[str], features: Mapping[str, NDArray[Any]], described: Mapping[str, Feature], roles: Roles
 ) -> Array | None:
-    """(T, D) of the elements of features that are those of the state, NaN for others; None where none is."""
+    """(T, D) of the features' elements that are also in the state, NaN for others; None if all are NaN."""
     columns = roles.in_state(parts) if parts else []
     if all(column is None for column in columns):
         return None

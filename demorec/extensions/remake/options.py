@@ -12,7 +12,7 @@ from demorec.core.tables import RENDERERS
 
 @dataclass(frozen=True, kw_only=True)
 class RerenderOptions:
-    """Changes of the new images; by default everything is as recorded."""
+    """Changes of the new images; all options default to the recorded values."""
 
     cameras: tuple[str, ...] = ()
     """Names from the recording or `demorec list cameras`, or my_package.my_module:MY_CAMERA (auto: as recorded)."""
@@ -29,7 +29,7 @@ class RerenderOptions:
     segmentation: bool = False
     """Add segmentation images if the recording has none."""
     looks: int | None = None
-    """Seed of random light, colours and textures (auto: the recorded looks)."""
+    """Seed of random light, colours and textures (auto: the recorded appearance)."""
     codec: Literal["h264", "av1", "jpeg"] | None = None
     """Codec of the new images (auto: as recorded)."""
     gop: int | None = None

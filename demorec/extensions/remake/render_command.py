@@ -1,4 +1,4 @@
-"""`demorec render`: recorded states seen by other cameras."""
+"""`demorec render`: draw recorded states with other cameras."""
 
 from __future__ import annotations
 
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Render:
-    """Render recordings again with other cameras, sizes, renderers or looks; all numbers stay the same.
+    """Render recordings again with other cameras, sizes, renderers or appearance; all numbers stay the same.
 
-    Writes new recordings that name their origin. With the recording's own cameras and looks, the images are bit-exact,
-    which is checked (exit code 1 if they are not). Run the same command again to continue where it stopped.
+    Writes new recordings that name their origin. With the recording's own cameras and appearance, the images are
+    bit-exact, which is checked (exit code 1 if they are not). Run the same command again to continue where it stopped.
 
     Examples:
       demorec render recordings/cubes --out large --width 640 --height 480
@@ -46,7 +46,7 @@ class Render:
     workers: int | None = None
     """Processes (auto: one per core)."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
+    """Module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     overwrite: bool = False
     """Replace recordings that exist already."""
 
@@ -84,7 +84,7 @@ class Render:
 
 
 def _jobs(paths: Sequence[Path], out: Path) -> list[tuple[Path, Path]]:
-    """(source, new recording) of everything; a run's folders episodes/ and failed/ are kept."""
+    """(source, new recording) of each job; a run's folders episodes/ and failed/ are kept."""
     jobs: list[tuple[Path, Path]] = []
     for path in paths:
         found = expect(path, "recording", *EPISODE_FOLDERS)
@@ -108,7 +108,7 @@ def _draw(options: RerenderOptions, allowed: Sequence[str], overwrite: bool, job
 
 @cache
 def _renderers() -> WarmRenderer:
-    """Return the renderer of this process, which draws one recording after the other."""
+    """Return the renderer of this process, shared by its recordings."""
     from demorec.render.painter import WarmRenderer
 
     return WarmRenderer()

@@ -1,4 +1,4 @@
-"""`demorec replay`: recorded actions or states back into the simulator."""
+"""`demorec replay`: send recorded actions or states to the simulator."""
 
 from __future__ import annotations
 
@@ -28,17 +28,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Replay:
-    """Send recorded actions back into the simulator and compare everything sensed, and the outcome, with the recording.
+    """Send recorded actions to the simulator and compare all sensor data and the outcome with the recording.
 
-    Recordings must replay bit-exactly (on the same type of machine); labels, phases and images are for
-    demorec check --deep. Datasets hold float32 actions without the
-    exploration noise that was executed; for them success and deviations are reported. Exit code 0: as recorded
-    (bit-exact; for a dataset or with --noise, --delay or --export-hz: the recorded outcome); 1: not as recorded. What
-    the same command has written to --out before stays.
+    Recordings must replay bit-exactly (on the same type of machine); demorec check --deep also compares labels, phases
+    and images. Datasets have float32 actions without the executed exploration noise; for them success and deviations
+    are reported. Exit code 0: as recorded (bit-exact; for a dataset or with --noise, --delay or --export-hz: the
+    recorded outcome); 1: not as recorded. Recordings that the same command has already written to --out stay.
 
-    With --robot a simulated arm does what a real one did, by the actions of its dataset or imported recordings alone,
-    on an empty table, and how far it is from the measured states is reported of each joint. Exit code 1: farther than
-    --tolerance, where that is given.
+    With --robot, a simulated arm executes a real arm's actions, from its dataset or imported recordings, on an empty
+    table, and the distance from the measured states is reported for each joint. Exit code 1: a distance over
+    --tolerance, if given.
 
     Examples:
       demorec replay recordings/cubes/episodes/episode_000000.mcap
@@ -52,7 +51,7 @@ class Replay:
     paths: Positional[tuple[Path, ...]]
     """Recordings, runs, folders of recordings, or exported datasets."""
     episodes: str = ""
-    """Which episodes, by number: 0:100, ::2, 3,5,8:10; all by default."""
+    """Episodes to replay, by number: 0:100, ::2, 3,5,8:10; all by default."""
     states: bool = False
     """Set the recorded states one after another instead of sending the actions."""
     export_hz: int | None = None
@@ -66,7 +65,7 @@ class Replay:
     tolerance: float = 0.0
     """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
     robot: str = ""
-    """The arm that does what a real one did: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
+    """Simulated arm for a real arm's actions: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     out: OptionalTarget = None
@@ -76,15 +75,15 @@ class Replay:
     overwrite: bool = False
     """Replace recordings in the output folder."""
     allow: Allow = ()
-    """A module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
+    """Module or package of your own that may be imported for the tasks, robots and cameras that the files name."""
     json: bool = False
-    """Print JSON: a list with one object for each episode."""
+    """Print JSON: a list with one object per episode."""
 
     def run(self) -> int:
         """Replay and report."""
         need_paths(self.paths, "replay")
         if self.tolerance < 0:
-            raise OptionError("tolerance", f"is {self.tolerance}, it must be 0 or more.")
+            raise OptionError("tolerance", f"is {self.tolerance}, allowed are 0 or more.")
         from demorec.extensions.remake.demonstration import ReplayOptions
         from demorec.extensions.remake.drive import is_as_recorded, replay_all
 
@@ -101,7 +100,7 @@ class Replay:
             named=self.roles.named,
         )
         if options.robot is not None and (self.out is not None or self.view):
-            raise ConfigError("--robot compares numbers, of a scene nothing is known: leave --out, --view out.")
+            raise ConfigError("--robot compares numbers without a scene: leave out --out and --view.")
         options.validate()
         with ExitStack() as stack:
             out = self.out
@@ -130,7 +129,7 @@ class Replay:
                 say_json([to_plain(report) for report in reports])
             else:
                 if options.robot is not None:
-                    say("Nothing stood on the table: where the arm held something, the gripper closes farther here.")
+                    say("The simulated table was empty: a gripper that held an object closes farther here.")
                 else:
                     say(_summary(reports, sum(good)))
                     say(_compared(reports))
@@ -142,10 +141,10 @@ class Replay:
 
 
 def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
-    """Yield what there is to replay in some paths, in order.
+    """Yield the demonstrations in some paths, in order.
 
-    Tells, before each of them, in which versions what recorded it differs from what is here, and where modules of the
-    user's own are not what they were.
+    Before each, prints the versions in which its recorder differs from this installation, and the user's modules that
+    have changed.
     """
     from demorec.core.config import deciding_versions
     from demorec.core.own_versions import changed_sources, version_differences
@@ -181,7 +180,7 @@ def _found(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> I
 
 
 def _replayable(path: Path) -> Found:
-    """What a path holds to be replayed: a dataset, or recordings."""
+    """Identify a path to replay: a dataset, or recordings."""
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind != "dataset":
         expect_recordings(found, found.recordings)
@@ -189,7 +188,7 @@ def _replayable(path: Path) -> Found:
 
 
 def describe_replay(report: ReplayReport) -> str:
-    """One line about a replay."""
+    """Describe a replay in one line."""
     if report.tracking:
         return f"{report.name}: {report.num_steps} steps; {_tracked(report.tracking)}"
     if report.is_identical:
@@ -218,11 +217,11 @@ def _tracked(tracking: Mapping[str, tuple[float, float]]) -> str:
         else f"{name} {math.degrees(median):.2f}, {math.degrees(largest):.2f}"
         for name, (median, largest) in tracking.items()
     ]
-    return f"off what was measured, median and largest, degrees: {'; '.join(parts)}"
+    return f"distance from the measured states, median and largest, degrees: {'; '.join(parts)}"
 
 
 def _compared(reports: Sequence[ReplayReport]) -> str:
-    """What "identical" means."""
+    """List of the compared quantities."""
     from demorec.extensions.remake.demonstration import POSE_OF
 
     found = dict.fromkeys(name for report in reports for name in report.compared)
@@ -252,6 +251,6 @@ def _show(pairs: Sequence[tuple[Path, Path]]) -> None:
     from demorec.cli import COMMANDS, run_command
 
     if not pairs:
-        raise ConfigError("There is nothing to show: --view needs recordings, since a dataset holds no scene to draw.")
+        raise ConfigError("Nothing to show: --view needs recordings, because a dataset has no scene to draw.")
     recorded, replayed = pairs[0]
     run_command(COMMANDS.load("view"), [str(recorded), str(replayed), "--compare"], prog="demorec view")

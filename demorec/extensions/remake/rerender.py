@@ -1,7 +1,7 @@
-"""Recorded states, new images: any camera, size, renderer or looks, without physics.
+"""Draw recorded states with other cameras, sizes, renderers or appearance, without physics.
 
 A new recording keeps every number of the old one and names it as its origin. With the recording's own cameras and
-looks the images come out again as they were before coding, so the coded packets are equal, byte for byte.
+appearance the images are equal before encoding, so that the encoded packets are bit-exact.
 """
 
 from __future__ import annotations
@@ -38,15 +38,14 @@ from demorec.tasks.vary import vary_looks
 
 @dataclass(frozen=True, kw_only=True)
 class RerenderReport:
-    """What was done.
+    """Result of rendering a recording again.
 
     Attributes:
         source, path: The recording and the new one.
-        num_frames, num_images: In it.
-        compared: Cameras whose coded images were compared with the recorded ones, because nothing about them was
-            to change.
-        differing: Of these, camera -> first frame whose packet differs.
-        was_there: Whether an earlier call had drawn it, so that nothing was drawn now.
+        num_frames, num_images: Size of the new recording.
+        compared: Cameras whose encoded images were compared with the recorded ones, because they should not change.
+        differing: Camera of these -> first frame whose packet differs.
+        was_there: Whether an earlier call had drawn it.
     """
 
     source: Path
@@ -60,11 +59,11 @@ class RerenderReport:
 
 @dataclass(frozen=True, kw_only=True)
 class SceneView:
-    """Where the images of an episode are taken from.
+    """Cameras and scene for the images of an episode.
 
     Attributes:
-        scene: As it is drawn and recorded; its cameras are where they are believed to be.
-        true_cameras: Where they are: the same, but for the calibration error of `--variation full`.
+        scene: Scene that is drawn and recorded, with the recorded camera poses.
+        true_cameras: The same cameras with their true poses, without the calibration error of `--variation full`.
         true_from_recorded: Camera name -> that error.
     """
 
@@ -74,16 +73,16 @@ class SceneView:
 
 
 def recorded_view(info: EpisodeInfo) -> SceneView:
-    """Return the view of a recording, whose extrinsics may be off on purpose, as those of a real camera are."""
+    """Return the view of a recording, whose extrinsics may have a deliberate error, like a real camera's."""
     cameras, errors = true_cameras(info.simulated.scene.cameras, info.simulated.behaviour)
     return SceneView(scene=info.simulated.scene, true_cameras=cameras, true_from_recorded=errors)
 
 
 def new_view(info: EpisodeInfo, options: RerenderOptions, allowed: Sequence[str] = ()) -> SceneView:
-    """The view that the options ask for.
+    """The view for the options.
 
     Raises:
-        ConfigError: An unknown camera, or an image size that cannot be coded.
+        ConfigError: An unknown camera, or an image size that cannot be encoded.
     """
     old = recorded_view(info)
     names = options.cameras or tuple(camera.name for camera in info.simulated.scene.cameras)
@@ -119,7 +118,7 @@ def new_view(info: EpisodeInfo, options: RerenderOptions, allowed: Sequence[str]
 
 
 def view_behaviour(info: EpisodeInfo, view: SceneView) -> dict[str, float]:
-    """The behaviour of an episode, without calibration errors of cameras that have none in the view."""
+    """The behaviour of an episode, without calibration errors for cameras without an error in the view."""
     off = {f"calibration_{name}" for name in view.true_from_recorded}
     return {
         name: value
@@ -142,7 +141,7 @@ def _check_size(camera: SceneCamera) -> None:
 
 
 def config_as[T](config: object, kind: type[T]) -> T:
-    """A recorded config, or a part of it; ConfigError when this version cannot read it."""
+    """Parse a recorded config, or a part of it; ConfigError if this version cannot read it."""
     try:
         return from_plain(config, kind)
     except ValueError as error:
@@ -150,12 +149,12 @@ def config_as[T](config: object, kind: type[T]) -> T:
 
 
 def view_painter(renderer: Renderer, view: SceneView, config: Mapping[str, Any]) -> Painter:
-    """A painter that draws worlds in a view's scene as the view and the config of a recording ask for.
+    """Painter of a view's scene with the image options of a recording's config.
 
     Args:
-        renderer: Entered.
-        view: Where the cameras are.
-        config: Tells depth, segmentation and antialiasing.
+        renderer: An entered renderer.
+        view: Cameras and scene.
+        config: Options for depth, segmentation and antialiasing.
     """
     return Painter(
         renderer,
@@ -192,19 +191,19 @@ def rerender(
     overwrite: bool = False,
     renderers: WarmRenderer | None = None,
 ) -> RerenderReport:
-    """Draw a recording anew, unless `out` is what the same call has made before.
+    """Draw a recording again, unless `out` is the result of the same earlier call.
 
     Args:
         source: The recording.
-        out: The file to be made.
+        out: File to create.
         options: Changes of the images.
-        allowed: The user's own modules that may be imported for what the recording or the options name.
-        overwrite: Whether `out` may be replaced; it is drawn then, whatever is there.
-        renderers: Gives the renderer, warm from one recording to the next; None makes and frees one.
+        allowed: The user's own modules that may be imported if the recording or the options name them.
+        overwrite: Whether `out` may be replaced; it is then drawn in any case.
+        renderers: Provides a renderer that stays warm between recordings; None makes and frees one.
 
     Raises:
         RecordingError: The source is damaged or empty.
-        ConfigError: The options cannot be, or something else is at `out` already.
+        ConfigError: The options are impossible, or another file exists at `out`.
         SceneError: A model file of the scene is missing or broken.
         RenderError: The renderer cannot draw the scene.
     """
@@ -266,15 +265,15 @@ def _write_drawn(
 
 
 def finished_outcome(path: Path, info: EpisodeInfo) -> Outcome | None:
-    """Return the outcome of a whole recording whose description is the one that would be written now, if it is there.
+    """Return the outcome of a complete recording with the description that would be written now, if it exists.
 
-    The description holds the digest of the source, and all that decides what is drawn or replayed.
+    The description has the source's digest and everything that decides the images or the replay.
     """
     try:
         with open_simulated(path) as recording:
             if to_json(recording.info) != to_json(info):
                 return None
-            recording.digest()  # reads it to its end, against its checksums
+            recording.digest()  # reads all of it and verifies the checksums
             return recording.outcome
     except RecordingError:
         return None
@@ -293,7 +292,7 @@ def _outcome(recording: Recording) -> Outcome:
 
 
 def _compare(recording: Recording, out: Path, options: RerenderOptions) -> dict[str, int | None]:
-    """The packets of the cameras that were to stay as they were: equal images give equal packets.
+    """Compare the packets of unchanged cameras: equal images give equal packets.
 
     Returns:
         Camera -> first frame whose packet differs, or None.

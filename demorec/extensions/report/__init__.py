@@ -1,1 +1,1 @@
-"""A run or a dataset on one page: HTML that holds all it shows, reads without scripts and asks no network."""
+"""A run or a dataset on one self-contained HTML page that needs neither scripts nor network."""

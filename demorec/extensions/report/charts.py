@@ -13,7 +13,7 @@ from demorec.extensions.report.content import ReportedEpisode
 WIDTH = 220
 """Width of a chart without its labels, in units of its SVG."""
 HEIGHT = 70
-"""Height of the same."""
+"""Height of a chart without its labels, in the same units."""
 _BINS = 48
 
 
@@ -24,7 +24,7 @@ class Chart(NamedTuple):
         title: The quantity and its unit.
         paths: (CSS class, SVG path).
         low, high, middle: Labels below its left end, its right end and its middle.
-        note: Below the title.
+        note: Text below the title.
     """
 
     title: str
@@ -36,11 +36,13 @@ class Chart(NamedTuple):
 
 
 def distribution(title: str, series: Sequence[tuple[str, NDArray[np.float32]]]) -> Chart:
-    """Draw the densities of one or two components over their common range; of each the CSS class and the values."""
+    """Draw the densities of one or two components over their common range; `series` has the CSS class and the values of
+    each.
+    """
     note = "mean: " + ", ".join(f"{name} {values.mean():.3g}" for name, values in series)
     low = min(float(values.min()) for _, values in series)
     high = max(float(values.max()) for _, values in series)
-    if low == high:  # a single value, whose bin would be too narrow to be seen
+    if low == high:  # the bin of a single value would be too narrow to see
         bar = f"M{WIDTH / 2 - 2:g} 0h4v{HEIGHT}h-4z"
         return Chart(title, [(series[0][0], bar)], "", "", f"{low:.3g}", note)
     counts = {name: np.histogram(values, bins=_BINS, range=(low, high))[0] / len(values) for name, values in series}
@@ -53,14 +55,14 @@ def distribution(title: str, series: Sequence[tuple[str, NDArray[np.float32]]]) 
 
 
 def css_color(rgb: Sequence[float]) -> str:
-    """Of red, green and blue from 0 to 1."""
+    """CSS color for red, green and blue in 0..1."""
     return "#" + "".join(f"{round(255 * min(max(channel, 0.0), 1.0)):02x}" for channel in rgb[:3])
 
 
 def phase_bar(episode: ReportedEpisode, moments: int, colors: Mapping[str, str]) -> list[tuple[str, str, str, str]]:
     """(title, left, width, color) of each phase, in units of one image of the filmstrip above.
 
-    The middle of each image stands over its own moment.
+    The middle of each image is above its own moment.
     """
     last = max(episode.num_frames - 1, 1)
     bars = []

@@ -1,4 +1,4 @@
-"""`demorec report`: a run or a dataset on one page."""
+"""`demorec report`: show a run or a dataset on one page."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ class ReportCommand:
     """Write a self-contained HTML page about a run, recordings or a dataset.
 
     It shows outcomes, the results of the checks, the distributions of states and actions, and a filmstrip of every
-    episode, failed ones first. It needs no network. Exit code 0 means that the page was written, whatever the results;
-    use demorec check for a verdict.
+    episode, failed ones first. It needs no network. Exit code 0 means that the page was written, regardless of the
+    results; use demorec check for a verdict.
 
     Examples:
       demorec report recordings/cubes --out cubes.html
@@ -50,7 +50,7 @@ class ReportCommand:
     roles: NamedByFlags = field(default_factory=RoleFlags)
 
     def run(self) -> int:
-        """Gather, then write."""
+        """Gather the content, then write the page."""
         if self.out.suffix.lower() not in (".html", ".htm"):
             raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
         check_option("workers", self.workers, 1, 1024)
@@ -58,7 +58,7 @@ class ReportCommand:
             raise ConfigError("--images chooses checks, and --no-checks runs none: leave one of them out.")
         expect(self.path, "recording", "dataset", *imported_kinds(), *EPISODE_FOLDERS)
         if not self.out.absolute().parent.is_dir():
-            raise ConfigError(f"--out: there is no folder {self.out.parent}.")
+            raise ConfigError(f"--out: folder {self.out.parent} is missing.")
         refuse_inside([self.out])
         from demorec.check.report import CheckOptions
         from demorec.extensions.doctor.from_dataset import ReadOptions

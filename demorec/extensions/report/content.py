@@ -20,25 +20,25 @@ from demorec.extensions.report.filmstrip import Filmstrip
 
 LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
-"""Of an episode. "flagged" is a success for which a check failed or warned."""
+"""State of an episode. "flagged" is a success with a check that failed or warned."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReportedEpisode:
-    """One attempt at one episode. What the source does not state is None or empty.
+    """One attempt at one episode. Facts missing from the source are None or empty.
 
     Attributes:
-        name: "episode 3", or "episode 3, attempt 0" for one that failed.
+        name: "episode 3", or "episode 3, attempt 0" for a failed one.
         source: Its file, relative to the path of the report.
-        problem: Why it cannot be read, or why nothing was recorded.
-        instruction: As text.
-        outcome: None when unknown.
+        problem: Reason why it cannot be read, or why nothing was recorded.
+        instruction: Text of the instruction.
+        outcome: None if unknown.
         num_frames, fps: Length and frame rate.
         seed: Root seed of the run.
         phases: (name, first frame, frame after the last) of each phase, in order.
         flags: Results of checks that failed or warned, failures first.
         filmstrip: None without images, and for some successes in a long report.
-        facts: (name, value) of what the summary says of all episodes together: robot, cameras, ...
+        facts: (name, value) for the summary of all episodes: robot, cameras, ...
     """
 
     name: str
@@ -56,12 +56,12 @@ class ReportedEpisode:
 
     @property
     def success(self) -> bool | None:
-        """None when unknown."""
+        """None if unknown."""
         return None if self.outcome is None else self.outcome.success
 
     @property
     def state(self) -> State:
-        """Its status in one word."""
+        """State in one word."""
         if self.success is False:
             return "failed"
         if self.problem:
@@ -72,7 +72,7 @@ class ReportedEpisode:
 
     @property
     def failure(self) -> str:
-        """Why it failed and in which phase; "" of any other."""
+        """Reason and phase of a failure; "" otherwise."""
         if self.outcome is None or self.outcome.success is not False:
             return ""
         reason, phase = self.outcome.failure_reason or "no reason recorded", self.outcome.failure_phase
@@ -80,12 +80,12 @@ class ReportedEpisode:
 
 
 MAX_COMPONENTS = 64
-"""Components of the state or of the action that are drawn."""
+"""Maximum components of state and action that are drawn."""
 MAX_SAMPLES = 200
-"""Frames of each episode that a distribution is drawn from, beside its extremes."""
+"""Maximum frames per episode from which a distribution is drawn, plus its extremes."""
 
 Components = dict[tuple[Literal["state", "action"], str], list[NDArray[np.float32]]]
-"""(role, name of the component) -> its sampled values, episode by episode."""
+"""(role, component name) -> sampled values, one array per episode."""
 
 
 def motion_components(roles: Roles, columns: Mapping[str, NDArray[Any]]) -> Components:
@@ -117,14 +117,14 @@ def add_components(into: Components, found: Components) -> None:
 
 
 class EpisodeResult(NamedTuple):
-    """A result of the doctor, and the number of its episode; None for the whole set."""
+    """A result of the doctor with its episode number; None for the whole dataset."""
 
     episode: int | None
     result: Result
 
 
 def flags_of(judged: Iterable[EpisodeResult]) -> dict[int, tuple[Result, ...]]:
-    """Number of an episode -> its results."""
+    """Episode number -> its results."""
     found: dict[int, tuple[Result, ...]] = {}
     for episode, result in judged:
         if episode is not None:
@@ -133,13 +133,13 @@ def flags_of(judged: Iterable[EpisodeResult]) -> dict[int, tuple[Result, ...]]:
 
 
 class CheckSummaries:
-    """The checks over everything that they looked at, in the order of the first results.
+    """Results of the checks over all subjects, in the order of the first results.
 
     Attributes:
-        worst: Name of a check -> the result shown, and what that was found in: of the highest level, and of those the
-            one with the largest value.
+        worst: Name of a check -> its result with the highest level and, within that, the largest value, and the
+        subject.
         counts: Name of a check -> number of its results of each level.
-        num_subjects: How many recordings, runs and datasets there were.
+        num_subjects: Number of recordings, runs and datasets.
     """
 
     def __init__(self) -> None:
@@ -148,7 +148,7 @@ class CheckSummaries:
         self.num_subjects = 0
 
     def add(self, results: Iterable[Result], where: str) -> None:
-        """Count the results for one recording, run or dataset."""
+        """Count the results of one recording, run or dataset."""
         self.num_subjects += 1
         for result in results:
             self.counts.setdefault(result.check, Counter())[result.level] += 1
@@ -156,17 +156,17 @@ class CheckSummaries:
                 self.worst[result.check] = result, where
 
     def count(self, result: Result, where: str) -> None:
-        """Count one more result of something that was counted before."""
+        """Count one more result of a subject that was counted before."""
         self.num_subjects -= 1
         self.add([result], where)
 
     def of(self, *levels: Level) -> list[tuple[Result, str]]:
-        """The worst results that have one of these levels, level by level, and what each was found in."""
+        """The worst results with one of these levels, level by level, each with its subject."""
         return [item for level in levels for item in self.worst.values() if item[0].level == level]
 
 
 def add_judged(summaries: CheckSummaries, judged: Iterable[EpisodeResult]) -> None:
-    """Count what the doctor found."""
+    """Count the doctor's findings."""
     for episode, result in judged:
         summaries.count(result, "the whole set" if episode is None else f"episode {episode}")
 
@@ -178,17 +178,17 @@ def _rank(result: Result) -> tuple[int, float]:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Report:
-    """Everything that a page shows.
+    """Content of a page.
 
     Attributes:
         title: Name of the run, recording or dataset.
-        kind: What it is, in words.
+        kind: Kind of the source, in words.
         facts: (name, value) of the summary.
         episodes: Every attempt, in order.
-        distributions: Of actions and states.
-        has_units: Whether their components have demorec's names, and so known units.
-        checks: None when no checks were run.
-        missing: Sentences about what the source does not contain.
+        distributions: Distributions of actions and states.
+        has_units: Whether the components have demorec's names, and thus known units.
+        checks: None if no checks were run.
+        missing: Sentences about data missing from the source.
     """
 
     title: str
@@ -202,13 +202,13 @@ class Report:
 
 
 def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:
-    """Over the attempts whose outcome is known."""
+    """Success rate over the attempts with a known outcome."""
     known = [episode.success for episode in episodes if episode.success is not None]
     return Rate(successes=sum(known), trials=len(known))
 
 
 def common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) -> Iterator[tuple[str, str]]:
-    """Facts that recordings and datasets share; of the size, their files."""
+    """Facts about recordings and datasets; the size is that of `files`."""
     rate = success_rate(episodes)
     if rate.trials:
         yield "success", f"{rate}"

@@ -1,4 +1,4 @@
-"""A LeRobot dataset, whoever wrote it, as a report shows it."""
+"""Content of a report about a LeRobot dataset from any writer."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def dataset_report(
     named: NamedRoles,
     advance: Callable[[int, int], None],
 ) -> Report:
-    """The content of a page about a dataset; arguments and errors as of `demorec.extensions.report.gather.gather`."""
+    """The content of a page about a dataset; arguments and errors as in `demorec.extensions.report.gather.gather`."""
     folder = LeRobotFolder(root, named=named)
     info, roles = folder.info, folder.roles
     rows = {row["episode_index"]: row for row in folder.sidecar(_EPISODE_COLUMNS)}
@@ -101,10 +101,10 @@ def dataset_report(
 
 
 def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
-    """The feature whose images are shown; None in a dataset without color images.
+    """The feature whose images are shown; None for a dataset without color images.
 
     Raises:
-        ConfigError: There is no such camera.
+        ConfigError: The camera does not exist.
     """
     keys = [key for key in _cameras(info) if not info.features[key].is_depth]
     if not camera:
@@ -113,7 +113,7 @@ def _camera_key(info: DatasetInfo, camera: str, root: Path) -> str | None:
         if camera in (key, key.removeprefix(IMAGE_PREFIX)):
             return key
     there = ", ".join(key.removeprefix(IMAGE_PREFIX) for key in keys) or "none"
-    raise ConfigError(f"There is no camera {camera!r} with color images, the cameras are {there}: {root}")
+    raise ConfigError(f"No camera {camera!r} with color images, available are {there}: {root}")
 
 
 def _cameras(info: DatasetInfo) -> list[str]:
@@ -121,7 +121,7 @@ def _cameras(info: DatasetInfo) -> list[str]:
 
 
 def _strip(folder: LeRobotFolder, key: str, place: EpisodePlace) -> Filmstrip | None:
-    """The filmstrip of an episode; ExportError where its images cannot be read."""
+    """The filmstrip of an episode; ExportError if its images cannot be read."""
     is_video = folder.info.features[key].is_video
     images_at = folder.video(key, place).images_at if is_video else partial(folder.stored_images[key].read, place)
     max_bytes = strip_budget(len(folder.places))
@@ -148,7 +148,7 @@ def _episode(place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]],
 
 
 def _outcome(row: _Row) -> Outcome | None:
-    """As far as a row of the sidecar states it."""
+    """Outcome of an episode, as far as the sidecar's row records it."""
     if row["success"] is None:
         return None
     return Outcome(
@@ -164,26 +164,26 @@ def _outcome(row: _Row) -> Outcome | None:
 def _left_out(row: _Row) -> ReportedEpisode:
     return ReportedEpisode(
         name=f"run's episode {row['run_episode_index']}, attempt {row['attempt']}",
-        problem="This attempt is not in the dataset; only how it ended is known.",
+        problem="This attempt is not in the dataset; only its outcome is known.",
         outcome=_outcome(row),
     )
 
 
 def _missing(info: DatasetInfo, roles: Roles, *, has_sidecar: bool) -> Iterator[str]:
-    """Sentences about what the dataset does not contain."""
+    """Sentences about data missing from the dataset."""
     if not has_sidecar:
         yield (
             f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
             "and the conditions of success are not known."
         )
         if _SUCCESS not in info.features:
-            yield f"No column {_SUCCESS} states which episodes succeeded."
+            yield f"Without a column {_SUCCESS}, the outcomes of the episodes are not known."
     if all(info.features[key].is_depth for key in _cameras(info)):
         yield "It has no color images, so there are no filmstrips."
     yield from roles.notes()
     for role, parts in (("state", roles.state), ("action", roles.action)):
         if (count := len(roles.elements(parts))) > MAX_COMPONENTS:
-            yield f"Of the {count} components of the {role} the first {MAX_COMPONENTS} are drawn."
+            yield f"Only the first {MAX_COMPONENTS} of the {count} components of the {role} are drawn."
 
 
 def _facts(

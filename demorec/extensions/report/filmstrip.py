@@ -1,4 +1,4 @@
-"""Filmstrips within a budget of bytes, so that a report on a thousand episodes still opens at once."""
+"""Filmstrips with a size limit, so that a report about a thousand episodes still opens at once."""
 
 from __future__ import annotations
 
@@ -11,28 +11,28 @@ from numpy.typing import NDArray
 from PIL import Image
 
 MAX_SHOWN = 4000
-"""Episodes that a page shows one by one."""
+"""Maximum episodes that a page shows individually."""
 _TOTAL_BYTES = 13_500_000
-"""Of all filmstrips of a page together; as base64 they take a third more, and a page stays below 30 MB."""
+"""Maximum size of all filmstrips of a page; base64 adds a third, and the page stays below 30 MB."""
 _MAX_BYTES = 16_000
-"""Of one filmstrip."""
+"""Maximum size of one filmstrip."""
 _MOMENTS = 8
 _HEIGHTS = (120, 104, 88, 72, 56, 40, 28)
-"""Pixels; the first at which the strip is within its budget is taken."""
+"""Heights in pixels; the first one that fits the size limit is used."""
 _MAX_ASPECT = 3.0
-"""Ratio of width to height up to which images keep their shape; wider ones are squeezed."""
+"""Maximum aspect ratio (width to height); wider images are squeezed."""
 _QUALITY = 72
 
 
 @dataclass(frozen=True, kw_only=True)
 class Filmstrip:
-    """Images of one camera side by side, evenly spaced from the first frame to the last.
+    """Images of one camera next to each other, evenly spaced from the first frame to the last.
 
     Attributes:
-        jpeg: All of them as one JPEG file.
-        camera: Name.
+        jpeg: The images as one JPEG file.
+        camera: Camera name.
         moments: Number of images.
-        width, height: Of the whole strip, pixels.
+        width, height: Size of the whole strip, pixels.
     """
 
     jpeg: bytes
@@ -54,13 +54,13 @@ def filmstrip(
     *,
     max_bytes: int,
 ) -> Filmstrip | None:
-    """A strip of at most `max_bytes`; None if even the smallest is larger, or there is no frame.
+    """A strip of at most `max_bytes`; None if even the smallest is larger, or the episode is empty.
 
     Args:
-        camera: Its name.
-        num_frames: Of the episode.
-        images_at: Rising frame numbers -> their images, (H, W, 3) uint8.
-        max_bytes: Of the JPEG file.
+        camera: Camera name.
+        num_frames: Number of frames of the episode.
+        images_at: Ascending frame numbers -> their images, (H, W, 3) uint8.
+        max_bytes: Maximum size of the JPEG file.
     """
     if num_frames == 0:
         return None

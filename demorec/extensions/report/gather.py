@@ -1,4 +1,4 @@
-"""Gathers the content of a report: from recordings here, from datasets in `demorec.extensions.report.dataset`."""
+"""Gather the content of a report: from recordings here, from datasets in `demorec.extensions.report.dataset`."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ _KINDS: Mapping[PathKind, str] = {
 }
 _Read = tuple[ReportedEpisode, Components, SubjectReport | None]
 _AHEAD = 2
-"""Episodes that a process may have read before they are counted here."""
+"""Maximum episodes that a process may be ahead of the count."""
 
 
 def gather(
@@ -64,16 +64,16 @@ def gather(
     """The content of a page about a recording, a run, an evaluation, a folder of recordings or a dataset.
 
     Args:
-        path: Of that.
-        camera: Which images the filmstrips show; "" for the first camera.
-        checks: Which checks of files are run; None for none.
-        judged: What the doctor found.
-        workers: Processes that read and check recordings.
-        named: Features whose role the user names, in what demorec did not simulate.
+        path: Path of the source.
+        camera: Camera of the filmstrips; "" for the first one.
+        checks: Selected checks of files; None for none.
+        judged: Findings of the doctor.
+        workers: Number of processes that read and check recordings.
+        named: Features whose role the user names, in data that demorec did not simulate.
         advance: Called with the number of finished items and of all items.
 
     Raises:
-        ConfigError: There is nothing that can be reported on, or no such camera.
+        ConfigError: There is nothing to report on, or the camera does not exist.
         ExportError: The dataset cannot be read.
     """
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
@@ -95,7 +95,7 @@ def _recordings_report(
     run, missing = _run_file(found)
     later = set() if run is None else {path / attempt.file for attempt in run.beyond}
     if later:
-        missing.append(f"{len(later)} recordings of episodes beyond the number last asked for are left out.")
+        missing.append(f"{len(later)} recordings of episodes beyond the number last requested are left out.")
     subjects = [
         Subject(path=file, kind="recording") for file in (*found.recordings, *found.failed) if file not in later
     ]
@@ -153,7 +153,9 @@ def _read_all(
 
 
 def _read(root: Path, camera: str, checks: CheckOptions | None, named: NamedRoles, given: tuple[Subject, int]) -> _Read:
-    """Read and check a recording, in any process, its strip within so many bytes; a damaged one is reported as such."""
+    """Read and check a recording, in any process, with a size limit for its strip; a damaged one is reported as
+    damaged.
+    """
     subject, strip_bytes = given
     checked = None if checks is None else check_subject(subject, checks)
     flags = [result for result in checked.results if result.level in ("warn", "fail")] if checked else []
@@ -173,7 +175,7 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> Repo
     info = recording.info
     if camera and camera not in recording.cameras:
         there = ", ".join(recording.cameras) or "none"
-        raise ConfigError(f"There is no camera {camera!r}, the cameras are {there}: {recording.path}")
+        raise ConfigError(f"No camera {camera!r}, available are {there}: {recording.path}")
     strip = None
     shown = next((name for name in recording.cameras if camera in ("", name) and recording.num_images(name)), None)
     if strip_bytes and shown is not None:
@@ -209,7 +211,7 @@ def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:
 
 
 def _run_file(found: Found) -> tuple[RunFile | None, list[str]]:
-    """run.json if it can be read, and sentences about what is missing."""
+    """run.json, if readable, and sentences about missing data."""
     if found.kind != "run":
         return None, []
     try:
@@ -217,7 +219,9 @@ def _run_file(found: Found) -> tuple[RunFile | None, list[str]]:
         missing = [f"{run.unfinished}."] if run.unfinished else []
         return (None if run.generation is None else run), missing
     except DamagedRunFileError as error:
-        return None, [f"{without_path(error, found.path / RUN_NAME)}, so what was asked for is not known."]
+        return None, [
+            f"{without_path(error, found.path / RUN_NAME)}, so the requested number of episodes is not known."
+        ]
 
 
 def _without_recording(attempt: Attempt) -> ReportedEpisode:

@@ -1,4 +1,4 @@
-"""Findings of the doctor, as a report shows them."""
+"""Findings of the doctor for a report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from demorec.extensions.report.content import EpisodeResult
 
 
 def results_of(path: Path, options: ReadOptions) -> list[EpisodeResult]:
-    """What the doctor finds, as the report shows it: each finding, and the score of each episode that has one."""
+    """The doctor's results for the report: each finding, and the score of each scored episode."""
     diagnosis, _ = examine(path, options)
     found = [EpisodeResult(each.episode, _as_result(each.check, each)) for each in diagnosis.findings]
     for each in diagnosis.episodes:

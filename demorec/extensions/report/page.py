@@ -1,7 +1,7 @@
-"""A report as one HTML file: no network, no font, no library; it can be read without scripts.
+"""A report as one HTML file without network access, fonts or libraries, readable without scripts.
 
-The templates in templates/ hold all markup. Whatever they print is escaped, and invisible characters are spelled out,
-so no text from a file can act on the page.
+The templates in templates/ hold all markup. Their output is escaped, and invisible characters are spelled out, so no
+text from a file can act on the page.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ _STATES: dict[State, str] = {
     "unknown": "outcome unknown",
     "succeeded": "succeeded",
 }
-"""State of an episode -> its words, in the order of the list of episodes."""
+"""State of an episode -> its label, in the order of the list of episodes."""
 _GOOD = ("success at the first try", "success after a retry")
 
 
@@ -47,7 +47,7 @@ def write_page(report: Report, path: Path) -> int:
 
 
 def page(report: Report) -> str:
-    """The whole file."""
+    """The complete HTML file."""
     return "".join(_stream(report))
 
 
@@ -96,12 +96,12 @@ def _own_text(name: str) -> Markup:
 
 
 def _digest(content: str) -> str:
-    """By which the Content-Security-Policy knows the page's own style and script."""
+    """Hash by which the Content-Security-Policy allows the page's own style and script."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()}'"
 
 
 def _shown(episodes: Sequence[ReportedEpisode]) -> list[tuple[int, ReportedEpisode]]:
-    """(number, episode), those first that need attention, of flagged ones the worst scores first."""
+    """(number, episode), sorted by need for attention; among flagged ones the worst scores first."""
     stride = max(1, -(-len(episodes) // MAX_SHOWN))
     chosen = [
         (number, episode)
@@ -133,7 +133,7 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
 
 
 def measured(result: Result) -> tuple[str, str, str]:
-    """What was found, what is allowed, and where."""
+    """Value, limit and place of a result."""
     unit = f"\u00a0{result.unit}" if result.unit else ""
     value = "" if result.value is None else f"{result.value:.4g}{unit}"
     frame = "" if result.frame is None else f"frame {result.frame}"
@@ -142,7 +142,7 @@ def measured(result: Result) -> tuple[str, str, str]:
 
 
 def _about(episode: ReportedEpisode) -> str:
-    """Length, retries, seed and source, as far as they are known."""
+    """Length, retries, seed and source, if known."""
     num_retries = episode.outcome.num_retries if episode.outcome else 0
     parts = [
         f"{episode.num_frames / episode.fps:.1f} s, {episode.num_frames} frames" if episode.num_frames else "",
@@ -154,7 +154,7 @@ def _about(episode: ReportedEpisode) -> str:
 
 
 def _words(episode: ReportedEpisode) -> str:
-    """By which the page's filter finds an episode."""
+    """Text that the page's filter searches."""
     parts = [episode.name, episode.instruction, _about(episode), *(flag.check for flag in episode.flags)]
     return " ".join([*parts, episode.failure]).lower()
 
@@ -173,7 +173,7 @@ def _distributions(report: Report) -> Iterator[Chart]:
 
 
 def _unit(name: str) -> str:
-    """Of a component, by its name in `demorec.episode.features`."""
+    """Unit of a component, by its name in `demorec.episode.features`."""
     part = name.rpartition(".")[2]
     if part in ("pos", "delta", "rx", "ry", "rz"):
         return "rad"

@@ -1,4 +1,4 @@
-"""The deep check: a recording, or an episode of a dataset, is made again, and all of it must come out the same."""
+"""The deep check: remake a recording, or an episode of a dataset, and compare all of it."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ from demorec.robots.assets import allow_models
 
 @dataclass(frozen=True, kw_only=True)
 class DeepReport:
-    """How a recording compares with itself made again.
+    """Comparison of a recording with its remake.
 
     Attributes:
         path: The recording.
-        versions: One line for each version, and the type of CPU, in which what made it differs from what is here. With
-            any of them nothing is provable here, so that differences are warnings.
+        versions: One line for each version, and the CPU type, that differs between the recording and this machine. If
+        there are any, nothing is provable here, and differences are warnings.
         differences: Everything that differs, ordered by the first frame.
-        error: Why it could not be made again; "" where it could.
-        replay: How its own commands fare in its own scene, in words; "" unless numbers differ.
-        is_derived: Whether it is a replay or rendering, of which labels, phases and events are taken over.
-        num_frames: Of the recording.
+        error: Reason why it could not be remade; "" if it could.
+        replay: Result of replaying its own commands in its own scene, in words; "" unless numbers differ.
+        is_derived: Whether it is a replay or a render, whose labels, phases and events are copied.
+        num_frames: Number of recorded frames.
     """
 
     path: Path
@@ -57,26 +57,26 @@ class DeepReport:
 
     @property
     def level(self) -> Literal["pass", "warn", "fail"]:
-        """Failed if it cannot be made again or differs, and neither versions nor the CPU explain it."""
+        """Fail if it cannot be remade or differs, and neither versions nor the CPU explain it."""
         if self.versions:
             return "warn"
         return "fail" if self.error or self.differences else "pass"
 
 
 _simulators = SimulatorCache()
-"""Of this process."""
+"""Simulators of this process."""
 
 
 def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Sequence[str] = ()) -> DeepReport:
-    """Make a recording again and compare everything.
+    """Remake a recording and compare everything.
 
     Args:
         path: The recording.
-        simulators: Gives world and renderer; by default one that stays warm for as long as the process lives.
-        allowed: The user's own modules that may be imported for what the recording names.
+        simulators: Provides world and renderer; by default one that stays warm during the process.
+        allowed: The user's own modules that may be imported if the recording names them.
 
     Raises:
-        ResourceError: This machine cannot do it, which says nothing about the recording.
+        ResourceError: This machine lacks resources; this implies nothing about the recording.
     """
     report = DeepReport(path=path)
     try:
@@ -98,7 +98,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
 
 
 def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
-    """The report that it could not be made again; ResourceError where this machine cannot do it."""
+    """Report that a remake is impossible; ResourceError if this machine lacks the resources."""
     lack = resource_error(error)
     if lack is error:
         raise error
@@ -110,7 +110,7 @@ def _impossible(report: DeepReport, error: DemorecError) -> DeepReport:
 
 
 def _unlike_here(info: EpisodeInfo, allowed: Sequence[str]) -> tuple[str, ...]:
-    """Describe the differences in versions, and in the type of CPU, between an episode and this machine."""
+    """Describe the differences in versions and CPU type between an episode and this machine."""
     lines = list(version_differences(info.versions, _versions_here(info, allowed)))
     if info.simulated.cpu != cpu_type():
         lines.append(f"it was simulated on {info.simulated.cpu or 'an unknown CPU'}, this is {cpu_type()}")
@@ -118,18 +118,18 @@ def _unlike_here(info: EpisodeInfo, allowed: Sequence[str]) -> tuple[str, ...]:
 
 
 def _versions_here(info: EpisodeInfo, allowed: Sequence[str]) -> Mapping[str, str]:
-    """package -> version of what would make such an episode here."""
+    """package -> version of the packages that would make such an episode here."""
     with suppress(DemorecError):
         return deciding_versions(_recorded_config(info, allowed))
     return deciding_versions()
 
 
 def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateConfig:
-    """The config that an episode says it was made with.
+    """The recorded config of an episode.
 
     Raises:
         ConfigError: The config is not valid.
-        NotAllowedError: It names something of a module that is not among those `allowed`.
+        NotAllowedError: It names an object of a module that is not in `allowed`.
     """
     config = config_as(info.simulated.config, GenerateConfig)
     config.check_names(allowed)
@@ -138,10 +138,10 @@ def _recorded_config(info: EpisodeInfo, allowed: Collection[str]) -> GenerateCon
 
 
 def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
-    """Make the episode of a recording again, into a file.
+    """Remake the episode of a recording into a file.
 
-    A generated one needs nothing but its config, its number and its attempt. A derived one (`origin`) has no script:
-    its commands are sent again in its recorded scene, and labels, phases and events are taken over.
+    A generated one needs only its config, its number and its attempt. A derived one (`origin`) has no script: its
+    commands are sent again in its recorded scene, and labels, phases and events are copied.
 
     Raises:
         ConfigError: Its config cannot be used.
@@ -154,7 +154,7 @@ def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed
 
 
 def _generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
-    """`remake` of a generated episode, of which nothing but its description is needed; errors as there."""
+    """`remake` of a generated episode, which needs only its description; same errors."""
     config = _recorded_config(recorded, allowed)
     episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
     world, renderer = simulators.acquire(episode.info)
@@ -175,7 +175,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
     painter = None if renderer is None else view_painter(renderer, recorded_view(info), info.simulated.config)
     with EpisodeWriter(path, info, video=config_as(info.simulated.config.get("video", {}), VideoConfig)) as writer:
         _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
-        if recording.outcome is not None:  # why it failed, and after how many tries, no replay can tell
+        if recording.outcome is not None:  # a replay cannot reproduce the reason of a failure or the number of retries
             recorded = recording.outcome
             outcome = replace(
                 outcome,
@@ -188,7 +188,7 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
 
 
 def _differences(recording: Recording, again: Path) -> Iterator[RemakeDifference]:
-    """Ordered by the first frame, what belongs to no frame first."""
+    """Sorted by the first frame, with differences outside frames first."""
     found, made = Contents.of(recording.path), Contents.of(again)
     with open_simulated(again) as remade:
         if recording.is_recovered:
@@ -213,7 +213,7 @@ def _replayed(recording: Recording, simulators: SimulatorCache, allowed: Sequenc
 
 
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
-    """One report for each recording, in order."""
+    """One report per recording, in order."""
     if workers == 1 or len(paths) < 2:
         with closing(SimulatorCache()) as simulators:
             for path in paths:
@@ -232,18 +232,20 @@ def proofs(paths: Sequence[Path], allowed: Sequence[str]) -> Iterator[Proof]:
 
 
 def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:
-    """One report for each episode that the sidecar knows, in order; a single one where that cannot be done.
+    """One report per episode in the sidecar, in order; a single one if that is impossible.
 
-    Each episode is made again from what the sidecar says of it, exported, and compared.
+    Each episode is remade from its row of the sidecar, exported, and compared.
 
     Raises:
-        ResourceError: This machine cannot do it, which says nothing about the dataset.
+        ResourceError: This machine lacks resources; this implies nothing about the dataset.
     """
     with closing(SimulatorCache()) as simulators:
         try:
             dataset = CheckedDataset(path)
             if not dataset.sidecar:
-                raise ConfigError(f"The dataset does not say how its episodes were made (no demorec/episodes): {path}")
+                raise ConfigError(
+                    f"The dataset does not record how its episodes were made (no demorec/episodes): {path}"
+                )
             dataset.check_simulated()
             options = export_options(path)
             if missing := dataset.folder.missing:
@@ -275,9 +277,11 @@ def _episode_differences(
 ) -> Iterator[RemakeDifference]:
     info = episode.info
     if info.origin:
-        raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not hold its commands.")
+        raise ConfigError(f"Its recording was derived ({info.origin}), and a dataset does not store its commands.")
     with tempfile.TemporaryDirectory(prefix="demorec-deep-") as folder:
         again = Path(folder) / "again.mcap"
         _generate_again(info, again, simulators, allowed)
         for what, frames in episode_differences(again, options, episode, dataset):
-            yield RemakeDifference(stream="dataset", field=what, frames=frames, recorded="not what comes out", again="")
+            yield RemakeDifference(
+                stream="dataset", field=what, frames=frames, recorded="differs from the remake", again=""
+            )

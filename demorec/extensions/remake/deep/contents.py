@@ -1,7 +1,7 @@
-"""Two recordings of one episode compared byte by byte, and what differs taken apart into named fields.
+"""Compare two recordings of one episode byte by byte, and name the fields that differ.
 
-Recordings hold no clock, host or path, so that the same episode made again on the same type of machine has the same
-bytes in every message. Encoded images that differ are left to `images`, which decodes them.
+Recordings contain no clock, host or path, so that a remake on the same type of machine has the same bytes in every
+message. Encoded images that differ are decoded in `images`.
 """
 
 from __future__ import annotations
@@ -23,29 +23,29 @@ from demorec.mcap.messages import Value, message_fields
 from demorec.mcap.metadata import EPISODE
 
 CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
-"""Streams of a camera whose messages hold a coded image in the field `data`."""
+"""Camera streams with messages that hold an encoded image in the field `data`."""
 _SEAL = "crc32"
-"""Follows from the other values of a metadata record."""
+"""Derived from the other values of a metadata record."""
 _MADE_BY = ("info.versions", "info.simulation.cpu")
-"""Fields that are reported by themselves, before all others."""
+"""Fields that are reported separately, before all others."""
 
 _SHOWN = reprlib.Repr(maxstring=80, maxother=80)
 
 Differing = tuple[str, str, int | None, Value | None, Value | None]
-"""Two values that differ: stream, field, frame if there is one, recorded value, value when made again."""
+"""A difference: stream, field, frame if any, recorded value, remade value."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class RemakeDifference:
-    """A field of a stream that differs when the recording is made again.
+    """A field of a stream that differs in the remake.
 
     Attributes:
         stream: A topic, or "metadata NAME", "attachment NAME".
-        field: Of its messages, as `pose.position.x`, or of the metadata, as `info.simulation.scene.bodies[1].mass`;
-            "image" for what a camera shows.
-        frames: In which, ascending; empty for what belongs to no frame.
-        recorded, again: What is recorded and what comes out, at the first of these frames, in words; `again` is ""
-            where `recorded` says it all.
+        field: Message field such as `pose.position.x`, or metadata field such as
+        `info.simulation.scene.bodies[1].mass`; "image" for a camera's image.
+        frames: Frames that differ, ascending; empty outside frames.
+        recorded, again: Recorded and remade value at the first of these frames, in words; `again` is "" if `recorded`
+        describes both.
         largest: Largest absolute difference over these frames; None if they are not numbers.
     """
 
@@ -69,7 +69,7 @@ class RemakeDifference:
 
 
 def difference_in_words(value: Value | None) -> str:
-    """A value in words; None for a missing one."""
+    """A value in words; None if missing."""
     if value is None:
         return "nothing"
     if isinstance(value, bytes):
@@ -97,7 +97,7 @@ class Contents:
 
     @classmethod
     def of(cls, path: Path) -> Contents:
-        """Read all of a file; RecordingError when it is damaged."""
+        """Read a whole file; RecordingError if it is damaged."""
         found = cls()
         with closing(Container(path)) as container:
             for name in container.metadata_names:
@@ -120,7 +120,7 @@ class Contents:
         return found
 
     def cut_off(self, other: Contents) -> None:
-        """Leave out what `other`, which a crash cut off, cannot have: later messages, what is written at the end."""
+        """Leave out data that `other`, which a crash cut off, cannot have: later messages and the final records."""
         last = max((max(times, default=0) for times in other.messages.values()), default=0)
         for topic, times in list(self.messages.items()):
             if topic.endswith("/histogram"):
@@ -134,7 +134,7 @@ class Contents:
 
 
 def coded_topics(info: EpisodeInfo) -> dict[str, str]:
-    """Topic -> camera, of all streams of coded images."""
+    """Topic -> camera, for all streams of encoded images."""
     return {
         camera_topic(camera.name, stream): camera.name for camera in info.simulated.scene.cameras for stream in CODED
     }
@@ -143,12 +143,12 @@ def coded_topics(info: EpisodeInfo) -> dict[str, str]:
 def content_differences(
     recorded: Contents, again: Contents, info: EpisodeInfo, fps: int
 ) -> tuple[list[RemakeDifference], dict[str, list[int]]]:
-    """What differs, less the coded images; and topic -> frames, ascending, whose coded images differ.
+    """Differences except those of encoded images; and topic -> ascending frames with different encoded images.
 
     Args:
         recorded, again: The two files.
-        info: Of the one made again.
-        fps: Of the recording.
+        info: Description of the remake.
+        fps: Frames per second of the recording.
     """
     images: dict[str, list[int]] = {}
     return list(_gathered(_all_differing(recorded, again, info, fps, images))), images
@@ -157,7 +157,7 @@ def content_differences(
 def _all_differing(
     recorded: Contents, again: Contents, info: EpisodeInfo, fps: int, images: dict[str, list[int]]
 ) -> Iterator[Differing]:
-    """One by one; frames whose coded images differ go into `images`."""
+    """Yield single differences; frames with different encoded images are added to `images`."""
     for name in recorded.attachments.keys() | again.attachments.keys():
         a, b = recorded.attachments.get(name), again.attachments.get(name)
         if a != b:
@@ -182,7 +182,7 @@ def _all_differing(
 
 
 def _gathered(found: Iterable[Differing]) -> Iterator[RemakeDifference]:
-    """Those of one field over all frames as one, of which the first is shown."""
+    """Merge the differences of one field over all frames into one, which shows the first."""
     groups: dict[tuple[str, str], tuple[str, str, dict[int, None]]] = {}
     largest: dict[tuple[str, str], float] = {}
     for stream, name, frame, a, b in found:
@@ -226,7 +226,7 @@ def _is_same(a: Value | None, b: Value | None) -> bool:
 def _topic_differences(
     topic: str, recorded: Contents, again: Contents, fps: int
 ) -> Iterator[tuple[str, int, Any, Any]]:
-    """(field, frame, recorded, made again) of what differs in a topic."""
+    """Yield (field, frame, recorded, remade) of the differences in a topic."""
     ours, theirs, schema = recorded.messages[topic], again.messages[topic], again.schemas[topic]
     if ours == theirs:
         return
@@ -241,7 +241,7 @@ def _topic_differences(
             try:
                 a_fields = message_fields(schema, a)
             except (ValueError, KeyError) as error:
-                yield "message", frame, f"{len(a)} bytes that are none ({error})", b
+                yield "message", frame, f"{len(a)} bytes that are not a message ({error})", b
                 continue
             differing = list(_differing(a_fields, message_fields(schema, b)))
             for name, ours_now, theirs_now in differing or [("padding", a, b)]:

@@ -1,4 +1,4 @@
-"""Encoded images that differ, decoded: in how many pixels they differ, and by how much."""
+"""Decode encoded images that differ, and measure the number of different pixels and the largest difference."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ def image_differences(
     cameras: Mapping[str, str],
     differing: Mapping[str, Sequence[int]],
 ) -> Iterator[RemakeDifference]:
-    """Yield one difference for each stream of encoded images that differ.
+    """Yield one difference per stream with encoded images that differ.
 
     Args:
         recorded, again: The two files.
-        remade: The one made again, open.
-        cameras: Topic -> camera, of streams of encoded images.
+        remade: The remake, open.
+        cameras: Topic -> camera, for streams of encoded images.
         differing: Topic -> frames with different encoded images.
     """
     for topic, frames in differing.items():
@@ -57,7 +57,7 @@ def _in_words(image: NDArray[Any], made: NDArray[Any]) -> str:
 
 
 def _decoded(contents: Contents, topic: str, settings: VideoSettings) -> Iterator[NDArray[Any]]:
-    """Decode the images of a topic in order: colours (H, W, 3) uint8, distances (H, W) float32, or labels int32."""
+    """Decode the images of a topic in order: colour (H, W, 3) uint8, depth (H, W) float32, or labels int32."""
     encoded = (_encoded(contents, topic, found[0]) for _, found in sorted(contents.messages[topic].items()))
     lossless: Any = {"depth": decode_depth, "segmentation": decode_labels}.get(topic.rpartition("/")[2])
     if lossless is not None:
