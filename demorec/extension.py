@@ -1,4 +1,4 @@
-"""Declaration of the core: what demorec has without any extension."""
+"""Declaration of the core: the abilities of demorec without extensions."""
 
 from __future__ import annotations
 

@@ -75,13 +75,13 @@ class Check:
 
     Attributes:
         name: Its row in `demorec.core.tables.FILE_CHECKS`.
-        group: What it is about.
-        on: What it can look at, whatever else it needs.
-        needs: What it needs, in few words.
-        measures: What the value is, in words.
-        unit: Of the value and the limits; "" for counts and ratios.
-        warn, fail: The value passes up to `warn`, is a warning up to `fail`, and a failure above.
-        needs_images: Whether images have to be decoded.
+        group: Kind of fault.
+        on: Forms that it can check, apart from other needs.
+        needs: Required data, in a few words.
+        measures: Meaning of the value, in words.
+        unit: Unit of the value and the limits; "" for counts and ratios.
+        warn, fail: A value up to `warn` passes, up to `fail` is a warning, and above is a failure.
+        needs_images: Whether images must be decoded.
         measure: The function.
     """
 

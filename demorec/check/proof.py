@@ -1,4 +1,4 @@
-"""Proofs that a recording is what its config and seed give, by the extensions that can make it again."""
+"""Proofs that a recording follows from its config and seed, by extensions that can remake it."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ class Proof:
 
     Attributes:
         path: The recording.
-        level: "warn" where this machine cannot prove it, "fail" where it is not the same.
-        problem: What differs; "" unless it failed.
+        level: "warn" if this machine cannot prove it, "fail" if the remake differs.
+        problem: The difference; "" unless it failed.
     """
 
     path: Path
@@ -27,11 +27,11 @@ class Proof:
 
 
 def prove(paths: Sequence[Path], allowed: Sequence[str] = ()) -> Iterator[Proof]:
-    """Yield the proofs of recordings; nothing without an extension that has any.
+    """Yield the proofs of recordings; none without an extension for it.
 
     Args:
         paths: The recordings.
-        allowed: Modules of the user that may be imported for what the recordings name.
+        allowed: The user's modules that may be imported if the recordings name them.
     """
     for _, target in rows_of("proofs"):
         yield from pkgutil.resolve_name(target)(paths, allowed)

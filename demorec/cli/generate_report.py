@@ -68,7 +68,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     if warned:
         found.append(f" ({', '.join(sorted(warned))})")
     if proofs:
-        found.append(f"; {counted(len(proofs), 'episode')} made again and compared")
+        found.append(f"; {counted(len(proofs), 'episode')} generated again and compared")
     return "".join(found), failures
 
 

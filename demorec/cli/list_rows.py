@@ -31,7 +31,7 @@ _NAMES = (*_TABLES, *LISTS.names(), "extensions")
 
 @dataclass(frozen=True, kw_only=True)
 class ListRows:
-    """List what can be chosen from: tasks, cameras, robots, objects, renderers, export formats and more.
+    """List the available choices: tasks, cameras, robots, objects, renderers, export formats and more.
 
     Examples:
       demorec list tasks
@@ -43,7 +43,7 @@ class ListRows:
     """Print JSON: a list of names and summaries."""
 
     def run(self) -> int:
-        """Print one line each."""
+        """Print one line per row."""
         check_choice("list", self.what, _NAMES)
         if self.what in LISTS.rows:
             rows = list(LISTS.load(self.what)())

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _MOST = 50
 """Maximum number of episodes to show unless --episodes asks for more."""
 _MOST_REASONS = 10
-"""Maximum number of episodes of --rank whose reasons are printed."""
+"""Maximum number of episodes of --rank with printed reasons."""
 _RANK_HELP = f"Order of the episodes, the worst first: {', '.join(RANKINGS.names()) or 'none is installed'}."
 
 
@@ -63,7 +63,7 @@ class View:
     compare: bool = False
     """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""
-    """Which episodes, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
+    """Episodes to show, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
     rank: Annotated[str | None, arg(help=_RANK_HELP)] = None
     include_failures: bool = False
     """Also show the failed attempts of a run."""
@@ -155,7 +155,7 @@ class View:
         say(f"{self.size[0]}x{self.size[1]}: {self.screenshot}")
 
     def _ranked(self, sources: Sequence[PlaybackSource]) -> list[PlaybackSource]:
-        """Order episodes as --rank asks, and print why the first ones are first."""
+        """Sort the episodes by --rank, and print the reasons for the first ones."""
         assert self.rank is not None
         ranked = RANKINGS.load(self.rank)(self.paths, self.roles.named)
         names = {source.name for source in sources}

@@ -1,7 +1,7 @@
-"""Declaration of an extension: the names that it adds, each with the place of the code behind it.
+"""Declaration of an extension: the names that it adds, each with the location of its code.
 
-A declaration imports nothing heavy. Its values are texts "module:name", which are loaded when they are used, so that
-`demorec --help` costs as much with twenty extensions as with none.
+A declaration imports nothing heavy. Its values are "module:name" texts that are loaded on use, so that `demorec --help`
+takes no longer with twenty extensions than with none.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class CommandRow:
     Attributes:
         target: "module:Class" of a dataclass whose fields are the flags (`demorec.cli.Command`).
         group: Heading in `demorec --help`.
-        limits: Limits of its process (`demorec.core.limited`): those for reading files of unknown origin, those for
-            simulating or drawing what such files describe, or none.
-        drawing_flags: Flags with which it simulates or draws.
+        limits: Limits of its process (`demorec.core.limited`): for reading files of unknown origin, for simulating or
+        rendering such files, or none.
+        drawing_flags: Flags with which it simulates or renders.
     """
 
     target: str
@@ -45,11 +45,11 @@ class ReaderRow:
 
     Attributes:
         target: "module:name" of a `demorec.runs.foreign.SourceFormat`.
-        name: Name of one in a sentence: "an HDF5 file".
-        plural: Name of several: "HDF5 files".
-        advice: What to do with one where a recording is expected: "make a run of it (demorec import)".
-        word: Word after `demorec import` that stands for this kind; "" for the kind that needs none.
-        suffixes: Endings of its files, for a kind that the core does not know.
+        name: Noun for one in a sentence: "an HDF5 file".
+        plural: Plural noun: "HDF5 files".
+        advice: Action for the user if a recording was expected: "convert it to a run (demorec import)".
+        word: Word after `demorec import` for this kind; "" if none is needed.
+        suffixes: File suffixes, for a kind that the core does not know.
     """
 
     target: str
@@ -62,11 +62,11 @@ class ReaderRow:
 
 @dataclass(frozen=True, kw_only=True)
 class Extension:
-    """Everything that an extension adds.
+    """Everything an extension adds.
 
     Attributes:
-        name: Name of its folder, or of its package.
-        summary: What it does, in one line.
+        name: Name of its folder or package.
+        summary: Its purpose in one line.
         needs: Names of the extensions that it imports.
         commands: Name -> command.
         readers: Kind of path -> reader. "dataset", "hdf5" and "rosbag" are kinds that the core knows.
@@ -79,12 +79,12 @@ class Extension:
         file_checks: Name -> `demorec.check.base.Check` of the integrity of recordings, runs and their datasets.
         checks: Name -> check of any dataset, for the extension that judges datasets.
         operations: Name -> command of `demorec dataset`, for the extension that edits datasets.
-        columns: Name of a column of a dataset's episodes, for `--where` and `--by` -> function (folder, names) that
-            returns a mapping with these names for each episode.
+        columns: Column of a dataset's episodes for `--where` and `--by` -> function (folder, names) that returns a
+        mapping with these names for each episode.
         rankings: Name for `demorec view --rank` -> function (paths, named roles) that returns the episodes, worst
             first, as `demorec.view.sources.RankedEpisode`.
         lists: Name for `demorec list` -> function that returns (name, summary) of each row.
-        proofs: Name -> function (recordings, allowed modules) that yields a `Proof` of each recording.
+        proofs: Name -> function (recordings, allowed modules) that yields a `Proof` for each recording.
     """
 
     name: str

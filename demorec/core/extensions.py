@@ -1,7 +1,7 @@
-"""The extensions that there are: the core itself, the folders of `demorec/extensions/`, and those of other packages.
+"""Installed extensions: the core itself, the folders of `demorec/extensions/`, and those of other packages.
 
-An installed package brings extensions by entry points of the group `demorec.extensions`, each "module:EXTENSION". An
-extension that cannot be used is left out and named; it harms no other.
+An installed package provides extensions by entry points in the group `demorec.extensions`, each "module:EXTENSION". An
+extension that cannot be used is left out and reported; it does not affect the others.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from typing import Any
 from demorec.core.extension import CommandRow, Extension, ReaderRow
 
 ENTRY_POINTS = "demorec.extensions"
-"""Group of the entry points of other packages, and the package of our own folders."""
+"""Entry point group of other packages, and package of demorec's own extensions."""
 
 
 @dataclass(frozen=True)
 class Extensions:
-    """The usable extensions, and what keeps others from being used.
+    """Usable extensions, and problems with the others.
 
     Attributes:
         found: The core first, then the others by name.
-        problems: One sentence for each that is left out.
+        problems: One sentence for each extension left out.
     """
 
     found: tuple[Extension, ...]
@@ -35,7 +35,7 @@ class Extensions:
 
 @cache
 def extensions() -> Extensions:
-    """Find all extensions; the same for as long as the process lives."""
+    """Find all extensions; cached for the lifetime of the process."""
     problems: list[str] = []
     declared = [_declaration("demorec", "demorec.extension:EXTENSION", problems)]
     declared += [_declaration(place, target, problems) for place, target in _targets()]
@@ -82,7 +82,7 @@ def _words(error: BaseException) -> str:
 
 
 def _clash(extension: Extension, others: Mapping[str, Extension]) -> str:
-    """Name what an extension has in common with another one; "" if nothing."""
+    """Describe a name conflict of an extension with another one; "" if there is none."""
     if extension.name in others:
         return f"The extension {extension.name} is left out, since another one has that name."
     for other in others.values():
@@ -91,7 +91,7 @@ def _clash(extension: Extension, others: Mapping[str, Extension]) -> str:
             if isinstance(rows, Mapping) and (both := sorted(rows.keys() & own.keys())):
                 kind = table.replace("_", " ")
                 return (
-                    f"The extension {extension.name} is left out, since {other.name} has {kind} of the same name: "
+                    f"The extension {extension.name} is left out, since {other.name} has {kind} with the same name: "
                     f"{', '.join(both)}."
                 )
     return ""
@@ -131,11 +131,11 @@ class ExtensionRows(Mapping[str, str]):
         return {name: getattr(row, "target", row) for name, row in rows_of(self._table)}
 
     def __getitem__(self, name: str) -> str:
-        """The place of the code."""
+        """Location of the code."""
         return self._rows()[name]
 
     def __iter__(self) -> Iterator[str]:
-        """The names, the core's first."""
+        """Names, the core's first."""
         return iter(self._rows())
 
     def __len__(self) -> int:

@@ -34,8 +34,8 @@ EVALUATION_NAME = "evaluation.json"
 
 _WORDS: dict[PathKind, tuple[str, str]] = {
     "recording": ("a recording (.mcap)", ""),
-    "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps what is whole in it"),
-    "rrd": ("a Rerun file (.rrd)", "; demorec view shows it by a name that ends in .rrd"),
+    "unfinished": ("an unfinished recording (.part)", "; demorec recover keeps its intact part"),
+    "rrd": ("a Rerun file (.rrd)", "; demorec view shows it if its name ends in .rrd"),
     "hdf5": ("an HDF5 file", "; name the run that it was made from"),
     "rosbag": ("a bag of another program", ""),
     "run": ("a run", "; name one of its recordings"),
@@ -43,7 +43,7 @@ _WORDS: dict[PathKind, tuple[str, str]] = {
     "dataset": ("a LeRobot dataset", "; name the run that it was made from"),
     "recordings": ("a folder of recordings", "; name one of them"),
 }
-"""What each kind is called, and what to do where it was not expected."""
+"""Noun for each kind, and advice if the kind was not expected."""
 ROSBAG2 = "metadata.yaml"
 """File that marks a folder as a bag of rosbag2."""
 BAG_SUFFIXES = (".db3", ".bag", ".mcap.zstd", ".db3.zstd")
@@ -96,7 +96,7 @@ class Found:
 
     @property
     def left(self) -> str:
-        """Unfinished recordings and what to do about them, as a sentence without its end; "" if there are none."""
+        """Unfinished recordings and what to do about them, as a sentence without its end; "" if all are finished."""
         if not self.unfinished:
             return ""
         first, count = shlex.quote(str(self.unfinished[0])), len(self.unfinished)
@@ -135,18 +135,18 @@ def find(path: Path) -> Found:
 
 
 def name_of(kind: PathKind) -> str:
-    """What a kind is called in a sentence: "an HDF5 file"."""
+    """Noun for a kind in a sentence: "an HDF5 file"."""
     return _words(kind)[0]
 
 
 def import_word(kind: PathKind) -> str:
-    """Return the word after `demorec import` that stands for a kind; "" if it needs none or is not imported."""
+    """Return the word after `demorec import` for a kind; "" if it needs none or is not imported."""
     row = reader_rows().get(kind)
     return "" if row is None else row.word
 
 
 def _words(kind: PathKind) -> tuple[str, str]:
-    """Name of a kind in a sentence, and what to do where it was not expected."""
+    """Noun for a kind in a sentence, and advice if the kind was not expected."""
     row = reader_rows().get(kind)
     if row is None or (kind in _WORDS and not row.advice):
         return _WORDS[kind]
@@ -181,7 +181,7 @@ def expect_recordings(found: Found, files: Sequence[Path]) -> None:
         return
     only = " except failed attempts, in failed/" if found.failed else ""
     left = f"; {found.left}" if found.left else ""
-    raise ConfigError(f"There is no finished recording in {_words(found.kind)[0]}{only}{left}: {found.path}")
+    raise ConfigError(f"No finished recording in {_words(found.kind)[0]}{only}{left}: {found.path}")
 
 
 def _file(path: Path) -> Found:
@@ -230,7 +230,7 @@ def _folder(path: Path) -> Found:
         places += _entries(path / UNFINISHED)
     parts: list[Path] = []
     for place in places:
-        with suppress(OSError):  # an unreadable entry is no reason to refuse the rest
+        with suppress(OSError):  # an unreadable entry must not hide the rest
             parts += [file for file in _entries(place) if file.name.endswith(".mcap.part")]
     unfinished = tuple(p for p in parts if not {p.name.removesuffix(".mcap.part"), p.name.partition(".")[0]} & made)
     found = Found(path=path, kind=kind or "recordings", recordings=recordings, failed=failed, unfinished=unfinished)

@@ -1,7 +1,7 @@
-"""Formats of other programs, which commands read through a temporary import.
+"""Third-party formats, which commands read through a temporary import.
 
 Each is a row `readers` of an extension (`demorec.core.extensions`). Every command reads them by the same mapping as
-`demorec import`, in the same words.
+`demorec import` and prints the same messages.
 """
 
 from __future__ import annotations
@@ -30,24 +30,24 @@ class ImportResult(Protocol):
         """Number of episodes in the run."""
 
     def left_out_lines(self) -> Iterator[str]:
-        """Describe what the run does not have."""
+        """Describe the data left out of the run."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SourceFormat:
-    """Format of files or folders of other programs.
+    """A third-party format of files or folders.
 
     Attributes:
-        kind: Kind of path, as `demorec.runs.find` knows it.
-        example: Example of what follows `demorec import` and the format's word.
-        importer: "module:function" of (paths, mapping, out), which makes or continues the run `out`.
-        suggester: "module:function" of (path, tell): the lines of a mapping; `tell` is called with what it leaves to
-            the user. "" for a format that needs no mapping.
-        reviewer: "module:function" of a mapping's path: its features and cameras in words; ConfigError if it leaves
-            something to the user. Needed with a `suggester`.
-        describer: "module:function" of a path: yields (plain data, lines) for `demorec info`, without a mapping; ""
-            where `info` reads it through an import.
-        dropped: "module:function" of an imported run: what it left out, as rows of "bag", "what" and "reason".
+        kind: Kind of path in `demorec.runs.find`.
+        example: Example of the arguments after `demorec import` and the format's word.
+        importer: "module:function" of (paths, mapping, out), which creates or continues the run `out`.
+        suggester: "module:function" of (path, tell) that returns the lines of a mapping; it calls `tell` with each open
+        decision. "" for a format that needs no mapping.
+        reviewer: "module:function" of a mapping's path: its features and cameras in words; ConfigError if a decision is
+        open. Needed with a `suggester`.
+        describer: "module:function" of a path: yields (plain data, lines) for `demorec info`, without a mapping; "" if
+        `info` reads it through an import.
+        dropped: "module:function" of an imported run: the data left out, as rows of "bag", "what" and "reason".
     """
 
     kind: PathKind
@@ -60,16 +60,16 @@ class SourceFormat:
 
     @property
     def plural(self) -> str:
-        """Name of several of them in a sentence."""
+        """Plural noun for a sentence."""
         return reader_rows()[self.kind].plural
 
     @property
     def command(self) -> str:
-        """The command that imports it, without paths."""
+        """Its import command, without paths."""
         return " ".join(filter(None, ("demorec import", reader_rows()[self.kind].word)))
 
     def read(self, paths: Sequence[Path], mapping: Path | None, out: Path, **options: Any) -> ImportResult:
-        """Make or continue the run `out`; options, result and errors are those of the importer."""
+        """Create or continue the run `out`; options, result and errors as in the importer."""
         return cast(ImportResult, pkgutil.resolve_name(self.importer)(paths, mapping, out, **options))
 
     def suggest(self, path: Path, tell: Tell) -> list[str]:
@@ -86,32 +86,31 @@ def formats() -> Mapping[str, SourceFormat]:
 
 
 def imported_kinds() -> tuple[PathKind, ...]:
-    """Kinds of paths that are read through an import only; datasets are read as they are except for an export."""
+    """Kinds of paths that are read only through an import; datasets are read directly except for an export."""
     return tuple(kind for kind in reader_rows() if kind != "dataset")
 
 
 def dropped_by_import(run: Path) -> list[dict[str, str]]:
-    """What an import left out of a run, each as "bag", "what" and "reason"."""
+    """Data that an import left out of a run, each as "bag", "what" and "reason"."""
     hooks = [form.dropped for form in formats().values() if form.dropped]
     return [row for hook in hooks for row in pkgutil.resolve_name(hook)(run)]
 
 
 @contextmanager
 def opened(paths: Sequence[Path], mapping: Path | None, *, imports_datasets: bool, tell: Tell) -> Iterator[list[Path]]:
-    """Give for each path a run of its episodes, or the path itself where that is read as it is.
+    """Yield a run of episodes for each path, or the path itself if it can be read directly.
 
-    The runs are temporary: they are removed when the context ends, however it ends.
+    The runs are temporary and removed when the context ends, with or without an error.
 
     Args:
-        paths: Recordings, runs, folders of recordings, and whatever can be imported.
-        mapping: Of the bags and files that need one; None where the one that `demorec import --suggest` writes leaves
-            nothing to decide.
+        paths: Recordings, runs, folders of recordings, and anything that can be imported.
+        mapping: Mapping for the bags and files that need one; None to use the suggested mapping if it is complete.
         imports_datasets: Whether datasets are opened as recordings.
-        tell: Called with what was left out, and by which mapping, a line each.
+        tell: Called with one line for each part left out and each mapping used.
 
     Raises:
-        ConfigError: A mapping is missing, given for what needs none, or impossible; or the disk is too small.
-        DemorecError: As of the importers.
+        ConfigError: A mapping is missing, impossible or given without need, or the disk is too small.
+        DemorecError: As in the importers.
     """
     by_kind = formats()
     kinds = [import_kind(path, imports_datasets) for path in paths]
@@ -142,18 +141,18 @@ def _imported(path: Path, form: SourceFormat, mapping: Path | None, run: Path, t
     for line in result.left_out_lines():
         tell(line)
     if not result.num_episodes:
-        raise DemorecError(f"The mapping makes no episode of this, so there is nothing to read: {path}")
+        raise DemorecError(f"The mapping yields no episode, so nothing can be read: {path}")
     return run
 
 
 def import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
-    """Return the kind that a path is to be imported as; None for what is read as it is, or by no command."""
+    """Return the kind under which a path is imported; None if it is read directly, or by no command."""
     kind = find(path).kind
     return kind if kind in imported_kinds() or (imports_datasets and kind == "dataset") else None
 
 
 def _check_space(paths: Sequence[Path], folder: Path) -> None:
-    """Raise ConfigError unless there is room: encoded images stay as they are, pixels become smaller."""
+    """Raise ConfigError unless there is enough space: encoded images keep their size, raw pixels become smaller."""
     files = [file for path in paths for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file()]
     needed, free = sum(file.stat().st_size for file in files), shutil.disk_usage(folder).free
     if needed > free:
@@ -164,7 +163,7 @@ def _check_space(paths: Sequence[Path], folder: Path) -> None:
 
 
 def _suggested(path: Path, form: SourceFormat, target: Path, tell: Tell) -> Path:
-    """Write the mapping that --suggest writes; ConfigError if it leaves something to the user."""
+    """Write the suggested mapping; ConfigError if it leaves a decision to the user."""
     doubts: list[str] = []
     target.write_text("\n".join(form.suggest(path, doubts.append)) + "\n", encoding="utf-8")
     suggest = f"{form.command} {path} --suggest > mapping.toml"
@@ -175,7 +174,7 @@ def _suggested(path: Path, form: SourceFormat, target: Path, tell: Tell) -> Path
     except ConfigError as error:
         reason = str(error).removesuffix(f": {target}")
         raise ConfigError(
-            f"This is read by a mapping (--mapping FILE), and the suggested one leaves something to you: {reason}; "
+            f"This is read by a mapping (--mapping FILE), and the suggested one leaves a decision to you: {reason}; "
             f"{suggest} writes it: {path}"
         ) from error
     tell(f"{path}: read by the suggested mapping ({taken}); {suggest} writes it, --mapping takes another.")

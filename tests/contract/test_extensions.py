@@ -25,7 +25,7 @@ BROKEN = {
     "other kind": ("EXTENSION = 1", "is not a demorec.core.extension.Extension"),
     "clash": (
         f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', tasks={{'stack': 'broken_extension:Stack'}})",
-        "core has tasks of the same name: stack",
+        "core has tasks with the same name: stack",
     ),
     "needs": (
         f"{IMPORT}\nEXTENSION = Extension(name='x', summary='', needs=('y',))",

@@ -1,4 +1,4 @@
-"""Columns of a dataset's episodes, for conditions and orders: those of its tables, and those that extensions add."""
+"""Columns of a dataset's episodes for conditions and sorting: from its tables and from extensions."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 
 
 def columns_of(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:
-    """Read the columns of each episode, with those columns of extensions that are asked for and not in the dataset."""
+    """Read the columns of each episode, including requested columns of extensions that the dataset lacks."""
     columns = episode_columns(folder)
     wanted: dict[str, list[str]] = {}
     for name, target in rows_of("columns"):

@@ -1,4 +1,4 @@
-"""Declaration of the editing of LeRobot datasets."""
+"""Declaration of the dataset editing."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
-"""Checks of an imported run: findings about its bags, and episodes and bags that it left out.
+"""Checks of an imported run: findings about its bags, and episodes and bags that the import left out.
 
-An import keeps its findings in import.json, since the bags may be gone later.
+An import stores its findings in import.json, because the bags may be gone later.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from demorec.extensions.imports.import_file import load_import_file
 
 _MAX_LISTED = 5
 
-import_check = partial(check, group="import", on=("external run",), needs="a run that was imported", fail=math.inf)
+import_check = partial(check, group="import", on=("external run",), needs="an imported run", fail=math.inf)
 
 
 @import_check(measures="findings of the import about clocks and losses")

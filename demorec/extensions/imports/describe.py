@@ -1,4 +1,4 @@
-"""What `demorec info` prints about bags, and about the bags and episodes that an import left out of a run."""
+"""Output of `demorec info` about bags, and about the bags and episodes that an import left out of a run."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from demorec.extensions.imports.bag import bags_in, summarize_bag
 from demorec.extensions.imports.import_file import load_import_file
 
 _MOST_PROBLEMS = 5
-"""Problems of a bag that are listed."""
+"""Maximum problems listed for a bag."""
 
 
 def describe_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
-    """A bag, or each one of a folder of bags."""
+    """Describe a bag, or each bag of a folder."""
     found = [_bag(bag) for bag in bags_in(path)]
     if len(found) == 1:
         return found[0]
@@ -39,7 +39,7 @@ def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def dropped_rows(path: Path) -> list[dict[str, str]]:
-    """What an import did not take into the run: episodes that it dropped and bags that it skipped, each with why."""
+    """Data that an import left out of the run: dropped episodes and skipped bags, each with its reason."""
     if (imported := load_import_file(path)) is None:
         return []
     dropped = [

@@ -6,14 +6,14 @@ from demorec.core.extension import CommandRow, Extension, ReaderRow
 
 EXTENSION = Extension(
     name="imports",
-    summary="make runs of bags, HDF5 files and LeRobot datasets",
+    summary="convert bags, HDF5 files and LeRobot datasets to runs",
     commands={"import": CommandRow(target="demorec.extensions.imports.command:Import", group="make", limits="reading")},
     readers={
         "rosbag": ReaderRow(
             target="demorec.extensions.imports.formats:BAGS",
             name="a bag of another program",
             plural="bags",
-            advice="demorec import makes a run of it",
+            advice="demorec import converts it to a run",
         ),
         "dataset": ReaderRow(
             target="demorec.extensions.imports.formats:DATASETS",
@@ -26,7 +26,7 @@ EXTENSION = Extension(
             name="an HDF5 file",
             plural="HDF5 files",
             word="hdf5",
-            advice="name the run that it was made from, or make one of it (demorec import hdf5)",
+            advice="name the run that it was made from, or convert it to one (demorec import hdf5)",
         ),
     },
     file_checks={

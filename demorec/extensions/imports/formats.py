@@ -1,4 +1,4 @@
-"""The formats that are imported: rows `readers` of the declaration, and words after `demorec import`."""
+"""Formats that can be imported: `readers` rows of the declaration, and words after `demorec import`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from demorec.extensions.imports.mapping_file import read_mapping
 from demorec.runs.foreign import SourceFormat, formats
 
 _MOST_SHOWN = 6
-"""Features and cameras of a mapping that are named."""
+"""Maximum features and cameras of a mapping that are listed."""
 
 BAGS = SourceFormat(
     kind="rosbag",
@@ -43,12 +43,12 @@ def formats_by_word() -> Mapping[str, SourceFormat]:
 
 
 def review_bag_mapping(path: Path) -> str:
-    """The features and cameras of a mapping of bags, in words; errors as of `read_mapping`."""
+    """Features and cameras of a mapping of bags, in words; errors as in `read_mapping`."""
     return _reviewed(path, "bag")
 
 
 def review_hdf5_mapping(path: Path) -> str:
-    """The same of a mapping of HDF5 files."""
+    """Features and cameras of a mapping of HDF5 files, in words."""
     return _reviewed(path, "hdf5")
 
 

@@ -1,4 +1,4 @@
-"""Declaration of deep checks, replay and drawing again."""
+"""Declaration of deep checks, replay and rendering."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from demorec.core.extension import CommandRow, Extension
 
 EXTENSION = Extension(
     name="remake",
-    summary="make recordings again and compare, replay them, draw them again",
+    summary="remake and compare recordings, replay them, render them again",
     commands={
         "replay": CommandRow(target="demorec.extensions.remake.replay_command:Replay", group="look", limits="drawing"),
         "render": CommandRow(target="demorec.extensions.remake.render_command:Render", group="make", limits="drawing"),
