@@ -143,7 +143,7 @@ def _next_attempt(attempts: list[GoalAttempt], name: str, frame: int, goals: Seq
 
 
 def _goal_of(name: str, goals: Sequence[Goal], first: int) -> int | None:
-    """Return the first goal, from index `first`, whose object has that name."""
+    """Return the first goal from index `first` for an object with that name."""
     return next((index for index in range(first, len(goals)) if goals[index].object == name), None)
 
 

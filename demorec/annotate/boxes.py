@@ -100,7 +100,7 @@ def _project(camera: SceneCamera, world_from_camera: Array, points: Array) -> Ar
 
 
 def _rim(shape: Shape) -> Array | None:
-    """Return points (N, 3) in the body's frame whose convex hull is the body; None for other shapes."""
+    """Return points (N, 3) in the body's frame with the body as their convex hull; None for other shapes."""
     if shape.kind == "box":
         signs = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
         return np.asarray(signs * np.array(shape.size))

@@ -237,6 +237,6 @@ _ORDERS: dict[str, tuple[int, float, int, Callable[[NamedThing], float], float]]
     "nearest to the robot": (2, math.inf, 1, _distance, MIN_GAP),
     "farthest from the robot": (2, math.inf, -1, _distance, MIN_GAP),
 }
-"""Word -> minimum and maximum number of objects to which it applies; the quantity, whose smallest (1) or largest (-1)
-value is chosen; and the margin.
+"""Word -> minimum and maximum number of objects to which it applies; whether the smallest (1) or largest (-1) value is
+chosen, and of which quantity; and the margin.
 """

@@ -32,7 +32,7 @@ _MISSING = {
     "lift": "lift the empty gripper, having missed {object} on purpose",
 }
 _AGAIN = ("approach", "descend", "close")
-"""Phases of a later attempt whose subtask begins with "try again"."""
+"""Phases of a later attempt in which the subtask begins with "try again"."""
 _RECOVERY = {
     "missed": "open the gripper and rise after missing {object}",
     "dropped": "open the gripper and rise after dropping {object}",

@@ -1,1 +1,1 @@
-"""What all exporters share: which recordings go in, their numbers, common options, folders made as a whole."""
+"""Shared parts of the exporters: selection of recordings, their numbers, common options, atomic output."""

@@ -1,4 +1,4 @@
-"""The part of an episode that an export writes: which frames, features and images, whatever the format."""
+"""The exported part of an episode: frames, features and images, for any format."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ REWARD = "next.reward"
 DONE = "next.done"
 SUCCESS = "next.success"
 INTERVENTION = "intervention"
-"""Whether the expert acts in an episode that a policy began; the name is that of LeRobot's DAgger."""
+"""Whether the expert acts in an episode that a policy began; LeRobot's DAgger uses the same name."""
 SCALARS: Mapping[str, Literal["float32", "bool"]] = {
     INTERVENTION: "bool",
     REWARD: "float32",
     DONE: "bool",
     SUCCESS: "bool",
 }
-"""Features of one number a frame, and their type."""
+"""Features with one number per frame, and their type."""
 _SECOND_NS = 1_000_000_000
 
 
@@ -69,22 +69,22 @@ class ExportEpisode[O: CommonOptions]:
     Args:
         recording: An open recording.
         options: Options of the export.
-        info: Description of the episode; default that of the recording.
-        read_table: Reads the features that `info` lists; default those of the recording.
+        info: Description of the episode; default: the recording's.
+        read_table: Reads the features that `info` lists; default: the recording's.
 
     Attributes:
         recording, options, info: As given.
-        scene: The world at the start; None where it is not known.
+        scene: World at the start; None if unknown.
         fps: Frames per second of the dataset.
-        stride: Number of frames of the recording for each of the dataset.
+        stride: Number of recorded frames per exported frame.
         state: Form of `observation.state`.
         names: Vector feature of the dataset -> names of its elements.
         scalars: Features of `SCALARS` in the dataset.
         cameras: Cameras in the order of the dataset.
-        depth_left_out: Cameras that only measure distances, if depth was not asked for.
+        depth_left_out: Cameras with depth only, if depth was not requested.
 
     Raises:
-        ConfigError: Options that the recording cannot serve.
+        ConfigError: Options that the recording does not support.
     """
 
     def __init__(
@@ -99,7 +99,7 @@ class ExportEpisode[O: CommonOptions]:
         self.info = info or recording.info
         self._read_table = read_table or recording.table
         self.scene = scene_of(self.info)
-        self.state: StateKind = getattr(options, "state", "joint")  # an option of LeRobot datasets alone
+        self.state: StateKind = getattr(options, "state", "joint")  # an option of LeRobot datasets only
         if self.scene is None:
             _refuse_without_scene(self.info, options, recording)
         self.stride = _frame_stride(self.info.fps, options.fps)
@@ -114,7 +114,7 @@ class ExportEpisode[O: CommonOptions]:
         self.depth_left_out = () if options.depth else tuple(only_depth)
 
     def _offered_names(self) -> dict[str, tuple[str, ...]]:
-        """Vector feature -> names of its elements; with a scene in the forms that the options ask for."""
+        """Vector feature -> names of its elements; with a scene, in the requested forms."""
         if self.scene is None:
             return {feature.name: feature.names for feature in self.info.features}
         robot, options = self.info.simulated.robot, self.options
@@ -125,7 +125,7 @@ class ExportEpisode[O: CommonOptions]:
         return {**names, ACTION: action_names(robot, options.action)}
 
     def _offered_scalars(self) -> tuple[str, ...]:
-        if getattr(self.options, "motor_units", None) is not None:  # as LeRobot records the real arm
+        if getattr(self.options, "motor_units", None) is not None:  # same as LeRobot's recording of the real arm
             return ()
         if self.scene is None:
             return (DONE,)
@@ -136,8 +136,8 @@ class ExportEpisode[O: CommonOptions]:
         colors, depths = self.recording.cameras, self.recording.depth_cameras if self.options.depth else ()
         if self.options.depth and not depths:
             raise ConfigError(
-                "depth is asked for, which needs recordings with depth images (generate --depth), and no camera of "
-                f"this one measures distances: {self.recording.path}"
+                "depth needs recordings with depth images (generate --depth), and no camera of "
+                f"this one has them: {self.recording.path}"
             )
         cameras = []
         for name in colors:
@@ -153,14 +153,14 @@ class ExportEpisode[O: CommonOptions]:
         return self.info.urdf or self.recording.description()
 
     def traits(self) -> dict[str, str]:
-        """Return the properties that all recordings of a dataset share, by name, in words."""
+        """Return the properties that all recordings of a dataset share: name -> text."""
         info = self.info
         traits = {"kind of episode": "external" if self.scene is None else "simulated", "fps": str(info.fps)}
         if self.scene is None:
             traits |= {"robot": info.robot_name, "features": " ".join(self.names)}
             traits |= {f"feature {name}": ", ".join(elements) for name, elements in self.names.items()}
         else:
-            # A scaled arm (the tutorial's) has the same joints and limits; its lengths are in the sidecar.
+            # A scaled arm (the tutorial's) has the same joints and limits; the sidecar has its lengths.
             traits["robot"] = f"{info.robot_name} ({digest(info.simulated.robot.scaled(0.0))})"
         traits["cameras"] = " ".join(camera.feature.removeprefix(IMAGE_PREFIX) for camera in self.cameras) or "none"
         for name in dict.fromkeys(camera.name for camera in self.cameras):
@@ -180,17 +180,17 @@ class ExportEpisode[O: CommonOptions]:
 
     @cached_property
     def rows(self) -> NDArray[np.intp]:
-        """(T,) frames of the recording that the dataset has. Raises ExportError if there are none."""
+        """(T,) indices of the exported frames in the recording. Raises ExportError if there are none."""
         if self.recording.num_frames == 0:
             raise ExportError(f"The recording has no frames: {self.recording.path}")
         return np.arange(0, self.recording.num_frames, self.stride)
 
     @cached_property
     def vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
-        """Feature of `names` -> (T, D), as precise as the recording has it.
+        """Feature of `names` -> (T, D), in the recording's precision.
 
-        With frames left out, an observation is that of the first frame of its group and an action the last one of it:
-        where the robot must be when the next observation is taken.
+        If frames are left out, an observation is from the first frame of its group and an action from the last: the
+        target at the time of the next observation.
 
         Raises:
             ExportError: The recording has no frames, or a number that is not finite.
@@ -215,7 +215,7 @@ class ExportEpisode[O: CommonOptions]:
         return vectors
 
     def _scene_observations(self) -> dict[str, NDArray[np.floating[Any]]]:
-        """The observations whose form needs the scene."""
+        """Observations with a form that needs the scene."""
         vectors = observation_vectors(
             ObservationRows.of_trajectory(self.recording.trajectory(), self.rows),
             self.info.simulated.robot,
@@ -230,7 +230,7 @@ class ExportEpisode[O: CommonOptions]:
     def columns(self) -> Mapping[str, NDArray[np.generic]]:
         """Feature of `names` -> (T, D) float32, feature of `scalars` -> (T,).
 
-        Raises ExportError for a number that float32 does not hold, and as `vectors`.
+        Raises ExportError for a number that float32 cannot hold, and as in `vectors`.
         """
         columns: dict[str, NDArray[np.generic]] = {}
         for name, values in self.vectors.items():
@@ -247,7 +247,7 @@ class ExportEpisode[O: CommonOptions]:
 
     @property
     def is_last(self) -> NDArray[np.bool_]:
-        """(T,) whether a frame is the last one."""
+        """(T,) whether each frame is the last one."""
         return np.asarray(self.rows == self.rows[-1])
 
     def _check_finite(self, name: str, values: NDArray[np.floating[Any]]) -> None:
@@ -259,9 +259,9 @@ class ExportEpisode[O: CommonOptions]:
             )
 
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
-        """(T,) number of the image that each frame shows, as `recording.packets` counts them.
+        """(T,) number of the image that each frame shows, in the order of `recording.packets`.
 
-        A frame without an image shows the camera's last one, if that may be held.
+        A frame without an image shows the camera's last one, if holding is allowed.
 
         Raises:
             ExportError: A frame has no image.
@@ -279,7 +279,7 @@ class ExportEpisode[O: CommonOptions]:
                     last = f"the last one is {age / _SECOND_NS:.3g} s old"
                     hold = "allow that one to be held (--hold-images SECONDS), or "
                 raise ExportError(
-                    f"Frame {frame} has no image of the camera {camera.name}, as {len(without)} of {len(numbers)} "
+                    f"Frame {frame} has no image of the camera {camera.name}, like {len(without)} of {len(numbers)} "
                     f"frames, and {last}: {hold}leave the camera (--features) or the episode (--episodes) out: "
                     f"{self.recording.path}"
                 )
@@ -287,10 +287,10 @@ class ExportEpisode[O: CommonOptions]:
         return numbers[self.rows]
 
     def images(self, camera: ExportCamera) -> Iterator[NDArray[Any]]:
-        """Yield one image a frame: (H, W, 3) uint8 RGB, for a depth camera (H, W) float32 metres.
+        """Yield one image per frame: (H, W, 3) uint8 RGB, or (H, W) float32 metres for a depth camera.
 
         Raises:
-            ExportError: The frames show the images in another order than that of the camera; and as `numbers`.
+            ExportError: The frames show the images in another order than the camera; and as in `numbers`.
         """
         wanted, recording = self.numbers(camera), self.recording
         if (np.diff(wanted) < 0).any():
@@ -310,29 +310,28 @@ def _refuse_without_scene(info: EpisodeInfo, options: CommonOptions, recording: 
     """Raise ConfigError for options that only an episode with a known scene can serve."""
     state = getattr(options, "state", "joint")
     spoken = [kind for kind in getattr(options, "language", None) or () if kind != "subtask"]
-    scenic = ("privileged", "intervention", "progress", "boxes")  # all but the first of LeRobot datasets alone
+    scenic = ("privileged", "intervention", "progress", "boxes")  # all but the first exist only for LeRobot datasets
     needs_scene = [name for name in scenic if getattr(options, name, False)]
     problems = (
         options.action != "joint"
-        and f"action is {options.action!r}, but external actions are exported as they came (joint)",
-        state != "joint" and f"state is {state!r}, but an external state is exported as it came (joint)",
+        and f"action is {options.action!r}, but external actions are exported unchanged (joint)",
+        state != "joint" and f"state is {state!r}, but an external state is exported unchanged (joint)",
         spoken
-        and f"language names {spoken[0]!r}, but of an external episode only the subtasks are known that its source "
-        "states",
-        needs_scene and f"{needs_scene[0]} is asked for, which needs the scene of a simulated episode",
+        and f"language names {spoken[0]!r}, but an external episode has only the subtasks that its source specifies",
+        needs_scene and f"{needs_scene[0]} needs the scene of a simulated episode",
         options.fps not in (None, info.fps)
-        and f"fps is {options.fps}, but the episode was recorded at {info.fps}, and whether frames can be left out of "
-        "it depends on what its actions mean",
+        and f"fps is {options.fps}, but the episode was recorded at {info.fps}, and leaving out frames "
+        "needs the meaning of its actions",
     )
     for problem in filter(None, problems):
         raise ConfigError(f"{problem}: {recording.path}")
 
 
 def _frame_stride(recording_fps: int, fps: int | None) -> int:
-    """Number of frames of the recording for each of the dataset.
+    """Number of recorded frames per exported frame.
 
     Raises:
-        ConfigError: The wanted fps does not divide that of the recording.
+        ConfigError: The requested fps does not divide the recording's.
     """
     if fps is None:
         return 1
@@ -351,6 +350,6 @@ def _check_feature_names(options: CommonOptions, offered: Collection[str]) -> No
             raise ConfigError(f"The feature {name} is named in --features, but only --privileged adds it.")
         if name not in offered:
             raise ConfigError(
-                f"Unknown feature {name!r}.{nearest_match(name, offered)} The recordings and these options give: "
+                f"Unknown feature {name!r}.{nearest_match(name, offered)} The recordings and these options provide: "
                 f"{', '.join(offered)}."
             )

@@ -1,4 +1,4 @@
-"""What a user chooses about an export, whatever its format, and what the export tells at the end."""
+"""Options of an export to any format, and its report."""
 
 from __future__ import annotations
 
@@ -12,41 +12,45 @@ from demorec.core.errors import OptionError, check_option
 from demorec.episode.features import ACTION, STATE, ActionKind
 
 ProgressCallback = Callable[[int, int], None]
-"""Called after every recording with (how many are done, how many there are)."""
+"""Called after every recording with (number finished, total)."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class CommonOptions:
-    """How recordings become a dataset, whatever its format."""
+    """Options of an export to any format."""
 
     episodes: str = ""
-    """Which episodes of each run, by their number: 0:100, ::2, 3,5,8:10; all by default."""
+    """Episodes of each run to export, by number: 0:100, ::2, 3,5,8:10; all by default."""
     corrected_only: bool = False
-    """Of the episodes that a policy began, export only those that the expert corrected (demorec correct);
-    demonstrations are all exported."""
+    """Among episodes that a policy began, export only those that the expert corrected (demorec correct); demonstrations
+    are always exported.
+    """
     include_failures: bool = False
-    """Export failed episodes too; the dataset says of each whether it succeeded."""
+    """Export failed episodes too; the dataset records each one's success."""
     action: ActionKind = "joint"
-    """Form of the action: joint (absolute joint targets), joint_increment (their change since the frame before),
-    ee (absolute TCP pose), ee_delta (its change). The gripper's opening is always absolute."""
+    """Form of the action: joint (absolute joint targets), joint_increment (change since the previous frame), ee
+    (absolute TCP pose), ee_delta (its change). The gripper's opening is always absolute.
+    """
     privileged: bool = False
-    """Add observation.environment_state: poses and sizes that no sensor of a real robot gives."""
+    """Add observation.environment_state: poses and sizes that no real robot senses."""
     features: tuple[str, ...] = ()
-    """Features to export, all by default; observation.state, action and what the format itself needs (times, indices)
-    are always there. Fewer features make training faster. Simulated episodes have more that must be named: command, and
-    sensed values such as observation.effort (docs/dataset-format.md)."""
+    """Features to export, all by default; observation.state, action and the format's own columns (times, indices) are
+    always included. Fewer features make training faster. Simulated episodes have optional ones: command, and sensor
+    values such as observation.effort (docs/dataset-format.md).
+    """
     depth: bool = False
-    """Add depth images of recordings that have depth."""
+    """Add depth images if the recordings have them."""
     fps: int | None = None
-    """Frames per second of the dataset; divides that of the recordings, the frames between are left out."""
+    """Frames per second of the dataset; must divide the recordings' rate; frames in between are left out."""
     hold_images: float = 0.0
-    """Of external episodes: seconds for which a frame without an image of a camera shows the camera's last one, as a
-    policy would see it; 0: such a frame is an error."""
+    """For external episodes: seconds for which a frame without an image shows the camera's last one, as a policy would
+    see it; 0: an error.
+    """
     overwrite: bool = False
-    """Replace an existing dataset; what is no dataset, or holds anything else, is never replaced."""
+    """Replace an existing dataset; a folder with any other content is never replaced."""
 
     def takes(self, feature: str) -> bool:
-        """Whether the dataset shall have a feature, if the recordings give it."""
+        """Whether the dataset includes a feature, if the recordings have it."""
         return not self.features or feature in self.features or feature in (STATE, ACTION)
 
     def validate(self) -> None:
@@ -54,28 +58,28 @@ class CommonOptions:
         parse_episodes(self.episodes)
         check_option("hold_images", self.hold_images, 0, 3600, "s")
         if self.fps is not None and self.fps < 1:
-            raise OptionError("fps", f"is {self.fps}, it must be at least 1.")
+            raise OptionError("fps", f"is {self.fps}, allowed are 1 or more.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class ExportReport:
-    """What was done.
+    """Result of an export.
 
     Attributes:
-        path: Of the dataset.
-        num_episodes, num_frames: In the dataset now.
-        new_episodes: Added by this export.
+        path: Path of the dataset.
+        num_episodes, num_frames: Current size of the dataset.
+        new_episodes: Episodes added by this export.
         skipped_failures: Failed episodes that were left out.
-        skipped_unknown: Episodes that were left out since their recordings end before the outcome.
-        skipped_unwanted: Recordings that `episodes` and `corrected_only` left out.
-        transcoded: Cameras whose images had to be encoded anew, with the reason.
-        left_out: Features that the dataset appended to does not have.
-        depth_left_out: Depth cameras of external episodes that were not asked for.
-        silent: Recordings of external episodes whose language was asked for, but whose source states no subtask.
-        verified_frames: Frames that were compared through LeRobot; 0 when not asked for, or without LeRobot.
-        not_verified: Why LeRobot did not verify what was asked for, as a sentence, or "".
-        digest: Of the content, as `dataset_digest`.
-        url: Where it was uploaded to, or "".
+        skipped_unknown: Episodes left out because their recordings have no outcome.
+        skipped_unwanted: Recordings left out by `episodes` and `corrected_only`.
+        transcoded: Cameras with re-encoded images, and the reason.
+        left_out: Features missing from the dataset that was appended to.
+        depth_left_out: Depth cameras of external episodes that were not requested.
+        silent: Recordings of external episodes with requested language, but without subtasks in the source.
+        verified_frames: Frames compared through LeRobot; 0 if not requested, or without LeRobot.
+        not_verified: Reason why LeRobot did not verify the dataset although requested, as a sentence, or "".
+        digest: Content digest, as in `dataset_digest`.
+        url: Upload URL, or "".
     """
 
     path: Path
@@ -96,10 +100,10 @@ class ExportReport:
 
 
 def parse_episodes(text: str) -> Callable[[int], bool]:
-    """A test of episode numbers from "0:100", "::2", "7" and commas between them; "" takes all.
+    """Parse "0:100", "::2", "7" and comma-separated lists into a test of episode numbers; "" accepts all.
 
     Raises:
-        OptionError: Something else.
+        OptionError: Invalid text.
     """
     parts: list[range] = []
     for part in text.split(",") if text.strip() else []:
@@ -120,15 +124,15 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
 
 @dataclass(frozen=True, kw_only=True)
 class Exporter[O: CommonOptions]:
-    """A format that recordings are exported to.
+    """A format for exporting recordings.
 
-    Its module is loaded for `--help`, so what is heavy is imported when `export` is called.
+    Its module is loaded for `--help`, so heavy imports wait until `export` is called.
 
     Attributes:
-        summary: What comes out, in one line.
-        options: Its flags; a dataclass with a docstring below each field.
-        function: "module:name" of (sources, out, options, progress) -> report. It reads recordings and nothing else,
-            takes those that `demorec.datasets.sources` finds, and makes `out` whole or not at all. Raises ConfigError,
+        summary: Result in one line.
+        options: Its flags; a dataclass with a docstring for each field.
+        function: "module:name" of (sources, out, options, progress) -> report. It reads only recordings, those that
+        `demorec.datasets.sources` finds, and writes `out` atomically. Raises ConfigError,
             ExportError and RecordingError.
     """
 
@@ -137,7 +141,7 @@ class Exporter[O: CommonOptions]:
     function: str
 
     def export(self, sources: Sequence[Path], out: Path, options: O, progress: ProgressCallback | None) -> ExportReport:
-        """Call it."""
+        """Run the export."""
         module, _, name = self.function.partition(":")
         report: ExportReport = getattr(importlib.import_module(module), name)(sources, out, options, progress)
         return report

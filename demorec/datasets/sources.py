@@ -53,7 +53,7 @@ def is_wanted(recording: Recording, options: CommonOptions) -> bool:
 def goes_in(recording: Recording, options: CommonOptions) -> bool:
     """Whether a recording of a wanted episode is exported, rather than left out as a failed attempt.
 
-    An episode of unknown success is not a failure, and a recording in a folder `failed` always is.
+    An episode with unknown success is not a failure; a recording in a folder `failed` always is.
     """
     return options.include_failures or not (recording.has_failed or recording.path.parent.name == "failed")
 
@@ -61,28 +61,28 @@ def goes_in(recording: Recording, options: CommonOptions) -> bool:
 def places_of(files: Sequence[Path]) -> list[Path]:
     """Return the paths that an export must not overwrite: the recordings, and a run's folders of recordings.
 
-    A dataset next to these folders, such as that of the run, may be replaced.
+    A dataset next to these folders, such as the run's own, may be replaced.
     """
     folders = dict.fromkeys(file.absolute().parent for file in files)
     return [*(folder for folder in folders if folder.name in ("episodes", "failed")), *files]
 
 
 def _attempt_order(file: Path) -> tuple[str, bool, str]:
-    """Sort key that puts the failed attempts at an episode before the one that succeeded."""
+    """Sort key that puts failed attempts at an episode before the successful one."""
     episode, _, attempt = file.stem.partition(".")
     return episode, not attempt, attempt
 
 
 class Intake:
-    """The recordings of one export: which take part, and how many are left out.
+    """The recordings of one export: selected ones, and counts of those left out.
 
     Args:
         found: All recordings of the export.
         options: Options of the export.
-        traits_of: Returns what a recording must have in common with the others (`ExportEpisode.traits`).
+        traits_of: Returns the properties that all recordings must share (`ExportEpisode.traits`).
 
     Attributes:
-        num_taken: Number of recordings that take part.
+        num_taken: Number of selected recordings.
         skipped_failures: Number of failed attempts left out.
         skipped_unknown: Number of recordings left out that end before their outcome.
     """
@@ -97,7 +97,7 @@ class Intake:
         self._first: tuple[Mapping[str, str], Path] | None = None
 
     def take(self, path: Path, traits: Mapping[str, str]) -> None:
-        """Count a recording that takes part.
+        """Count a selected recording.
 
         Raises:
             ConfigError: Its traits differ from those of the first one.
@@ -109,7 +109,7 @@ class Intake:
         self.num_taken += 1
 
     def leave_out(self, outcome: Outcome | None) -> None:
-        """Count a failed attempt, or one of unknown outcome, that only counts for the success rate."""
+        """Count a failed attempt, or one with unknown outcome, for the success rate only."""
         if outcome is None:
             self.skipped_unknown += 1
         else:
@@ -121,18 +121,18 @@ class Intake:
         return len(self._found) - self.num_taken - self.skipped_failures - self.skipped_unknown
 
     def nothing_to_export(self) -> ConfigError:
-        """Return the error for an export in which no recording takes part."""
+        """Return the error for an export without selected recordings."""
         corrected = " or were not corrected" if self._options.corrected_only else ""
         return ConfigError(
-            f"Nothing to export. Recordings: {len(self._found)}, of failed attempts: {self.skipped_failures}, "
-            f"of unknown outcome: {self.skipped_unknown} (--include-failures takes both); the others are not among "
-            f"the wanted --episodes{corrected}."
+            f"Nothing to export. Recordings: {len(self._found)}, failed attempts: {self.skipped_failures}, "
+            f"unknown outcome: {self.skipped_unknown} (--include-failures selects both); the others are not in "
+            f"--episodes{corrected}."
         )
 
     def _refuse_differences(self, traits: Mapping[str, str], reference: Path) -> None:
-        """Raise ConfigError with every difference between the reference and the other recordings that take part.
+        """Raise ConfigError with every difference between the reference and the other selected recordings.
 
-        All headers are read for it, so it is called only when one is known to differ.
+        Reads all headers, so it is called only when a difference is known to exist.
         """
         files_by_difference: dict[str, list[str]] = {}
         for file in self._found:
@@ -147,6 +147,6 @@ class Intake:
                 f"{difference} ({listed(files, 3, ', ')})" for difference, files in files_by_difference.items()
             )
             raise ConfigError(
-                f"These recordings do not go into one dataset with {reference.name}: {differences}. "
+                f"These recordings do not fit into one dataset with {reference.name}: {differences}. "
                 "Export them separately."
             )

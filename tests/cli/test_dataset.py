@@ -126,7 +126,7 @@ def test_a_mistake_is_named_with_what_to_do(
 def test_a_column_that_is_not_as_info_json_says_ends_an_edit(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit_json(cups / "meta/info.json", lambda info: info["features"]["action"].update(shape=[2]))
     assert exit_code("dataset", "shuffle", "cups", "--out", "new") == 1
-    assert "The column action of what would be episode 0 is not as meta/info.json says" in capsys.readouterr().err
+    assert "The column action of the new episode 0 does not match meta/info.json" in capsys.readouterr().err
     assert not (cups.parent / "new").exists()
 
 

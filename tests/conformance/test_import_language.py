@@ -59,7 +59,7 @@ def rows_of(dataset: Path) -> list[dict[str, Any]]:
 
 @pytest.mark.parametrize(
     ("change", "expected"),
-    [({"style": "memory"}, "all but its subtasks"), ({"content": "a\nb"}, "a subtask is no single line")],
+    [({"style": "memory"}, "all but its subtasks"), ({"content": "a\nb"}, "a subtask is not a single line")],
 )
 def test_what_else_a_dataset_says_is_left_out(
     change: dict[str, str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -150,7 +150,7 @@ def test_all_kinds_are_as_much_as_is_known(tmp_path: Path) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     export(tmp_path / "run", tmp_path / "all", language=())
     assert {entry["style"] for row in rows_of(tmp_path / "all") for entry in row["language_persistent"]} == {"subtask"}
-    with pytest.raises(ConfigError, match="only the subtasks are known"):
+    with pytest.raises(ConfigError, match="has only the subtasks"):
         export(tmp_path / "run", tmp_path / "plans", language=("subtask", "plan"))
 
 
@@ -179,7 +179,7 @@ def test_where_nobody_says_anything_none_is_invented(tmp_path: Path, capsys: pyt
     capsys.readouterr()
     assert exit_code(*words, "--no-verify") == 2
     err = capsys.readouterr().err
-    assert "no source of them states a subtask" in err
+    assert "no source specifies subtasks" in err
     assert err.count("\n") == 1
     assert not (tmp_path / "dataset").exists()
 

@@ -226,7 +226,7 @@ def test_what_cannot_be_in_motor_units_is_refused(
 ) -> None:
     panda = simulate(tmp_path / "panda.mcap", seed=11)
     assert exit_code("export", "lerobot", panda, "--motor-units", "degrees", "--out", tmp_path / "a") != 0
-    assert "not those of panda: leave --motor-units out" in " ".join(capsys.readouterr().err.split())
+    assert "not for those of panda: leave out --motor-units" in " ".join(capsys.readouterr().err.split())
     wrong = ("--motor-units", "degrees", "--action", "ee")
     assert exit_code("export", "lerobot", run, *wrong, "--out", tmp_path / "b") != 0
     assert not (tmp_path / "a").exists()

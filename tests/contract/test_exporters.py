@@ -86,7 +86,7 @@ def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tm
     recover(tmp_path / "cut.mcap.part", sources[1])
     report = export(sources, tmp_path / "d", exporter)
     assert (report.num_episodes, report.skipped_failures, report.skipped_unknown) == (1, 0, 1)
-    with pytest.raises(ConfigError, match="of failed attempts: 0, of unknown outcome: 1"):
+    with pytest.raises(ConfigError, match="failed attempts: 0, unknown outcome: 1"):
         export(sources[1:], tmp_path / "e", exporter)
 
 
@@ -151,7 +151,7 @@ def test_a_refused_export_leaves_nothing(
 
 def test_recordings_that_differ_are_refused(exporter: str, run: Path, tmp_path: Path) -> None:
     other = make_run(tmp_path / "other", (4,), video=VideoConfig(), width=48)
-    with pytest.raises(ConfigError, match=r"do not go into one dataset.*48x48 instead of 64x48"):
+    with pytest.raises(ConfigError, match=r"do not fit into one dataset.*48x48 instead of 64x48"):
         export([run, other], tmp_path / "d", exporter)
     assert [path.name for path in tmp_path.iterdir()] == ["other"]
 

@@ -175,7 +175,7 @@ def test_append_refuses_what_does_not_fit_and_says_all(run: Path, tmp_path: Path
     with pytest.raises(ConfigError) as error:
         export(run, out, append=True, fps=15)
     text = str(error.value)
-    assert "fps is 30, the recordings give 15" in text
+    assert "fps is 30, the recordings have 15" in text
     assert "observation.environment_state" in text
     assert "tcp.x" in text
     assert files_of(out) == before
@@ -262,7 +262,7 @@ def test_append_refuses_episodes_that_are_there_already(run: Path, tmp_path: Pat
         shutil.copy(path, copies / f"other_{number}.mcap")
     with pytest.raises(ConfigError, match="has 2 of these episodes already") as error:
         export(copies, out, append=True)
-    assert "other_0.mcap (episode 1 of it), other_1.mcap (episode 2 of it)" in str(error.value)
+    assert "other_0.mcap (its episode 1), other_1.mcap (its episode 2)" in str(error.value)
     assert "--allow-duplicates" in str(error.value)
     assert files_of(out) == before
     assert export(copies, out, append=True, allow_duplicates=True).num_episodes == 6

@@ -72,7 +72,7 @@ def test_a_missing_image_is_an_error_unless_the_last_may_be_held(tmp_path: Path)
     gap = [replace(frame, images={}) if index in (7, 8) else frame for index, frame in enumerate(episode.frames)]
     run = run_of(tmp_path / "run", replace(episode, frames=gap))
     age = episode.frames[8].time_ns - episode.images["top"][6][0]
-    with pytest.raises(ExportError, match="Frame 7 has no image of the camera top, as 2 of 30 frames"):
+    with pytest.raises(ExportError, match="Frame 7 has no image of the camera top, like 2 of 30 frames"):
         export(run, tmp_path / "d")
     with pytest.raises(ExportError, match="Frame 8"):
         export(run, tmp_path / "d", hold_images=(age - 10**6) / 1e9)
@@ -126,10 +126,10 @@ def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        ({"action": "ee"}, "exported as they came"),
-        ({"privileged": True}, "privileged is asked for"),
-        ({"intervention": True}, "intervention is asked for"),
-        ({"depth": True}, "depth is asked for"),
+        ({"action": "ee"}, "exported unchanged"),
+        ({"privileged": True}, "privileged needs the scene"),
+        ({"intervention": True}, "intervention needs the scene"),
+        ({"depth": True}, "depth needs recordings"),
         ({"fps": 10}, "was recorded at 30"),
         ({"features": ("observation.forse",)}, "Unknown feature 'observation.forse'.*observation.force"),
     ],

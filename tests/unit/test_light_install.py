@@ -55,7 +55,7 @@ def test_an_export_says_that_nothing_was_verified(
 ) -> None:
     assert exit_code("export", "lerobot", run, "--out", tmp_path / "d") == 0
     out = capsys.readouterr().out
-    assert f"Not verified: LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'." in out
+    assert f"Not verified: LeRobot, which verifies the dataset, is not installed: pip install '{LEROBOT}'." in out
     assert "Verified:" not in out
 
 

@@ -111,8 +111,8 @@ def reading(
 ) -> Iterator[tuple[Path, ...]]:
     """Yield the paths to read instead of the given ones; inside the context, all output names the user's paths.
 
-    Imported files (`demorec.runs.foreign`) are read through a temporary run. No output names that run:
-    its episodes are called "demo.hdf5: episode 3".
+    Imported files (`demorec.runs.foreign`) are read through a temporary run. No output names that run: its episodes are
+    printed as "demo.hdf5: episode 3".
 
     Args:
         paths: The user's paths.

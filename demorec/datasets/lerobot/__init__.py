@@ -1,1 +1,1 @@
-"""LeRobot v3.0: recordings to datasets, and datasets read, whoever wrote them."""
+"""LeRobot v3.0: export of recordings, and reading of datasets from any writer."""

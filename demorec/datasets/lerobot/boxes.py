@@ -1,4 +1,4 @@
-"""COCO annotations of a dataset's images, one JSON file for each camera, written as the episodes come."""
+"""COCO annotations of a dataset's images, one JSON file per camera, written while episodes are added."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 
 BOXES_DIR = f"{SIDECAR_DIR}/boxes"
 SeenByCamera = tuple[int, int, tuple[BoxEntry, ...]]
-"""Width and height of a camera's images in an episode, px, and what is seen in them, row by row."""
+"""Width and height of a camera's images in an episode, px, and visible objects row by row."""
 Box = tuple[int, str, tuple[float, float, float, float]]
 """Frame, name of the body, (x, y, width, height) px."""
 
@@ -36,10 +36,10 @@ def _box_errors(path: Path) -> Iterator[None]:
 
 
 class StoredBoxes:
-    """A file of ours by episode, read in one pass for where its lines are; ExportError when it is missing, or none.
+    """A boxes file of demorec by episode, indexed by line in one pass; ExportError if it is missing or invalid.
 
     Args:
-        starts: First row over the dataset of each episode.
+        starts: First row of each episode over the dataset.
     """
 
     def __init__(self, path: Path, starts: Sequence[int]) -> None:
@@ -71,7 +71,7 @@ class StoredBoxes:
         return bisect_right(self._starts, index) - 1
 
     def read(self, episode: int, first: int, last: int) -> SeenByCamera | None:
-        """Those of the frames from `first` to before `last`; None for an episode whose boxes nobody made."""
+        """Read the boxes of frames `first` to `last` - 1; None for an episode without boxes."""
         if episode not in self._sizes:
             return None
         (width, height), start = self._sizes[episode], self._starts[episode] + first
@@ -98,7 +98,7 @@ class StoredBoxes:
 
 
 class BoxWriter(Closing):
-    """Context manager; `finish` completes the files in a dataset's folder."""
+    """Context manager; `finish` completes the files in the dataset's folder."""
 
     def __init__(self, root: Path, *, fps: int) -> None:
         self._root, self._fps = root, fps
@@ -106,12 +106,12 @@ class BoxWriter(Closing):
         self._num_frames = 0
 
     def close(self) -> None:
-        """Let go of the files."""
+        """Close the files."""
         for camera in self._cameras.values():
             camera.close()
 
     def add(self, episode_index: int, boxes: Mapping[str, SeenByCamera], num_frames: int) -> None:
-        """What the cameras (features) see in the next episode."""
+        """Add the visible objects of the next episode by camera (feature)."""
         for key, seen in boxes.items():
             if key not in self._cameras:
                 self._cameras[key] = _CameraFile(self._root / BOXES_DIR / f"{key}.json", key, self._fps)
@@ -125,7 +125,7 @@ class BoxWriter(Closing):
 
 
 class _CameraFile:
-    """One COCO file; the images' descriptions wait in a file beside it, since they come at the same time."""
+    """One COCO file; the images' descriptions wait in a second file, because both arrive at the same time."""
 
     def __init__(self, path: Path, key: str, fps: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)

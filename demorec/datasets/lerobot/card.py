@@ -1,6 +1,6 @@
-"""The dataset card: README.md, as the Hugging Face Hub shows it.
+"""The dataset card: README.md, shown by the Hugging Face Hub.
 
-It is written from the finished dataset, so it covers appended episodes too.
+It is written from the finished dataset, so it also covers appended episodes.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from demorec.episode.features import (
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""
 _OWN_LICENCE = "apache-2.0"
-"""Licence of what demorec simulated, unless the user names another one."""
+"""Licence of data that demorec simulated, unless the user names another one."""
 _MEANING = {
     **dict.fromkeys(AUTOMATIC_FEATURES, "filled in by LeRobot's rules"),
     "timestamp": "seconds since the episode's start",
@@ -90,14 +90,14 @@ _RECORDED_SIDECAR = (
 
 @dataclass(frozen=True, kw_only=True)
 class _Provenance:
-    """The parts of a card that depend on where the episodes come from.
+    """The parts of a card that depend on the source of the episodes.
 
     Attributes:
         demonstration: Start of the summary: "demonstration{plural} of {robot}", to be formatted.
-        origin: What demorec did.
-        packets: What the video packets are, unless images were transcoded.
-        licence: Licence unless the user names one, None if unknown.
-        tags: Tags besides those of every card.
+        origin: demorec's role.
+        packets: Source of the video packets, unless images were transcoded.
+        licence: Licence unless the user names one; None if unknown.
+        tags: Tags in addition to those of every card.
         rows: Meaning of row t.
         sidecar: Content of the sidecar.
     """
@@ -133,10 +133,10 @@ _RECORDED = _Provenance(
 
 @dataclass(frozen=True, kw_only=True)
 class CardContent:
-    """What a card says beyond what the tables of the dataset hold.
+    """Content of a card beyond the dataset's tables.
 
     Attributes:
-        options: Of the export.
+        options: Options of the export.
         meanings: Feature -> its description in the recordings.
         is_transcoded: Whether any images were transcoded.
     """

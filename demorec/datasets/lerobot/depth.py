@@ -1,8 +1,8 @@
-"""Depth images as LeRobot 0.6 has them: 12-bit logarithmic codes in lossless HEVC.
+"""Depth images in LeRobot 0.6's form: 12-bit logarithmic codes in lossless HEVC.
 
-The code of a distance z (metres) is rint(4095 (ln(z + s) - ln(a + s)) / (ln(b + s) - ln(a + s))) with a = 0.01 m,
-b = 10 m and s = 3.5 m: steps of 1.2 mm near the camera, 4.4 mm at the far end. Where nothing was hit the code is 0,
-which reads as 0.01 m, closer than any camera sees.
+A distance z (metres) has the code rint(4095 (ln(z + s) - ln(a + s)) / (ln(b + s) - ln(a + s))) with a = 0.01 m, b = 10
+m and s = 3.5 m: steps of 1.2 mm near the camera, 4.4 mm at the far end. Pixels without a hit have code 0, which decodes
+to 0.01 m, closer than any camera measures.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ _PARAMETERS = "lossless=1"
 
 
 def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
-    """(H, W) codes of distances in metres; in float32 arithmetic, to the code as LeRobot's `quantize_depth`.
+    """(H, W) codes of distances in metres; float32 arithmetic, so that codes equal those of LeRobot's `quantize_depth`.
 
-    What is not finite, or behind the camera, was not measured, and has code 0.
+    Values that are not finite, or behind the camera, count as not measured and get code 0.
     """
     shift = np.float32(_SHIFT)
     low = math.log(float(np.float32(_NEAREST) + shift))
@@ -47,7 +47,7 @@ def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
 
 @dataclass(frozen=True, kw_only=True)
 class DepthScale:
-    """What codes stand for, by the metadata of a depth feature: metres, and whether steps grow with the distance."""
+    """Mapping from codes to metres by a depth feature's metadata, linear or logarithmic."""
 
     nearest: float = _NEAREST
     farthest: float = _FARTHEST
@@ -56,18 +56,18 @@ class DepthScale:
 
     @classmethod
     def of(cls, info: Mapping[str, Any]) -> DepthScale:
-        """From the `info` of a feature, whoever wrote it; ValueError for what is no scale."""
+        """Read the scale from a feature's `info`, by any writer; ValueError if it is invalid."""
         numbers = [info.get(f"video.{name}") for name in ("depth_min", "depth_max", "shift")]
         use_log = info.get("video.use_log")
         if not isinstance(use_log, bool) or not all(_is_number(number) for number in numbers):
             raise ValueError(f"its scale of depth is {reprlib.repr([*numbers, use_log])}")
         nearest, farthest, shift = (float(number) for number in numbers if number is not None)
         if not nearest < farthest or (use_log and not nearest + shift > 0):
-            raise ValueError(f"its depth is from {nearest} to {farthest} m, shifted by {shift}")
+            raise ValueError(f"its depth range is {nearest} to {farthest} m, shifted by {shift}")
         return cls(nearest=nearest, farthest=farthest, shift=shift, use_log=use_log)
 
     def values(self) -> Array:
-        """(4096,) distance in metres that each code stands for."""
+        """(4096,) distance in metres of each code."""
         codes = np.arange(LARGEST_CODE + 1)
         if not self.use_log:
             return np.asarray(self.nearest + codes * ((self.farthest - self.nearest) / LARGEST_CODE))
@@ -75,7 +75,7 @@ class DepthScale:
         return np.asarray(np.exp(low + codes * ((high - low) / LARGEST_CODE)) - self.shift)
 
     def shown(self) -> NDArray[np.float32]:
-        """(4096,) the same for people's eyes: 0, nothing measured, for the lowest code."""
+        """(4096,) the same for display: 0, nothing measured, for the lowest code."""
         return np.concatenate([[0], self.values()[1:]]).astype(np.float32)
 
 
@@ -84,7 +84,7 @@ def _is_number(value: object) -> bool:
 
 
 def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[EncodedVideo, PixelHistogram]:
-    """Code depth images (H, W) in metres; also count their codes for the statistics."""
+    """Encode depth images (H, W) in metres; also count their codes for the statistics."""
     context: av.VideoCodecContext | None = None
     packets: list[av.Packet] = []
     counts = np.zeros(LARGEST_CODE + 1, dtype=np.int64)
@@ -100,7 +100,7 @@ def depth_video(images: Iterable[NDArray[np.float32]], *, fps: int) -> tuple[Enc
         frame.pts, frame.time_base = number - 1, context.time_base
         packets += context.encode(frame)
     if context is None:
-        raise ExportError("There are no depth images to encode.")
+        raise ExportError("No depth images to encode.")
     packets += context.encode(None)
     data = [bytes(packet) for packet in packets]
     video = EncodedVideo.of_access_units("hevc", width, height, b"".join(data), [len(unit) for unit in data])
@@ -114,8 +114,8 @@ def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
         context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
         context.width, context.height, context.pix_fmt = width, height, "gray12le"
         context.time_base, context.framerate = Fraction(1, fps), Fraction(fps, 1)
-        # No reordering and nothing printed; keyframes that stand alone. One thread and no note of the encoder's
-        # settings in the stream: both depend on the machine, and the same images shall give the same bytes anywhere.
+        # No reordering and no log output; every keyframe is independent. One thread and no encoder settings in the
+        # stream: both depend on the machine, and equal images must give equal bytes on every machine.
         context.options = {
             "g": str(_GOP),
             "crf": str(_CRF),
@@ -131,7 +131,7 @@ def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
 
 
 def depth_info(*, width: int, height: int, fps: int) -> dict[str, Any]:
-    """The `info` of a depth feature, from which LeRobot turns codes back into distances."""
+    """The `info` of a depth feature, from which LeRobot decodes distances."""
     return {
         "video.height": height,
         "video.width": width,

@@ -1,4 +1,4 @@
-"""What the tables of a dataset record of each episode: values to choose and sort episodes by, and statistics."""
+"""Per-episode values in a dataset's tables: for selecting and sorting episodes, and statistics."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from demorec.datasets.lerobot.stats import NAMES
 OLD_STATS = "meta/episodes_stats.jsonl"
 """Statistics of each episode before v3.0."""
 _SIDECAR = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
-"""Columns of the sidecar that episodes can be chosen by."""
+"""Columns of the sidecar for selecting episodes."""
 
 
 def episode_columns(folder: LeRobotFolder) -> list[dict[str, Any]]:
-    """Read what episodes are chosen and sorted by: name -> value, for each episode in order."""
+    """Read the values for selecting and sorting: name -> value, for each episode in order."""
     found = [
         {
             "episode_index": place.episode_index,
@@ -54,7 +54,7 @@ def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
 
 
 def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
-    """Yield (episode_index, feature, its statistics as LeRobot writes them) where a table has all ten."""
+    """Yield (episode_index, feature, its statistics in LeRobot's form) for entries with all ten values."""
     if folder.info.is_old:
         path = folder.root / OLD_STATS
         for line in read_json_lines(path) if path.exists() else ():

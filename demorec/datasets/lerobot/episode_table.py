@@ -27,9 +27,9 @@ from demorec.datasets.lerobot.layout import (
 TIME_TOLERANCE_S = 1e-4
 """Maximum distance of a row's timestamp from the grid, as in LeRobot."""
 _MAX_VALUE = 1 << 40
-"""Above all rows, frames and seconds of any dataset."""
+"""Exceeds the rows, frames and seconds of any dataset."""
 _MAX_TASK_GAPS = 100_000
-"""Numbers up to the largest one that no task has, in tables of which tasks were removed."""
+"""Maximum number of task numbers without a task, for tables from which tasks were removed."""
 _VIDEO_COLUMNS = ("chunk_index", "file_index", "from_timestamp")
 """Columns that locate the images of an episode, for each camera."""
 
@@ -46,10 +46,10 @@ class EpisodePlace:
     """Where the rows and images of an episode are stored.
 
     Attributes:
-        episode_index, length, tasks: As in the episodes' table.
+        episode_index, length, tasks: Same as in the episodes' table.
         data: File of its rows.
-        first_row: Of its rows in that file.
-        from_index: Of its first row over the whole dataset.
+        first_row: Index of its first row in that file.
+        from_index: Index of its first row in the whole dataset.
         videos: Camera feature -> (mp4 file, first image in it).
     """
 
@@ -63,7 +63,7 @@ class EpisodePlace:
 
 
 def has_episode_table(root: Path, info: DatasetInfo) -> bool:
-    """Whether the dataset has a table of episodes, which recordings that were never finalized lack."""
+    """Whether the dataset has a table of episodes; recordings that were never finalized lack it."""
     return (root / OLD_EPISODES_PATH).exists() if info.is_old else bool(tables_in(root, "meta/episodes"))
 
 
@@ -106,7 +106,7 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
 
 
 def elsewhere(root: Path, path: Path, key: str) -> Path | None:
-    """Find the only file of this name, and of a camera in a folder of its name, where info.json names other folders."""
+    """Find the only file with this name, for a camera in a folder with its name, if info.json names other folders."""
     found = [other for other in root.rglob(path.name) if not key or key in other.relative_to(root).parts]
     if len(found) > 1:
         found = [other for other in found if other.parent.name == path.parent.name]

@@ -1,6 +1,6 @@
-"""Going on in a dataset that is there already, whoever wrote it: what must fit, and where to continue.
+"""Continuing an existing dataset from any writer: compatibility checks and the starting position.
 
-Files that are there are never opened for writing; new episodes get new files, as with LeRobot's own `resume`.
+Existing files are never opened for writing; new episodes get new files, as with LeRobot's own `resume`.
 """
 
 from __future__ import annotations
@@ -31,21 +31,23 @@ from demorec.datasets.lerobot.writer import DatasetStart
 
 
 def start_after(folder: LeRobotFolder) -> DatasetStart:
-    """Read what a writer needs to go on in a dataset.
+    """Read the state that a writer needs to continue a dataset.
 
     Raises:
-        ExportError: It is not of this format, or not whole.
+        ExportError: It has another format, or is incomplete.
     """
     root, info = folder.root, folder.info
     if info.is_old:
         raise ExportError(
-            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} is appended to. This writes it as "
-            f"{CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
+            f"The dataset has format {info.version}, and only {CODEBASE_VERSION} can be appended to. This converts it "
+            f"to {CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
         )
     episodes, frames = len(folder.places), sum(place.length for place in folder.places)
     rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
     if rows != frames:
-        raise ExportError(f"The dataset is not whole: its episodes have {frames} frames, its data files {rows}: {root}")
+        raise ExportError(
+            f"The dataset is incomplete: its episodes have {frames} frames, its data files {rows}: {root}"
+        )
     try:
         tasks = tuple(folder.tasks) if info.total_tasks else ()
         found = folder.statistics if (root / STATS_PATH).exists() else {}
@@ -55,57 +57,57 @@ def start_after(folder: LeRobotFolder) -> DatasetStart:
             raise ValueError(f"{CONFIGS_PATH} holds no configurations")
     except (OSError, ValueError, TypeError, AttributeError) as error:
         raise ExportError(f"The dataset cannot be read ({describe_error(error)}): {root}") from error
-    info = replace(info, total_episodes=episodes, total_frames=frames)  # other writers have some as 30.0
+    info = replace(info, total_episodes=episodes, total_frames=frames)  # other writers store some as 30.0
     return DatasetStart(info=info, facts=folder.fact_types, tasks=tasks, statistics=statistics, configs=configs)
 
 
 def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
-    """Of a camera, as stats.json has them; ValueError and the like when it has something else."""
+    """Statistics of a camera in stats.json's form; ValueError and the like for an invalid entry."""
     part = Statistics.from_json(found.get(key, {}))
     if part is None:
         return None
     if any(value.shape != info.features[key].shape[-1:] for value in part.values.values()) or part.count < 0:
-        raise ValueError(f"the statistics of {key} are none of its images")
-    # LeRobot's streaming writer counts pixels; as a weight beside ours a frame must count as one.
+        raise ValueError(f"the statistics of {key} do not match its images")
+    # LeRobot's streaming writer counts pixels; for merging, a frame must count as one.
     return Statistics(values=part.values, count=min(part.count, info.total_frames), is_camera=True)
 
 
 def features_to_append(root: Path, info: DatasetInfo, new: DatasetInfo) -> tuple[str, ...]:
-    """Check that recordings can give every feature of a dataset; return those that it does not have.
+    """Check that recordings provide every feature of a dataset; return their features that it lacks.
 
     Args:
         root, info: The existing dataset.
-        new: A dataset of the recordings alone.
+        new: A dataset made from the recordings alone.
 
     Raises:
-        ConfigError: All differences in one message.
+        ConfigError: Lists all differences.
     """
     offered = new.features
     wrong = []
     if info.fps != new.fps:
-        wrong.append(f"fps is {info.fps}, the recordings give {new.fps}")
+        wrong.append(f"fps is {info.fps}, the recordings have {new.fps}")
     if info.robot_type not in (None, new.robot_type):
         wrong.append(f"robot_type is {info.robot_type!r}, the recordings have {new.robot_type!r}")
     for name, feature in info.features.items():
         if name in AUTOMATIC_FEATURES:
             continue
         if name not in offered:
-            wrong.append(f"it has {name!r}, which the recordings and these options do not give")
+            wrong.append(f"it has {name!r}, which the recordings and these options do not provide")
         else:
             found = feature.differences(offered[name])
             wrong += [f"{name}: {what} is {there}, not {ours}" for what, there, ours in found]
     if wrong:
         raise ConfigError(
-            f"These recordings cannot be appended, since the dataset differs: {'; '.join(wrong)}. "
+            f"These recordings cannot be appended, because the dataset differs: {'; '.join(wrong)}. "
             f"Export into a new folder, or with other options: {root}"
         )
     return tuple(name for name in offered if name not in info.features)
 
 
 def link_files(source: Path, target: Path) -> None:
-    """Let the finished tables and videos of a dataset appear in another folder, without copying where possible.
+    """Link a dataset's finished tables and videos into another folder, or copy them if links are not possible.
 
-    Only files that are never changed in place are linked; what the writer will write anew is left out.
+    Only files that are never changed in place are linked; files that the writer replaces are left out.
     """
     renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH}
     for folder, _, names in os.walk(source):

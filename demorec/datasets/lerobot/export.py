@@ -46,7 +46,7 @@ _STATED_OPTIONS = (
 def export_lerobot(
     sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None = None
 ) -> ExportReport:
-    """Write the recordings into the dataset folder `out`, completely or not at all.
+    """Write the recordings to the dataset folder `out`, completely or not at all.
 
     Args:
         sources: Recordings, runs, or folders of recordings.
@@ -56,7 +56,7 @@ def export_lerobot(
 
     Raises:
         ConfigError: Options that contradict each other or ask for data that was not recorded, nothing to export,
-            recordings that differ, something in the way at `out`, or episodes to be appended that the dataset has.
+        recordings that differ, an existing `out`, or episodes to append that the dataset already has.
         ExportError: A full disk, a failed verification. `out` is unchanged.
         RecordingError: A recording is damaged.
     """
@@ -73,11 +73,11 @@ def export_lerobot(
         if existing is not None:
             link_files(out, folder)
         elif options.overwrite and has_own_card(out) and (out / CARD_PATH).is_file():
-            shutil.copy2(out / CARD_PATH, folder / CARD_PATH)  # a card that a user edited is kept
+            shutil.copy2(out / CARD_PATH, folder / CARD_PATH)  # keep a card that a user edited
         report = export.run(folder, progress)
         if verifier is not None:
             report = replace(report, verified_frames=verifier.verify(folder, export.samples(), options))
-    why = f"LeRobot, which would verify the dataset, is not installed: pip install '{LEROBOT}'."
+    why = f"LeRobot, which verifies the dataset, is not installed: pip install '{LEROBOT}'."
     report = replace(report, path=out, not_verified=why if options.verify and not verifies else "")
     if options.push_to_hub:
         report = replace(report, url=push_to_hub(out, options.repo_id, private=not options.public))
@@ -85,11 +85,11 @@ def export_lerobot(
 
 
 _ENCODED = ".encoded"
-"""Folder next to the new one for images of the export's processes."""
+"""Folder next to the new one for the worker processes' images."""
 
 
 class _Export:
-    """One export of recordings, into a new dataset or to the end of an existing one."""
+    """One export of recordings, to a new dataset or to the end of an existing one."""
 
     def __init__(self, found: list[Path], options: ExportOptions, existing: LeRobotFolder | None) -> None:
         self._found = found
@@ -104,11 +104,11 @@ class _Export:
         self._intake = Intake(found, options, lambda recording: export_episode(recording, options).traits())
 
     def run(self, folder: Path, progress: ProgressCallback | None) -> ExportReport:
-        """Write all recordings into an empty folder, or one with links to the files of the existing dataset."""
-        aside = folder.with_name(_ENCODED)  # removed with everything next to the new folder
+        """Write all recordings to an empty folder, or to one with links to the existing dataset's files."""
+        aside = folder.with_name(_ENCODED)  # removed with all files next to the new folder
         aside.mkdir(exist_ok=True)
         found = self._noted(_read_recordings(self._found, self._options, progress, folder=aside))
-        begun: list[ReadRecording] = []  # up to the first episode, which decides what features there are
+        begun: list[ReadRecording] = []  # until the first episode, which decides the features
         first = None
         while first is None:
             if (recording := next(found, None)) is None:
@@ -147,7 +147,7 @@ class _Export:
         return [(len(self._before) + index, paths[index]) for index in chosen]
 
     def _start(self, first: ExportedEpisode) -> DatasetStart:
-        """Return the state of the folder before the first new episode."""
+        """Return the dataset before the first new episode."""
         existing, start = self._existing, self._begin
         if existing is None or start is None:
             return DatasetStart(info=first.info, facts=fact_types(first.data.facts), configs={})
@@ -155,13 +155,13 @@ class _Export:
         has_progress = set(STAGE_COLUMNS) <= set(start.facts)
         if has_progress != self._options.progress:
             raise ConfigError(
-                f"These recordings cannot be appended, since the dataset {'has' if has_progress else 'lacks'} the "
+                f"These recordings cannot be appended, because the dataset {'has' if has_progress else 'lacks'} the "
                 f"stages of --progress: export {'with' if has_progress else 'without'} it: {existing.root}"
             )
         return start
 
     def _noted(self, found: Iterable[ReadRecording]) -> Iterator[ReadRecording]:
-        """Count each recording, and hold it against the others, before it is written."""
+        """Count each recording, and compare it with the others, before it is written."""
         for recording in found:
             if recording.episode is None:
                 self._intake.leave_out(recording.outcome)
@@ -179,22 +179,22 @@ class _Export:
         self._transcoded.update(dict.fromkeys(episode.transcoded))
 
     def _refuse_duplicates(self) -> None:
-        """Raise ConfigError if new episodes have the content of episodes that are in the dataset already."""
+        """Raise ConfigError if the dataset already contains new episodes, by their content."""
         there = {digest: number for number, digest in enumerate(self._before)}
         known = {path: there[digest] for path, digest in self._digests.items() if digest in there}
-        twice = [f"{path.name} (episode {number} of it)" for path, number in known.items()]
+        twice = [f"{path.name} (its episode {number})" for path, number in known.items()]
         if twice and not self._options.allow_duplicates:
             raise ConfigError(
                 f"The dataset has {len(twice)} of these episodes already: {shown(twice)}. Leave them out with "
-                "--episodes, or give --allow-duplicates to have them twice."
+                "--episodes, or use --allow-duplicates to add them again."
             )
 
     def _refuse_silence(self) -> None:
-        """Raise ConfigError if language is asked for and a new dataset would have no statement at all."""
+        """Raise ConfigError if language is requested and a new dataset would have no statements."""
         if self._existing is None and self._options.language is not None and len(self._silent) == len(self._digests):
             raise ConfigError(
-                "Language is asked for, but nothing is known to say of these episodes, and no source of them states a "
-                "subtask (in the mapping of an import, [subtasks] names the topic of it): leave --language out."
+                "These episodes have no language, since no source specifies subtasks "
+                "(in the mapping of an import, [subtasks] names their topic): leave --language out."
             )
 
     def _about_this_export(self) -> dict[str, Any]:
@@ -203,14 +203,14 @@ class _Export:
 
 
 def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
-    """Upload the folder as a dataset repository, tagged with the format's version as LeRobot expects it.
+    """Upload the folder as a dataset repository, with the tag of the format's version that LeRobot expects.
 
     Returns:
-        Its address.
+        URL of the repository.
 
     Raises:
-        ExportError: No token, no network, no right to write there; the folder stays as it is.
-        MissingDependencyError: The Hub's client, which comes with LeRobot, is not installed.
+        ExportError: No token, no network, or no write permission; the folder is unchanged.
+        MissingDependencyError: The Hub's client, part of LeRobot's dependencies, is not installed.
     """
     try:
         from huggingface_hub import HfApi, get_token
@@ -233,7 +233,7 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
             commit_message="Upload dataset",
         )
         hub.create_tag(repo_id, tag=CODEBASE_VERSION, repo_type="dataset", exist_ok=True)
-    except Exception as error:  # the hub's client raises errors of several HTTP libraries
+    except Exception as error:  # the Hub's client raises errors of several HTTP libraries
         raise ExportError(
             f"The dataset was not uploaded to {repo_id} ({describe_error(error)}); it is kept: {folder}"
         ) from error
@@ -241,21 +241,21 @@ def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
 
 
 _BYTES_THAT_PAY = 1 << 30
-"""Size of the recordings from which starting processes saves time (benchmarks/export.py)."""
+"""Minimum size of the recordings for which several processes save time (benchmarks/export.py)."""
 _AHEAD = 3
-"""Maximum number of recordings that each process is ahead of the writer; bounds the memory."""
+"""Maximum number of recordings that each process may be ahead of the writer, to limit memory."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ReadRecording:
-    """A recording that was read for a dataset.
+    """A recording read for a dataset.
 
     Attributes:
         path: Path of the recording.
         attempt: Row of the table of attempts.
-        outcome: Recorded outcome; None if the recording ends before it.
-        episode: The episode; None for a failed attempt that is left out. Nothing else is read of such an attempt, so
-            its faults do not stop the export.
+        outcome: Recorded outcome; None if the recording has none.
+        episode: The episode; None for a failed attempt to leave out. Only the metadata of such an attempt is read, so
+        its faults do not stop the export.
     """
 
     path: Path
@@ -265,13 +265,13 @@ class ReadRecording:
 
 
 def _read(path: Path, options: ExportOptions, folder: Path | None) -> ReadRecording | None:
-    """Read one recording; None if its episode is not wanted (`is_wanted`).
+    """Read one recording; None if its episode is not selected (`is_wanted`).
 
     Args:
         folder: Folder for files with the images; None keeps them in memory.
 
     Raises:
-        ConfigError: Options that the recording cannot serve.
+        ConfigError: Options that the recording does not support.
         RecordingError: The recording is damaged.
         ExportError: It has no frames, or frames without images.
     """
@@ -290,10 +290,10 @@ def _read(path: Path, options: ExportOptions, folder: Path | None) -> ReadRecord
 def _read_recordings(
     sources: Sequence[Path], options: ExportOptions, progress: ProgressCallback | None, *, folder: Path
 ) -> Iterator[ReadRecording]:
-    """Yield every wanted recording in order.
+    """Yield every selected recording in order.
 
-    Several processes read ahead where that saves time. They leave the images in `folder`, since sending them through a
-    pipe takes as long as the rest.
+    Several processes read ahead if that saves time. They store the images in `folder`, because sending them through a
+    pipe takes as long as the rest of the work.
     """
     workers = options.workers or _workers_that_pay(sources, options)
     one = partial(_read, options=options, folder=None if workers == 1 else folder)

@@ -1,13 +1,13 @@
-"""Facts about each episode where LeRobot looks for them: columns to filter by, progress and stages.
+"""Facts about each episode in LeRobot's places: columns to filter by, progress and stages.
 
 Facts are columns of the table that LeRobot filters episodes by (`episode_filter`). The first episode decides which
-columns exist, since all files of the table must have the same ones; an episode that lacks a value has null there.
-Progress and stages are:
+columns exist, because all files of the table must share them; an episode without a value has null. Progress and stages
+are:
 
-- `sarm_progress.parquet`: `progress_dense` of every row of the dataset, which
-  `lerobot-train --sample_weighting.type=rabc --sample_weighting.head_mode=dense` weighs samples by;
+- `sarm_progress.parquet`: `progress_dense` for every row of the dataset, by which `lerobot-train
+--sample_weighting.type=rabc --sample_weighting.head_mode=dense` weights samples;
 - columns `dense_subtask_names`, `dense_subtask_start_frames` and `dense_subtask_end_frames` in the table of episodes,
-  which SARM is trained with;
+for training SARM;
 - `meta/temporal_proportions_dense.json`: the stages' mean shares of the time.
 """
 
@@ -108,12 +108,12 @@ _LEROBOT_COLUMN = re.compile(
 
 
 def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
-    """Return column of a fact -> type; a fact that is not listed is a number."""
+    """Return fact column -> type; facts that are not listed are numbers."""
     return {name: _TYPES.get(name, pa.float64()) for name in names}
 
 
 def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
-    """Return column of the table of episodes, in these files, beyond LeRobot's own -> type.
+    """Return column -> type for columns of the table of episodes beyond LeRobot's own.
 
     Raises:
         ExportError: The table is damaged.
@@ -147,7 +147,7 @@ def episode_facts(recording: Recording) -> dict[str, Any]:
 
 
 def _first_goal(scene: Scene) -> dict[str, Any]:
-    """Return the first object to be moved, its position and that of its goal at the start (m, world frame)."""
+    """Return the first object to be moved, its position and its goal's position at the start (m, world frame)."""
     if not scene.goals:
         return {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
     goal = scene.goals[0]
@@ -178,7 +178,7 @@ def _drawn(simulation: Simulation) -> Mapping[str, float]:
 
 
 def _nearest_to_limit(checks: Iterable[SuccessCheck]) -> dict[str, float]:
-    """Return condition -> measured value; for several objects, the one that failed or is nearest to failing."""
+    """Return condition -> measured value; with several objects, the one that failed or is closest to failing."""
     worst: dict[str, SuccessCheck] = {}
     for check in checks:
         name = check.name.partition(":")[0]

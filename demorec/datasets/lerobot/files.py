@@ -1,4 +1,4 @@
-"""JSON files and Parquet tables of a dataset that anyone may have written."""
+"""JSON files and Parquet tables of a dataset from any writer."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from demorec.core.files import open_regular, read_text_limited
 from demorec.core.plain import parse_json
 
 MAX_JSON_BYTES = 32 << 20
-"""Of info.json, stats.json and the like; ours have some ten kB."""
+"""Maximum size of info.json, stats.json and the like; demorec's have tens of kB."""
 _BATCH_BYTES = 32 << 20
-"""Size of rows that are read at once, by the table's footer."""
+"""Size of the rows read at once, according to the table's footer."""
 _ROWS_AT_ONCE = 64
 _MAX_OPEN_TABLES = 16
 
 
 def leave_pandas_out() -> None:
-    """Let PyArrow work without pandas in this process.
+    """Make PyArrow work without pandas in this process.
 
-    It would load it, which takes longer than most edits, to ask whether the lists that it is given are pandas' own.
+    PyArrow would import pandas, which takes longer than most edits, to check whether given lists are pandas objects.
     """
     finder = _NoPandas()
     sys.meta_path.insert(0, finder)
-    pa.array([0])  # looks for it once, and remembers
+    pa.array([0])  # checks for pandas once and caches the result
     sys.meta_path.remove(finder)
 
 
@@ -44,46 +44,46 @@ class _NoPandas(MetaPathFinder):
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a new text file, and make its folder."""
+    """Write a new text file, and create its folder."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(text)
 
 
 def read_json(path: Path) -> Any:
-    """The content of a JSON file of a dataset; NaN, which other writers leave in statistics, is taken.
+    """Read a JSON file of a dataset; accepts NaN, which other writers leave in statistics.
 
     Raises:
-        OSError: It is missing, no regular file, or very large.
-        ValueError: It is no JSON, or nested very deeply.
+        OSError: It is missing, not a regular file, or very large.
+        ValueError: It is not JSON, or nested too deeply.
     """
     return parse_json(read_text_limited(path, MAX_JSON_BYTES), allow_nan=True)
 
 
 def read_json_lines(path: Path) -> list[dict[str, Any]]:
-    """The objects of a file with one in each line; ExportError when it cannot be read, or holds anything else."""
+    """Read the objects of a JSON Lines file; ExportError if it cannot be read, or a line is not an object."""
     try:
         lines = read_text_limited(path, MAX_JSON_BYTES).splitlines()
         found = [parse_json(line, allow_nan=True) for line in lines if line.strip()]
         if not all(isinstance(line, dict) for line in found):
-            raise ValueError("a line is no object")
+            raise ValueError("a line is not an object")
     except (OSError, ValueError) as error:
         raise ExportError(f"The table cannot be read ({describe_error(error)}): {path}") from error
     return found
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
-    """A Parquet file that has these columns, for what its footer says; its rows are read by `TableReader` alone.
+    """Open a Parquet file with these columns for its footer; only `TableReader` reads its rows.
 
     Raises:
-        ExportError: It is missing, no regular file, no Parquet, or lacks a column.
+        ExportError: It is missing, not a regular file, not Parquet, or lacks a column.
     """
     with _table_errors(path):
         open_regular(path).close()
-        table = pq.ParquetFile(path, pre_buffer=False)  # which would hold the whole file in memory
+        table = pq.ParquetFile(path, pre_buffer=False)  # buffering would hold the whole file in memory
         num_rows = table.metadata.num_rows
         groups = [table.metadata.row_group(number).num_rows for number in range(table.metadata.num_row_groups)]
         if min(groups, default=0) < 0 or sum(groups) != num_rows:
-            raise ValueError(f"its parts have {sum(groups):,} rows, it says {num_rows:,}")
+            raise ValueError(f"its row groups have {sum(groups):,} rows, its footer {num_rows:,}")
     missing = set(columns or ()) - set(table.schema_arrow.names)
     if missing:
         raise ExportError(f"The table has no column {', '.join(sorted(missing))}: {path}")
@@ -91,14 +91,14 @@ def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFi
 
 
 def tables_in(root: Path, place: str) -> list[Path]:
-    """The numbered tables of one kind, in order: those of a dataset's folder "data", "meta/episodes" or another one."""
+    """List the numbered tables of one kind, in order: in a dataset's folder "data", "meta/episodes" or another one."""
     return sorted(root.glob(f"{place}/*/*.parquet"))
 
 
 def rows_in(
     root: Path, place: str, columns: Sequence[str], *, schema: pa.Schema | None = None
 ) -> Iterator[dict[str, Any]]:
-    """All rows of such tables; arguments and errors as of `read_table`."""
+    """Yield all rows of such tables; arguments and errors as in `read_table`."""
     for path in tables_in(root, place):
         yield from read_table(path, columns, schema=schema).to_pylist()
 
@@ -106,21 +106,21 @@ def rows_in(
 def table_batches(
     path: Path, columns: Sequence[str] | None = None, *, rows: int = _ROWS_AT_ONCE
 ) -> Iterator[pa.RecordBatch]:
-    """All rows of some columns of a table, some at a time; arguments and errors as of `TableReader`."""
+    """Yield all rows of some columns of a table, in batches; arguments and errors as in `TableReader`."""
     yield from TableReader(columns, rows=rows).read(path)
 
 
 class TableReader:
-    """Rows of tables by number: the only way by which rows of a dataset are read. One batch of a table is in memory.
+    """Rows of tables by number; all rows of datasets are read by this class. One batch of a table is in memory.
 
-    Rows that are asked for in rising order are read in one pass; before others, row groups are skipped.
+    Rows requested in ascending order are read in one pass; row groups before the requested rows are skipped.
 
     Args:
-        columns: Names that every table has; None for all.
-        optional: Names that are read where a table has them.
-        rows: Maximum number of rows in a batch; fewer where they may be large.
+        columns: Names that every table must have; None for all.
+        optional: Names that are read if a table has them.
+        rows: Maximum number of rows in a batch; fewer if they may be large.
 
-    Methods raise ExportError as `open_table`.
+    Methods raise ExportError as in `open_table`.
     """
 
     def __init__(
@@ -134,7 +134,7 @@ class TableReader:
         return self._table(path).num_rows
 
     def read(self, path: Path, first: int = 0, count: int | None = None) -> Iterator[pa.RecordBatch]:
-        """Yield `count` rows from `first` on, all by default; fewer where the table ends before."""
+        """Yield `count` rows from row `first`, by default all; fewer if the table ends earlier."""
         return self._table(path).read(first, count)
 
     def _table(self, path: Path) -> _OpenTable:
@@ -163,7 +163,7 @@ class _OpenTable:
         self.rest()
 
     def rest(self) -> None:
-        """Let go of the batch that is in memory."""
+        """Free the batch in memory."""
         self._batches: Iterator[pa.RecordBatch] = iter(())
         self._held: pa.RecordBatch | None = None
         self._next = self.num_rows + 1
@@ -195,15 +195,15 @@ class _OpenTable:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:
-    """Some columns, or all, of a table.
+    """Read some columns of a table, or all.
 
     Args:
         path: The file.
         columns: Names; None for all.
-        schema: Of which types the columns must be.
+        schema: Required types of the columns.
 
     Raises:
-        ExportError: As `open_table`, or a column has another type.
+        ExportError: As in `open_table`, or a column has another type.
     """
     found = open_table(path, columns).schema_arrow
     for name in columns or ():
@@ -215,7 +215,7 @@ def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.S
 
 
 def column_numbers(column: pa.Array) -> NDArray[Any]:
-    """(T, D) numbers of a data column, D = 1 for a scalar one; those of arrays of several dimensions row by row."""
+    """(T, D) numbers of a data column, D = 1 for a scalar one; multi-dimensional arrays are flattened row by row."""
     flat = plain_column(column)
     if not pa.types.is_list(flat.type) and not pa.types.is_fixed_size_list(flat.type):
         return _numbers(flat).reshape(-1, 1)
@@ -225,7 +225,9 @@ def column_numbers(column: pa.Array) -> NDArray[Any]:
 
 
 def _numbers(flat: pa.Array) -> NDArray[Any]:
-    """Of a plain column. PyArrow's own `to_numpy` would load pandas first, which takes a quarter of a second."""
+    """Numbers of a flat column. PyArrow's own `to_numpy` would first import pandas, which takes a quarter of a
+    second.
+    """
     if not flat.null_count and (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
         return np.from_dlpack(flat)
     if not flat.null_count and pa.types.is_boolean(flat.type):
@@ -235,7 +237,9 @@ def _numbers(flat: pa.Array) -> NDArray[Any]:
 
 
 def _elements(lists: pa.Array) -> pa.Array:
-    """Of all lists, one after the other; as `flatten`, which would load pyarrow.compute where no list is missing."""
+    """Concatenate the elements of all lists, like `flatten`, which would import pyarrow.compute when no list is
+    missing.
+    """
     if lists.null_count or not len(lists):
         return lists.flatten()
     if pa.types.is_list(lists.type):
@@ -246,13 +250,13 @@ def _elements(lists: pa.Array) -> pa.Array:
 
 
 def plain_column(column: pa.Array) -> pa.Array:
-    """A column as lists, where HF datasets, once it is loaded, makes it one of its own types of arrays."""
+    """Convert a column to lists; HF datasets, once imported, gives it one of its own array types."""
     return column.storage if isinstance(column, pa.ExtensionArray) else column
 
 
 @contextmanager
 def _table_errors(path: Path) -> Iterator[None]:
-    """Turn what PyArrow raises into an ExportError; lack of memory says nothing about the table."""
+    """Turn PyArrow's errors into an ExportError; lack of memory implies nothing about the table."""
     try:
         yield
     except (OSError, ValueError, IndexError, KeyError, MemoryError, pa.ArrowException) as error:
@@ -261,7 +265,7 @@ def _table_errors(path: Path) -> Iterator[None]:
 
 
 def _row_bytes(metadata: pq.FileMetaData, columns: Sequence[str] | None) -> int:
-    """Mean size of a row of some columns, bytes, at least 1."""
+    """Mean size of a row in some columns, bytes, at least 1."""
     beginnings = tuple(f"{name}." for name in columns or ())
     num_bytes = 0
     for group in (metadata.row_group(number) for number in range(metadata.num_row_groups)):

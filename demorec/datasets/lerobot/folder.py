@@ -1,4 +1,4 @@
-"""A LeRobot dataset of format v2.0 to v3.0, whoever wrote it.
+"""A LeRobot dataset of format v2.0 to v3.0 from any writer.
 
     folder = LeRobotFolder(root)
     rows = folder.rows(["observation.state", "action"])
@@ -6,7 +6,7 @@
         rows.numbers(place)["action"]
         folder.video("observation.images.front", place).images()
 
-Files are opened when something of them is asked for, so that a missing or damaged one spoils only its episodes.
+Files are opened on demand, so that a missing or damaged one affects only its episodes.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from demorec.datasets.lerobot.row_episodes import REPAIR, places_by_rows, reloca
 from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, IndexedRows
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
-# What reads videos, images, robots and the sidecar takes longer to load than to read the numbers of most datasets.
+# Code for videos, images, robots and the sidecar takes longer to load than most datasets' numbers to read.
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.boxes import StoredBoxes
     from demorec.datasets.lerobot.robots import DatasetRobot
@@ -41,33 +41,33 @@ if TYPE_CHECKING:
     from demorec.robots.motors import Motors
 
 _MAX_LISTED = 50
-"""Episodes that a sentence names."""
+"""Maximum episodes listed in a sentence."""
 _MAX_OPEN_VIDEOS = 16
-"""Video files of which the index is kept: that of 15 minutes takes one MB."""
+"""Maximum video files with a cached index; an index of 15 minutes takes 1 MB."""
 _BY_ROWS = f"they were found by the episode_index of the rows ({REPAIR} writes the table again)."
 _KNOWN = ("source", "success", "failure_reason", "root_seed", "cameras", "robot_digest")
-"""Columns of the sidecar that recordings of other robots can hold; the rest is of simulated episodes alone."""
+"""Columns of the sidecar that external recordings can hold; the rest is for simulated episodes only."""
 
 
 class LeRobotFolder:
     """An open dataset.
 
     Args:
-        root: Its folder.
-        motors: The servos whose values its state and actions are, if the user says so.
+        root: The dataset's folder.
+        motors: Servos whose values are its state and action, if the user names them.
         named: Features whose role the user names.
-        info: What meta/info.json should say, instead of what it says.
+        info: Replaces the content of meta/info.json.
 
     Attributes:
         root, motors: As given.
         info: The content of meta/info.json.
-        own_counters: Columns that prove whose rows are read, where the files have them.
-        keeps_timestamps: Whether edits keep the timestamps that are not multiples of 1/fps.
+        own_counters: Columns that verify the episode of a row, if the files have them.
+        keeps_timestamps: Whether edits keep timestamps that are not multiples of 1/fps.
         keeps_statistics: Whether edits keep the stored statistics of images.
 
     Raises:
-        ConfigError: The dataset has no state of these servos.
-        ExportError: info.json is missing or damaged. Methods and properties raise it where other files are.
+        ConfigError: The dataset has no state from these servos.
+        ExportError: info.json is missing or damaged. Methods and properties raise it for other unreadable files.
     """
 
     def __init__(
@@ -106,17 +106,17 @@ class LeRobotFolder:
 
     @cached_property
     def listed(self) -> tuple[EpisodePlace, ...]:
-        """The episodes of the episodes' table, or found by the rows where it is missing or names other files."""
+        """Episodes in the episodes' table, or located by the rows if it is missing or names other files."""
         return self._listed_and_problem[0]
 
     @property
     def is_found_by_rows(self) -> bool:
-        """Whether the table of episodes is missing or wrong, and the episodes were found by their rows."""
+        """Whether the table of episodes is missing or wrong, so that the episodes were located by their rows."""
         return self._listed_and_problem[1] != ""
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what the dataset lacks and was found by the rows; none if they cannot be read."""
+        """Sentences about missing parts that the rows replace; empty if the rows cannot be read."""
         problem = ""
         with suppress(ExportError):
             problem = self._listed_and_problem[1]
@@ -128,7 +128,7 @@ class LeRobotFolder:
     def _listed_and_problem(self) -> tuple[tuple[EpisodePlace, ...], str]:
         if has_episode_table(self.root, self.info):
             listed = tuple(read_episode_table(self.root, self.info))
-            with suppress(ExportError):  # a file that cannot be read is an error of its own episodes
+            with suppress(ExportError):  # an unreadable file is reported for its own episodes
                 if not self.info.is_old and (found := relocated(self.root, listed)) is not None:
                     moved = sum(a.data != b.data for a, b in zip(listed, found, strict=True))
                     return found, f"The table of episodes names wrong data files for {moved} of them: {_BY_ROWS}"
@@ -138,20 +138,20 @@ class LeRobotFolder:
 
     @property
     def missing(self) -> str:
-        """In how many episodes info.json and the episodes' table differ, as a sentence; "" if in none."""
+        """Difference between info.json and the episodes' table, as a sentence; "" if they agree."""
         counted = int(self.info.total_episodes), int(self.info.total_frames)
         listed = len(self.listed), sum(place.length for place in self.listed)
         if counted == listed:
             return ""
         return (
-            f"The dataset is not whole: {INFO_PATH} counts {counted[0]} episodes of {counted[1]} frames, its table of "
+            f"The dataset is incomplete: {INFO_PATH} counts {counted[0]} episodes of {counted[1]} frames, its table of "
             f"episodes has {listed[0]} of {listed[1]}. Complete the recording or the download, or let {REPAIR} keep "
-            f"what is whole: {self.root}"
+            f"the intact part: {self.root}"
         )
 
     @cached_property
     def places(self) -> tuple[EpisodePlace, ...]:
-        """All episodes, in order. Raises ExportError if there are more or fewer than info.json counts."""
+        """All episodes, in order. Raises ExportError if their number differs from info.json."""
         if missing := self.missing:
             raise ExportError(missing)
         return self.listed
@@ -163,7 +163,7 @@ class LeRobotFolder:
 
     @cached_property
     def statistics(self) -> Mapping[str, Any]:
-        """The content of meta/stats.json, an object for each feature."""
+        """Content of meta/stats.json, an object for each feature."""
         path = self.root / STATS_PATH
         try:
             found = read_json(path)
@@ -175,7 +175,7 @@ class LeRobotFolder:
 
     @cached_property
     def num_rows(self) -> Mapping[Path, int]:
-        """Data file -> number of rows that its episodes have."""
+        """Data file -> number of its episodes' rows."""
         found: dict[Path, int] = {}
         for place in self.listed:
             found[place.data] = found.get(place.data, 0) + place.length
@@ -193,7 +193,7 @@ class LeRobotFolder:
         )
 
     def _only_task_number(self, place: EpisodePlace) -> int:
-        """Number of the only task of an episode whose rows do not name one."""
+        """Number of an episode's only task, if its rows do not contain one."""
         if len(place.tasks) != 1 or place.tasks[0] not in self.tasks:
             raise ExportError(
                 f"The rows of episode {place.episode_index} have no task_index, and it has {len(place.tasks)} tasks in "
@@ -234,7 +234,7 @@ class LeRobotFolder:
 
     @cached_property
     def stored_images(self) -> Mapping[str, StoredImages]:
-        """Feature -> its images, of those whose images are stored in the data files."""
+        """Feature -> its images, for features stored in the data files."""
         from demorec.datasets.lerobot.stored_images import StoredImages
 
         keys = [name for name, feature in self.info.features.items() if feature.dtype == "image"]
@@ -245,12 +245,12 @@ class LeRobotFolder:
         return tables_in(self.root, f"{SIDECAR_DIR}/{table}")
 
     def sidecar_rows(self, table: str, episode_index: int) -> list[dict[str, Any]]:
-        """Read all that a table of the sidecar has of an episode."""
+        """Read all rows of an episode in a table of the sidecar."""
         found = IndexedRows(self.sidecar_tables(table), rows=64).read(episode_index)
         return [] if found is None else found.to_pylist()
 
     def sidecar(self, names: Sequence[str]) -> list[dict[str, Any]]:
-        """Read columns of the sidecar's row of every episode, None where a table lacks one; empty without a sidecar."""
+        """Read columns of the sidecar's row of every episode, None if a table lacks one; empty without a sidecar."""
         tables = self.sidecar_tables("episodes")
         if not tables:
             return []
@@ -293,16 +293,16 @@ class LeRobotFolder:
 
     @cached_property
     def known(self) -> Mapping[int, dict[str, Any]]:
-        """Episode index -> what the sidecar knows of it, as far as any recording can hold it."""
+        """Episode index -> the sidecar's data about it that recordings can hold."""
         return {row["episode_index"]: row for row in self.sidecar(_KNOWN)}
 
     @cached_property
     def has_one_robot(self) -> bool:
-        """Whether the sidecar describes the same robot for all episodes, or none for any."""
+        """Whether the sidecar describes the same robot for all episodes, or none at all."""
         return len({self.known.get(place.episode_index, {}).get("robot_digest") for place in self.places}) <= 1
 
     def robot(self, digest: str) -> DatasetRobot:
-        """Read the arm that episodes name by this digest."""
+        """Read the arm with this digest."""
         from demorec.datasets.lerobot.robots import read_robot
 
         if digest not in self._robots:
@@ -311,7 +311,7 @@ class LeRobotFolder:
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
-        """The numbers that its recordings have."""
+        """Numeric features of its recordings."""
         from demorec.datasets.lerobot.recorded_features import recorded_feature, why_not_recorded
 
         roles = self.roles.beyond_names()
@@ -322,19 +322,19 @@ class LeRobotFolder:
         )
 
     def leave_out_missing_cameras(self) -> tuple[str, ...]:
-        """Let no recording have the cameras of which no episode has its video, and return their features."""
+        """Exclude the cameras without a video in any episode from recordings; return their features."""
         videos = [key for key in self.keys.values() if self.info.features[key].is_video]
         found = tuple(key for key in videos if not any(place.videos[key][0].exists() for place in self.listed))
         self.keys = {name: key for name, key in self.keys.items() if key not in found}
         return found
 
     def leave_out(self, name: str) -> None:
-        """Let no recording have a feature."""
+        """Exclude a feature from recordings."""
         self.features = tuple(feature for feature in self.features if feature.name != name)
 
     @cached_property
     def keys(self) -> Mapping[str, str]:
-        """Camera, as its recordings name it -> feature. Raises ConfigError if two would get one name."""
+        """Camera name in recordings -> feature. Raises ConfigError if two cameras would get the same name."""
         from demorec.datasets.lerobot.recorded_features import camera_name, why_not_recorded
 
         found: dict[str, str] = {}
@@ -347,7 +347,7 @@ class LeRobotFolder:
         return found
 
     def camera(self, name: str) -> Camera:
-        """Describe a camera by its first file or image that can be read."""
+        """Describe a camera from its first readable file or image."""
         if name not in self._cameras:
             self._cameras[name] = self._described(name, self.keys[name])
         return self._cameras[name]

@@ -1,4 +1,4 @@
-"""What a dataset holds: attempts, what is missing, and the digest of its content recomputed from its files."""
+"""Inspection of a dataset: attempts, missing parts, and the content digest recomputed from its files."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from demorec.datasets.lerobot.mp4_index import check_video
 
 
 def attempt_counts(folder: LeRobotFolder) -> tuple[int, int] | None:
-    """Count (episodes that succeeded, attempts that were made); None in a dataset that demorec did not write.
+    """Count (successful episodes, attempts made); None for a dataset that demorec did not write.
 
     Raises:
         ExportError: Its tables are damaged.
@@ -28,7 +28,7 @@ def attempt_counts(folder: LeRobotFolder) -> tuple[int, int] | None:
 
 
 def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
-    """Feature -> units of its elements, as demorec keeps them in the sidecar; empty without one.
+    """Feature -> units of its elements, from the sidecar; empty without one.
 
     Raises:
         ExportError: The tables or the robot's description are damaged.
@@ -39,9 +39,9 @@ def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
 
 
 def dataset_problems(folder: LeRobotFolder) -> list[str]:
-    """List what is missing, empty or cut off, one sentence each; by the ends of the files, which is quick.
+    """List missing, empty and truncated files, one sentence each; reads only the ends of files, which is fast.
 
-    `demorec check` reads all their content.
+    `demorec check` reads their whole content.
     """
     problems: list[str] = []
     places: Sequence[EpisodePlace] = ()
@@ -66,8 +66,9 @@ def dataset_problems(folder: LeRobotFolder) -> list[str]:
 
 @contextmanager
 def noted(problems: list[str], root: Path) -> Iterator[None]:
-    """Turn an ExportError into one more problem, without the dataset's own path. Lack of memory is not a problem of
-    the dataset, and is raised."""
+    """Add an ExportError to the problems, without the dataset's own path. Lack of memory is not a problem of the
+    dataset and is raised.
+    """
     try:
         yield
     except ExportError as error:
@@ -77,15 +78,15 @@ def noted(problems: list[str], root: Path) -> Iterator[None]:
 
 
 def without_digest(info: DatasetInfo) -> list[str]:
-    """Features whose content has no digest: what is not video, numbers or text, that of language columns included."""
+    """Features without a content digest: all except video, numbers and text, including text in language columns."""
     return [name for name, feature in info.features.items() if feature.dtype == "image"]
 
 
 def check_tables(path: Path) -> None:
-    """Read the ends of all tables and the JSON files: whether any was emptied or cut off.
+    """Read the ends of all tables and the JSON files to detect empty or truncated ones.
 
     Raises:
-        ExportError: One was.
+        ExportError: A file is empty or truncated.
     """
     for file in sorted(path.rglob("*")):
         try:
@@ -98,7 +99,7 @@ def check_tables(path: Path) -> None:
 
 
 def dataset_digest(path: Path) -> str:
-    """SHA-256 (hex) of the content, read back from all files; `ExportReport.digest` of a new dataset is the same.
+    """SHA-256 (hex) of the content, read back from all files; equals `ExportReport.digest` of a new dataset.
 
     Raises:
         ExportError: The dataset is damaged.
@@ -108,22 +109,22 @@ def dataset_digest(path: Path) -> str:
 
 
 def episode_digests(folder: LeRobotFolder, numbers: Sequence[int] | None = None) -> list[str]:
-    """Compute the digest of some episodes, all by default, in order, read back from all files."""
+    """Compute the digests of some episodes, by default all, in order, from all files."""
     if unknown := without_digest(folder.info):
         raise ExportError(
-            f"The content of {', '.join(unknown)} has no digest, it is neither video nor numbers: {folder.root}"
+            f"The content of {', '.join(unknown)} has no digest, because it is neither video nor numbers: {folder.root}"
         )
     rows = folder.rows(folder.columns)
     found: list[str] = []
     for place in folder.places if numbers is None else [folder.listed[number] for number in numbers]:
         columns = rows.numbers(place)
         task_index = columns["task_index"][0, 0] if len(columns["task_index"]) else -1
-        if not 0 <= task_index < len(folder.tasks):  # NaN, which a null is read as, is neither
+        if not 0 <= task_index < len(folder.tasks):  # NaN, the value of a null, is neither
             raise ExportError(f"Episode {place.episode_index} has no task: {folder.root}")
         found.append(episode_digest(folder.tasks[int(task_index)], columns, video_digests(folder, place)))
     return found
 
 
 def video_digests(folder: LeRobotFolder, place: EpisodePlace) -> dict[str, str]:
-    """SHA-256 (hex) of the encoded images of each camera feature in an episode."""
+    """SHA-256 (hex) of an episode's encoded images for each camera feature."""
     return {key: folder.video(key, place).digest() for key in folder.info.video_keys}

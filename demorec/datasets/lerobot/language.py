@@ -1,8 +1,7 @@
-"""LeRobot's language columns: what an episode's statements look like in its tables, and their digests.
+"""LeRobot's language columns: an episode's statements in the form of its tables, and their digests.
 
-`language_persistent` has every statement of the episode in every row of it, each with the time from which it holds;
-`language_events` has those of one moment in the row of that moment. LeRobot's own types are in
-`lerobot/datasets/language.py`.
+`language_persistent` repeats every statement of the episode in each row, with its start time; `language_events` has the
+statements of one moment in that moment's row. LeRobot's own types are in `lerobot/datasets/language.py`.
 """
 
 from __future__ import annotations
@@ -36,22 +35,22 @@ _EVENT_FIELDS = (
 _EVENT = pa.struct(_EVENT_FIELDS)
 _STATE = pa.struct([*_EVENT_FIELDS[:3], pa.field("timestamp", pa.float32()), *_EVENT_FIELDS[3:]])
 TYPES: dict[str, pa.DataType] = {PERSISTENT: pa.list_(_STATE), EVENTS: pa.list_(_EVENT)}
-"""Column -> its type, as the package datasets reads LeRobot's own."""
+"""Column -> its type, as HF datasets reads LeRobot's own."""
 REPEATING = tuple(f"{name}.list.element.{item}" for name in COLUMNS for item in ("role", "content", "style", "camera"))
 REPEATING += (f"{PERSISTENT}.list.element.timestamp",)
-"""Parquet's names of the parts whose values come again and again."""
+"""Parquet names of the parts with repeating values."""
 
 _AT_ONCE = 16
-"""How many rows of an episode are made in one step."""
+"""Number of rows of an episode built in one step."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeLanguage:
-    """The language columns of one episode; entries as the columns have them, calls of tools as JSON.
+    """Language columns of one episode; entries in the columns' form, tool calls as JSON.
 
     Attributes:
-        persistent: What stands in every row; of one that was read, in the first.
-        events: Row -> what stands in it alone, of rows in which anything does.
+        persistent: Entries in every row; read from the first row.
+        events: Row -> entries of that row only, for rows that have any.
     """
 
     persistent: Sequence[dict[str, Any]] = ()
@@ -59,7 +58,7 @@ class EpisodeLanguage:
 
 
 def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLanguage:
-    """The statements in LeRobot's form; times are bit-exact those of the `timestamp` column."""
+    """Convert statements to LeRobot's form; times are bit-exact with the `timestamp` column."""
     persistent = [
         {
             "role": "user" if statement.kind == "task_aug" else "assistant",
@@ -75,7 +74,7 @@ def episode_language(statements: Sequence[Statement], *, fps: int) -> EpisodeLan
 
 
 def language_feature(name: str) -> dict[str, Any]:
-    """What the schema's metadata say of a language column, from which the package datasets takes its types."""
+    """Schema metadata of a language column, from which HF datasets takes its types."""
     text = {"dtype": "string", "_type": "Value"}
     row: dict[str, Any] = {"role": text, "content": text, "style": text}
     if name == PERSISTENT:
@@ -85,13 +84,13 @@ def language_feature(name: str) -> dict[str, Any]:
 
 
 def language_arrays(language: EpisodeLanguage, frames: int) -> dict[str, pa.Array]:
-    """Column -> array of so many rows."""
+    """Column -> array with `frames` rows."""
     counts = np.zeros(frames + 1, dtype=np.int32)
     for row, entries in language.events.items():
         counts[row + 1] = len(entries)
     said = [entry for _, entries in sorted(language.events.items()) for entry in entries]
     state = _structs(language.persistent, _STATE)
-    # In two steps, since each costs by the number of its parts; `take` costs three times as much.
+    # In two steps, because each costs by its number of parts; `take` costs three times as much.
     several = pa.concat_arrays([state] * _AT_ONCE)
     often = pa.concat_arrays([state[:0], *[several] * (frames // _AT_ONCE), *[state] * (frames % _AT_ONCE)])
     steps = pa.array(np.arange(frames + 1, dtype=np.int32) * np.int32(len(state)))
@@ -109,13 +108,13 @@ def _structs(found: Sequence[dict[str, Any]], kind: pa.StructType) -> pa.StructA
             arrays.append(pa.array(values, part.type))
         elif not any(values):
             arrays.append(pa.nulls(len(found), part.type))
-        else:  # pyarrow makes none of JSON from Python's lists
+        else:  # PyArrow does not build JSON from Python lists
             arrays.append(pa.array(values, pa.list_(pa.string())).cast(part.type))
     return pa.StructArray.from_arrays(arrays, fields=list(kind))
 
 
 def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArray[np.str_]]:
-    """Column -> (T, 1) SHA-256 (hex) of what stands in each row; equal to `column_digests` of the column read back."""
+    """Column -> (T, 1) SHA-256 (hex) of each row's content; equal to `column_digests` of the column read back."""
     state = _digest(language.persistent)
     events = np.full((frames, 1), _digest([]))
     for row, entries in language.events.items():
@@ -124,16 +123,16 @@ def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArra
 
 
 def is_language(kind: pa.DataType) -> bool:
-    """Whether a column of this type can hold statements; where none has any, LeRobot's tools write lists of nulls."""
+    """Whether a column of this type can hold statements; for empty columns, LeRobot's tools write lists of nulls."""
     listed = pa.types.is_list(kind) or pa.types.is_large_list(kind)
     return bool(listed) and bool(pa.types.is_struct(kind.value_type) or pa.types.is_null(kind.value_type))
 
 
 def column_digests(column: pa.Array) -> NDArray[np.str_]:
-    """(T, 1) SHA-256 (hex) of what stands in each row of a language column, whoever wrote it.
+    """(T, 1) SHA-256 (hex) of the content of each row of a language column, from any writer.
 
     Raises:
-        ValueError: It is no list of structures.
+        ValueError: It is not a list of structures.
     """
     if not is_language(column.type):
         raise ValueError(f"a language column of type {column.type}")
@@ -143,14 +142,14 @@ def column_digests(column: pa.Array) -> NDArray[np.str_]:
         rows = column[index].values
         if before is None or rows is None or not rows.equals(before):
             found.append(_digest([] if rows is None else rows.to_pylist()))
-        else:  # what holds for an episode stands in each of its rows
+        else:  # the persistent entries are the same in each row
             found.append(found[-1])
         before = rows
     return np.array(found, dtype="<U64").reshape(-1, 1)
 
 
 def _digest(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Of the entries that are there; an empty list of tool calls is as good as none, and JSON is what it says."""
+    """Digest of the entries present; an empty list of tool calls equals none, and JSON counts by its value."""
     known = [{name: value for name, value in row.items() if value is not None and value != []} for row in rows]
     for row in known:
         if "tool_calls" in row:
@@ -166,7 +165,7 @@ def _parsed(call: Any) -> Any:
 
 
 def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> EpisodeLanguage:
-    """The language of one episode, whoever wrote it, from its rows of both columns, in a dataset in the folder `path`.
+    """Language of one episode, from any writer, from its rows of both columns; `path` is the dataset's folder.
 
     Raises:
         ExportError: They cannot be read.
@@ -178,7 +177,7 @@ def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> EpisodeLanguage:
         for batch in batches:
             persistent, of_rows = (batch.column(name) for name in COLUMNS)
             if not is_language(persistent.type) or not is_language(of_rows.type):
-                raise ValueError("language columns of another type")
+                raise ValueError("language columns with another type")
             for row in range(len(batch)):
                 if not number:
                     said = persistent[row].as_py() or []

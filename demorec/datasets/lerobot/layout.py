@@ -1,9 +1,9 @@
-"""Where everything of a LeRobot dataset lies, how its schema is written down, and the digest of its content.
+"""Layout of a LeRobot dataset: paths, schema, and content digest.
 
-The digest is the same whatever the files' sizes, their compression or their number. An episode's covers its task, its
-numbers and the encoded images as they lie in the mp4 file; that of the dataset covers fps, robot, features and the
-episodes in order. Positions in the dataset (`index`, `episode_index`, `task_index`) are left out, so that an episode
-keeps its digest wherever it is put.
+The digest is independent of the files' sizes, compression and number. An episode's digest covers its task, its numbers
+and the encoded images as stored in the mp4 file; the dataset's covers fps, robot, features and the episodes in order.
+Positions in the dataset (`index`, `episode_index`, `task_index`) are excluded, so that an episode keeps its digest when
+it moves.
 """
 
 from __future__ import annotations
@@ -30,9 +30,11 @@ from demorec.episode.element_names import numbers, read_names
 from demorec.episode.roles import Column
 
 CODEBASE_VERSION = "v3.0"
-"""Of what is written."""
+"""Format version for writing."""
 OLD_VERSIONS = ("v2.0", "v2.1")
-"""Also read: a file of rows and of each camera for each episode, and tables as lines of JSON."""
+"""Further readable versions: one data file per episode, one video file per episode and camera, and tables as JSON
+Lines.
+"""
 MEBIBYTE = 2**20
 
 _CHUNK = "chunk-{chunk_index:03d}/file-{file_index:03d}"
@@ -62,12 +64,12 @@ _CODING = (
     "video.codec", "video.pix_fmt", "is_depth_map", "depth_unit", "video.depth_min", "video.depth_max", "video.shift",
     "video.use_log",
 )  # fmt: skip
-"""What a reader of the dataset takes as true of all its videos."""
+"""Properties that readers assume to be equal in all videos of the dataset."""
 _NUM_CHANNELS = (1, 3, 4)
 _MOST_DIMENSIONS = 5
-"""Of arrays that HF datasets has types for."""
+"""Maximum dimensions of arrays for which HF datasets has types."""
 _IMAGE = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
-"""A file of an image in a row, as HF datasets has it."""
+"""Image file in a row, in HF datasets' form."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -75,11 +77,11 @@ class DatasetFeature:
     """One entry of `features` in info.json.
 
     Attributes:
-        dtype: LeRobot's name of the type.
-        shape: Without the frame dimension; (1,) is a scalar column.
-        names: Names of a vector's elements, of a camera's dimensions; None where they are unknown.
-        info: Of cameras only: the `video.*` entries.
-        written_names: `names` as info.json has them, where that is no list of these names.
+        dtype: LeRobot's type name.
+        shape: Shape without the frame dimension; (1,) is a scalar column.
+        names: Names of a vector's elements or a camera's dimensions; None if unknown.
+        info: The `video.*` entries; cameras only.
+        written_names: `names` in info.json, if they are not a list of these names.
         other: Other keys of the entry.
     """
 
@@ -92,12 +94,12 @@ class DatasetFeature:
 
     @property
     def elements(self) -> tuple[str, ...]:
-        """Names of a vector's elements, their numbers where they have no names."""
+        """Names of a vector's elements, or their numbers if they have no names."""
         return self.names or numbers(self.shape[0])
 
     @property
     def column(self) -> Column:
-        """The feature as its role is found."""
+        """The feature in the form for finding roles."""
         is_vector = self.is_numeric and len(self.shape) == 1
         return Column(self.dtype, self.elements if is_vector else ())
 
@@ -108,7 +110,7 @@ class DatasetFeature:
 
     @property
     def is_numeric(self) -> bool:
-        """Whether its frames are numbers, which have statistics of their own."""
+        """Whether its frames are numeric, with separate statistics."""
         return self.dtype not in ("video", "image", "string", "language")
 
     @property
@@ -118,18 +120,20 @@ class DatasetFeature:
 
     @property
     def image_size(self) -> tuple[int, int]:
-        """(width, height) of a camera's images, also where the channels come first, as in v2."""
+        """(width, height) of a camera's images, also for v2's channels-first order."""
         is_channels_first = self.shape[0] in _NUM_CHANNELS and self.shape[-1] not in _NUM_CHANNELS
         height, width = self.shape[1:3] if is_channels_first else self.shape[:2]
         return width, height
 
     @property
     def is_depth(self) -> bool:
-        """Whether it is a camera whose pixels are distances."""
+        """Whether its frames are depth images."""
         return bool((self.info or {}).get("is_depth_map"))
 
     def differences(self, other: DatasetFeature) -> Iterator[tuple[str, Any, Any]]:
-        """In what rows of both cannot stand in one dataset: name, value, the other's value; unknown ones are equal."""
+        """Yield (name, value, other's value) for differences that prevent rows of both from being in one dataset;
+        unknown values count as equal.
+        """
         pairs = {name: (getattr(self, name), getattr(other, name)) for name in ("dtype", "shape")}
         if self.is_numeric and None not in (self.names, other.names):
             pairs["elements"] = tuple(", ".join(feature.names or ()) for feature in (self, other))  # type: ignore[assignment]
@@ -139,7 +143,7 @@ class DatasetFeature:
         yield from ((name, *values) for name, values in pairs.items() if values[0] != values[1])
 
     def to_json(self) -> dict[str, Any]:
-        """The entry as info.json has it."""
+        """The entry in info.json's form."""
         names = self.written_names
         if names is None and self.names is not None:
             names = list(self.names)
@@ -150,7 +154,7 @@ class DatasetFeature:
 
     @classmethod
     def from_json(cls, entry: dict[str, Any]) -> DatasetFeature:
-        """Inverse of `to_json`, for datasets written by anyone."""
+        """Inverse of `to_json`, for datasets from any writer."""
         shape, info = entry["shape"], entry.get("info")
         if not isinstance(entry["dtype"], str):
             raise ValueError("a feature without dtype")
@@ -159,7 +163,7 @@ class DatasetFeature:
         if entry["dtype"] == "video" and len(shape) != 3:
             raise ValueError(f"a video of shape {reprlib.repr(shape)}")
         if info is not None and not isinstance(info, dict):
-            raise ValueError("the info of a feature is no object")
+            raise ValueError("the info of a feature is not an object")
         written = entry.get("names")
         names = read_names(written, int(shape[0]) if len(shape) == 1 else len(shape))
         return cls(
@@ -177,20 +181,20 @@ AUTOMATIC_FEATURES: dict[str, DatasetFeature] = {
     "timestamp": DatasetFeature(dtype="float32", shape=(1,)),
     **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), DatasetFeature(dtype="int64", shape=(1,))),
 }
-"""Come last in every dataset, filled in by the writer."""
+"""Automatic features: last in every dataset, filled in by the writer."""
 LANGUAGE_FEATURE = DatasetFeature(dtype="language", shape=(1,))
-"""Of each of LeRobot's language columns."""
+"""Feature of each of LeRobot's language columns."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FilePosition:
-    """Which of the numbered files: chunk folder, then file within."""
+    """Position in the numbered files: chunk folder, then file in it."""
 
     chunk: int = 0
     file: int = 0
 
     def next(self, chunks_size: int) -> FilePosition:
-        """The file after this one; a chunk folder holds `chunks_size` files."""
+        """The next file; a chunk folder holds `chunks_size` files."""
         if self.file >= chunks_size - 1:
             return FilePosition(chunk=self.chunk + 1, file=0)
         return replace(self, file=self.file + 1)
@@ -202,16 +206,16 @@ class FilePosition:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetInfo:
-    """What meta/info.json says.
+    """Content of meta/info.json.
 
-    Templates of paths are those of v3.0: in an older dataset `file_index` is the number of the episode.
+    Path templates have v3.0's placeholders: in an older dataset `file_index` is the episode's number.
 
     Attributes:
-        features: All features; those that every dataset has are added where the file does not list them.
+        features: All features; standard ones are added if the file does not list them.
         other: Other entries of the file.
         version: Format of the dataset.
-        unlisted: The features that were added.
-        splits: Splits to write; None for one of all episodes.
+        unlisted: The added features.
+        splits: Splits to write; None for a single one with all episodes.
     """
 
     fps: int
@@ -232,7 +236,7 @@ class DatasetInfo:
 
     @property
     def is_old(self) -> bool:
-        """Whether it is of a format before v3.0."""
+        """Whether its format is older than v3.0."""
         return self.version in OLD_VERSIONS
 
     @property
@@ -256,28 +260,28 @@ class DatasetInfo:
 
     @classmethod
     def load(cls, root: Path) -> DatasetInfo:
-        """Read it from a dataset folder.
+        """Read it from a dataset's folder.
 
         Raises:
-            ExportError: No info.json, or of another version of the format.
+            ExportError: info.json is missing, or has another version of the format.
         """
         try:
             return cls.from_json(read_json(root / INFO_PATH), root)
         except OSError as error:
-            raise ExportError(f"No LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}") from error
+            raise ExportError(
+                f"Not a LeRobot dataset, {INFO_PATH} cannot be read ({error.strerror}): {root}"
+            ) from error
         except ValueError as error:
             raise ExportError(f"{INFO_PATH} of the dataset is damaged ({describe_error(error)}): {root}") from error
 
     @classmethod
     def from_json(cls, data: Any, root: Path) -> DatasetInfo:
-        """Take the content of the file apart, which is changed; errors as of `load`."""
+        """Parse the file's content, which is modified; errors as in `load`."""
         try:
             version = data.pop("codebase_version")
             if version not in (CODEBASE_VERSION, *OLD_VERSIONS):
                 found = f"The dataset has format {reprlib.repr(version).strip("'")}"
-                raise ExportError(
-                    f"{found}, those that are read are {', '.join(OLD_VERSIONS)} and {CODEBASE_VERSION}: {root}"
-                )
+                raise ExportError(f"{found}, supported are {', '.join(OLD_VERSIONS)} and {CODEBASE_VERSION}: {root}")
             data.pop("splits", None)
             features = {name: DatasetFeature.from_json(entry) for name, entry in data.pop("features").items()}
             unlisted = tuple(name for name in AUTOMATIC_FEATURES if name not in features)
@@ -292,7 +296,7 @@ class DatasetInfo:
         return info
 
     def _check(self) -> None:
-        """ValueError for values that no dataset can have."""
+        """Raise ValueError for impossible values."""
         for name in ("fps", "total_episodes", "total_frames", "total_tasks", "chunks_size"):
             if not _is_count(getattr(self, name), 0 if name.startswith("total") else 1, 1 << 40):
                 raise ValueError(f"{name} is {reprlib.repr(getattr(self, name))}")
@@ -310,23 +314,23 @@ class DatasetInfo:
 
 
 def _as_new(template: object) -> object:
-    """A template of paths with the placeholders of v3.0."""
+    """Convert a path template to v3.0's placeholders."""
     if not isinstance(template, str):
         return template
     return template.replace("{episode_chunk", "{chunk_index").replace("{episode_index", "{file_index")
 
 
 def _is_count(value: object, low: int, high: int) -> bool:
-    """A whole number from `low` to `high`; other writers have some as 30.0."""
+    """Whether a value is an integer from `low` to `high`; other writers store some as 30.0."""
     return (
         isinstance(value, int | float) and not isinstance(value, bool) and low <= value <= high and value == int(value)
     )
 
 
 def _check_template(template: object) -> None:
-    """ValueError unless a template of paths stays in the dataset and fills in what every dataset does."""
+    """Raise ValueError unless a path template stays inside the dataset and uses known placeholders."""
     if not isinstance(template, str) or not template.isprintable():
-        raise ValueError("a path that is no text")
+        raise ValueError("a path that is not text")
     parts = Path(template).parts
     if Path(template).is_absolute() or ".." in parts:
         raise ValueError(f"the path {template[:80]!r} leads out of the dataset")
@@ -346,7 +350,7 @@ _ENCODER_INFO = ("video.g", "video.crf", "video.preset", "video.fast_decode", "v
 
 
 def merged_video_info(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
-    """`a`, less the encoder settings in which `b` differs (null, as LeRobot does when it merges datasets)."""
+    """`a` without the encoder settings that differ in `b` (null, as when LeRobot merges datasets)."""
     unknown: dict[str, Any] = {"video.extra_options": {}}
     return {
         key: value if key not in _ENCODER_INFO or b.get(key) == value else unknown.get(key) for key, value in a.items()
@@ -354,7 +358,7 @@ def merged_video_info(a: dict[str, Any], b: dict[str, Any]) -> dict[str, Any]:
 
 
 def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
-    """Schema of the data files, with the metadata from which HF datasets takes its types."""
+    """Schema of the data files, with the metadata for HF datasets' types."""
     columns = {name: _column(name, feature) for name, feature in features.items() if not feature.is_video}
     described = {name: description for name, (_, description) in columns.items()}
     metadata = {"huggingface": json.dumps({"info": {"features": described}})}
@@ -362,7 +366,7 @@ def data_schema(features: dict[str, DatasetFeature]) -> pa.Schema:
 
 
 def _column(name: str, feature: DatasetFeature) -> tuple[pa.DataType, Mapping[str, Any]]:
-    """The Arrow type of a column, and its type for HF datasets."""
+    """Arrow type of a column, and its type for HF datasets."""
     dtype, shape = feature.dtype, feature.shape
     if dtype == "language" and name in TYPES:
         return TYPES[name], language_feature(name)
@@ -392,8 +396,8 @@ def episode_digest(task: str, columns: Mapping[str, NDArray[Any]], videos: Mappi
 
     Args:
         task: Instruction.
-        columns: Feature -> (T,) or (T, D); the positions may be among them.
-        videos: Camera feature -> SHA-256 (hex) of its images' bytes one after the other.
+        columns: Feature -> (T,) or (T, D); may include the positions.
+        videos: Camera feature -> SHA-256 (hex) of its concatenated images.
     """
     result = hashlib.sha256(json.dumps(task).encode())
     for name in sorted(columns):

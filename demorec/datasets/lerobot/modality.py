@@ -15,11 +15,11 @@ from demorec.episode.roles import Modality, NamedRoles, Roles, find_roles
 
 MODALITY_PATH = "meta/modality.json"
 _DEFAULT_FEATURES = {"state": STATE, "action": ACTION}
-"""Section -> the feature that its groups are parts of, unless they name another as original_key."""
+"""Section -> feature of its groups, unless they name another one as original_key."""
 
 
 class _Group(NamedTuple):
-    """Some elements of a feature, from `first` to before `last`."""
+    """Elements `first` to `last` - 1 of a feature."""
 
     feature: str
     name: str
@@ -31,12 +31,12 @@ def dataset_roles(root: Path, info: DatasetInfo, named: NamedRoles) -> Roles:
     """The role of each feature of a dataset.
 
     Args:
-        root: Its folder.
-        info: What info.json says.
-        named: What the user says.
+        root: The dataset's folder.
+        info: Content of info.json.
+        named: Roles that the user names.
 
     Raises:
-        ConfigError: As `find_roles`.
+        ConfigError: As in `find_roles`.
         ExportError: modality.json is damaged.
     """
     columns = {name: feature.column for name, feature in info.features.items()}
@@ -44,7 +44,7 @@ def dataset_roles(root: Path, info: DatasetInfo, named: NamedRoles) -> Roles:
 
 
 def read_modality(root: Path, info: DatasetInfo) -> Modality:
-    """What modality.json says of the features, nothing if there is none; ExportError if it is damaged."""
+    """Read the features' groups from modality.json, none if it is missing; ExportError if it is damaged."""
     path = root / MODALITY_PATH
     if not path.exists():
         return Modality()
@@ -79,7 +79,7 @@ def _groups(section: Mapping[str, Any], name: str) -> Iterator[_Group]:
 
 
 def _elements(groups: list[_Group], info: DatasetInfo) -> dict[str, tuple[str, ...]]:
-    """Feature -> names of its elements, of those that are in a group."""
+    """Feature -> names of its elements, for elements in a group."""
     found: dict[str, list[str]] = {}
     for group in groups:
         feature = info.features.get(group.feature)

@@ -1,4 +1,4 @@
-"""Simulated episodes in the units of a real arm's motors, as LeRobot would have recorded them: without a scene."""
+"""Simulated episodes in a real arm's motor units, as LeRobot would record them: without a scene."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from demorec.mcap import Recording
 from demorec.robots.motors import Motors
 
 NO_PLACE = (VELOCITY, EE_POSE, REWARD, DONE, SUCCESS)
-"""Features that LeRobot does not record of a real arm."""
+"""Features that LeRobot does not record from a real arm."""
 
 
 def export_episode(recording: Recording, options: ExportOptions) -> ExportEpisode[ExportOptions]:
     """Select the frames, features and images of a recording for a dataset with these options.
 
     Raises:
-        ConfigError: Options that the recording cannot serve, or a calibration that does not fit the arm's servos.
+        ConfigError: Options that the recording does not support, or a calibration that does not fit the arm's servos.
         RecordingError: The recording is damaged.
     """
     if options.motor_units is None:
@@ -34,8 +34,8 @@ def export_episode(recording: Recording, options: ExportOptions) -> ExportEpisod
     name = recording.info.robot_name
     if scene_of(recording.info) is None or name not in IN_MOTOR_UNITS:
         raise ConfigError(
-            f"Motor units are asked for, which simulated episodes of {', '.join(IN_MOTOR_UNITS)} have, not those "
-            f"of {name or 'an unnamed robot'}: leave --motor-units out: {recording.path}"
+            f"Motor units exist for simulated episodes of {', '.join(IN_MOTOR_UNITS)}, not for those "
+            f"of {name or 'an unnamed robot'}: leave out --motor-units: {recording.path}"
         )
     motors = IN_MOTOR_UNITS[name].motors(options.motor_units, options.calibration)
     info, read_table = _info_of_arm(recording, motors), partial(_motor_table, recording, motors)

@@ -1,7 +1,8 @@
-"""Mp4 files written from encoded images as they are: no image is decoded or encoded anew.
+"""Mp4 writer for encoded images, without decoding or re-encoding.
 
-A file has one video track at a constant rate, and its index in front so that it can be read over a network. LeRobot's
-own writer copies the whole file for every episode; here images are appended, and the index is written once, at the end.
+A file has one video track at a constant rate, and its index at the start so that it can be read over a network.
+LeRobot's own writer copies the whole file for every episode; this one appends images and writes the index once, at the
+end.
 """
 
 from __future__ import annotations
@@ -30,12 +31,12 @@ _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
 @dataclass(frozen=True, kw_only=True)
 class Stored:
-    """Encoded images in a file.
+    """Location of encoded images in a file.
 
     Attributes:
         path: Of the file.
-        spans: (begin, bytes) of its parts, one behind the other.
-        is_own: The file has nothing else, and is deleted once they are written.
+        spans: (begin, bytes) of the consecutive parts.
+        is_own: Whether the file has no other content and is deleted once the images are written.
     """
 
     path: Path
@@ -43,7 +44,7 @@ class Stored:
     is_own: bool = False
 
     def read(self) -> bytes:
-        """Read all of them. Raises OSError if the file cannot be read, or ends before."""
+        """Read all images. Raises OSError if the file cannot be read or is too short."""
         with self.path.open("rb", buffering=0) as file:
             data = b"".join(os.pread(file.fileno(), count, begin) for begin, count in self.spans)
         if len(data) != sum(count for _, count in self.spans):
@@ -53,20 +54,19 @@ class Stored:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EncodedVideo:
-    """The T images of one camera in one episode, and those around them without which they cannot be decoded.
+    """The T images of one camera in one episode, and further images needed to decode them.
 
     Attributes:
         codec: "h264", "hevc" or "av1", or another one by libav's name.
-        first: The first image as it was encoded, a keyframe; for another codec an mp4 file of it alone.
-        samples: All images back to back, as an mp4 file stores them, or where they lie.
-        sizes: (lead + T + tail,) int64, bytes of each in `samples`.
-        is_keyframe: (lead + T + tail,) bool, which ones can be decoded by themselves.
-        digest: SHA-256 of T samples, those of the images, hex; with a tail, of those that are stored in their place. ""
-            where nobody asks for it.
-        lead: How many images are in front that belong to no frame, from a keyframe on.
-        tail: How many images are shown behind the last frame, since some of the T are decoded from them.
-        shifts: (lead + T + tail,) int64, by how many places each image is shown after the place at which it is stored;
-            None where images are shown in the order in which they were encoded.
+        first: The first image as encoded, a keyframe; for other codecs an mp4 file of it alone.
+        samples: All images concatenated in mp4's form, or their location.
+        sizes: (lead + T + tail,) int64, size of each in bytes.
+        is_keyframe: (lead + T + tail,) bool, whether each can be decoded independently.
+        digest: SHA-256 (hex) of the T samples; with a tail, of the samples stored in their places. "" if not requested.
+        lead: Number of images before the first frame, starting with a keyframe.
+        tail: Number of images shown after the last frame, from which some of the T are decoded.
+        shifts: (lead + T + tail,) int64, display position minus storage position of each image; None if both orders are
+        equal.
     """
 
     codec: str
@@ -85,7 +85,7 @@ class EncodedVideo:
     def of_access_units(
         cls, codec: str, width: int, height: int, data: bytes, lengths: Sequence[int] | NDArray[np.int64], lead: int = 0
     ) -> EncodedVideo:
-        """From images back to back, as they were encoded, and the length of each; ExportError if that is none."""
+        """Build from concatenated access units and their lengths; ExportError if they are invalid."""
         ends = np.cumsum(np.asarray(lengths, dtype=np.int64)).tolist()
         units = [data[begin:end] for begin, end in pairwise([0, *ends])]
         parts = [list(_units(codec, unit)) for unit in units]
@@ -106,7 +106,7 @@ class EncodedVideo:
         return video.with_digest()
 
     def with_digest(self) -> EncodedVideo:
-        """The same with its digest."""
+        """Return a copy with its digest."""
         begin, end = (int(self.sizes[:count].sum()) for count in (self.lead, self.lead + self.num_frames))
         return replace(self, digest=hashlib.sha256(memoryview(self.read())[begin:end]).hexdigest())
 
@@ -117,27 +117,27 @@ class EncodedVideo:
 
     @property
     def delay(self) -> int:
-        """How many images a decoder has to hold back until it can show them in order."""
+        """Number of images that a decoder must hold back to show them in order."""
         return 0 if self.shifts is None else -int(self.shifts.min())
 
     @property
     def num_bytes(self) -> int:
-        """Of all images."""
+        """Total size of the images."""
         return int(self.sizes.sum())
 
     def put_aside(self, folder: Path) -> EncodedVideo:
-        """The same with its `samples` in a new file in `folder`: cheap to hand to another process."""
+        """Move `samples` to a new file in `folder`, so that passing to another process is cheap."""
         handle, name = tempfile.mkstemp(dir=folder)
         with os.fdopen(handle, "wb") as file:
             file.write(self.read())
         return replace(self, samples=Stored(path=Path(name), spans=((0, self.num_bytes),), is_own=True))
 
     def read(self) -> bytes:
-        """All images back to back; OSError where a file cannot be read."""
+        """Read all images, concatenated; OSError if a file cannot be read."""
         return self.samples if isinstance(self.samples, bytes) else self.samples.read()
 
     def parameter_sets(self) -> bytes:
-        """What a decoder must know before the first image; ExportError if that is no keyframe that stands alone."""
+        """Parameter sets for the decoder; ExportError if the first image is not an independent keyframe."""
         if not len(self.is_keyframe) or not self.is_keyframe[0]:
             raise ExportError(f"The {self.codec} video does not start with a keyframe.")
         if self.codec not in _PARAMETER_SETS:
@@ -151,10 +151,10 @@ class EncodedVideo:
 
 
 class Mp4Writer:
-    """One mp4 file; episodes are appended, `close` puts the index in front.
+    """Writer of one mp4 file; episodes are appended, and `close` writes the index at the start.
 
-    Until then the file has another name, so that an unfinished one is never taken for a finished one. All methods raise
-    OSError if the file cannot be written, and ExportError for images that libav does not understand.
+    Until then the file has another name, so that an unfinished one is never mistaken for a finished one. Methods raise
+    OSError if the file cannot be written, and ExportError for images that libav cannot parse.
     """
 
     def __init__(self, path: Path, first: EncodedVideo, *, fps: int) -> None:
@@ -165,20 +165,21 @@ class Mp4Writer:
         self._path, self._unfinished = path, path.with_suffix(".unfinished")
         template = _first_image_file(first, path)
         path.parent.mkdir(parents=True, exist_ok=True)
-        # The bit rate would be that of the first image, and without `bitexact` the file would name libav's version.
+        # The bit rate would be the first image's, and without `bitexact` the file would contain libav's version.
         options = {"movflags": "faststart", "write_btrt": "0", "fflags": "bitexact"}
         self._file: OutputContainer | None = av.open(
             str(self._unfinished), "w", format="mp4", container_options=options
         )
         with av.open(template, format="mp4") as image:
             self._stream = self._file.add_stream_from_template(image.streams.video[0], opaque=True)
-        self._stream.codec_context.thread_count = 1  # nothing is decoded: no threads for it
+        self._stream.codec_context.thread_count = 1  # nothing is decoded, so it needs no threads
         self._stream.time_base = Fraction(1, fps)
         self._file.start_encoding()
-        self._ticks = int(1 / (fps * self._stream.time_base))  # a frame, in the unit that libav has chosen now
+        # duration of a frame, in the unit that libav has now chosen
+        self._ticks = int(1 / (fps * self._stream.time_base))
 
     def add(self, video: EncodedVideo) -> None:
-        """Append the images of an episode; if they are in a file of their own, it is deleted."""
+        """Append the images of an episode; a separate file with them is deleted."""
         shifts = [0] * len(video.sizes) if video.shifts is None else video.shifts.tolist()
         data, begin = video.read(), 0
         with _mux_errors(self._path):
@@ -190,7 +191,7 @@ class Mp4Writer:
             video.samples.path.unlink()
 
     def _mux(self, sample: bytes, is_keyframe: bool, shift: int) -> None:
-        """Append an image that is shown `shift` places after the place at which it is stored."""
+        """Append an image with its display position `shift` after its storage position."""
         assert self._file is not None
         packet = av.Packet(sample)
         packet.stream = self._stream
@@ -202,7 +203,7 @@ class Mp4Writer:
         self.num_images += 1
 
     def close(self) -> None:
-        """Write the index and give the file its name; harmless when called twice."""
+        """Write the index and rename the file; idempotent."""
         if self._file is not None:
             with _mux_errors(self._path):
                 self._file.close()
@@ -210,16 +211,16 @@ class Mp4Writer:
             self._file = None
 
     def abort(self) -> None:
-        """Drop what was written; nothing after `close`."""
+        """Discard the file; does nothing after `close`."""
         if self._file is not None:
-            with suppress(OSError, av.FFmpegError):  # which libav may raise again
+            with suppress(OSError, av.FFmpegError):  # libav may raise the same error again
                 self._file.close()
             self._file = None
             self._unfinished.unlink(missing_ok=True)
 
 
 def one_image_file(image: bytes, stream: av.VideoStream) -> bytes:
-    """Write an mp4 file of one image that was encoded as a stream describes."""
+    """Write an mp4 file of one image, encoded as the stream describes."""
     described = io.BytesIO()
     with av.open(described, "w", format="mp4") as target:
         packet = av.Packet(image)
@@ -231,7 +232,7 @@ def one_image_file(image: bytes, stream: av.VideoStream) -> bytes:
 
 
 def _first_image_file(video: EncodedVideo, path: Path) -> io.BytesIO:
-    """Return an mp4 file of the first image alone, which describes the encoding, for the file at `path`."""
+    """Return an mp4 file of the first image alone, as a template of the encoding, for the file at `path`."""
     if video.codec not in _DEMUXERS:
         return io.BytesIO(video.first)
     with (
@@ -254,15 +255,15 @@ def _mux_errors(path: Path) -> Iterator[None]:
 
 
 _TEMPORAL_DELIMITER = 2
-"""Kind of a unit of AV1 that mp4 files leave out."""
+"""Type of an AV1 unit that mp4 files omit."""
 _KEYFRAMES = {"h264": (5,), "hevc": range(16, 22), "av1": (1,)}
-"""Kinds of the units that only images have that are decoded without others: slices of IDR and IRAP, AV1's headers."""
+"""Types of units that occur only in independently decodable images: slices of IDR and IRAP, AV1's headers."""
 _PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34), "av1": (1,)}
-"""Kinds of the units of which one mp4 file holds one set: a decoder must know them before the first image."""
+"""Types of units of which an mp4 file holds one set: a decoder needs them before the first image."""
 
 
 def _units(codec: str, access_unit: bytes) -> Iterator[tuple[int, bytes]]:
-    """Kind of each unit, and the unit as an mp4 file stores it: nothing but the framing changes."""
+    """Type of each unit, and the unit in mp4's form: only the framing changes."""
     if codec == "av1":
         for kind, start, end in _open_bitstream_units(access_unit):
             if kind != _TEMPORAL_DELIMITER:
@@ -270,14 +271,14 @@ def _units(codec: str, access_unit: bytes) -> Iterator[tuple[int, bytes]]:
         return
     before, *pieces = access_unit.split(b"\x00\x00\x01")
     if before.strip(b"\x00") or not pieces:
-        raise ExportError("A video packet does not begin with a start code: it is no Annex B stream.")
+        raise ExportError("A video packet does not begin with a start code: it is not an Annex B stream.")
     for nal in (piece.rstrip(b"\x00") for piece in pieces):
         if nal:
             yield nal[0] & 31 if codec == "h264" else (nal[0] >> 1) & 63, len(nal).to_bytes(4, "big") + nal
 
 
 def _open_bitstream_units(access_unit: bytes) -> list[tuple[int, int, int]]:
-    """(type, start, end) of each unit; every one must carry its size, as encoders write them."""
+    """(type, start, end) of each unit; each must carry its size, which encoders write."""
     units = []
     start = 0
     while start < len(access_unit):
@@ -295,7 +296,7 @@ def _open_bitstream_units(access_unit: bytes) -> list[tuple[int, int, int]]:
                 break
         end = position + size
         if end > len(access_unit):
-            raise ExportError("An AV1 packet is cut off.")
+            raise ExportError("An AV1 packet is truncated.")
         units.append(((header >> 3) & 15, start, end))
         start = end
     return units

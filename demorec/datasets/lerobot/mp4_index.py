@@ -19,7 +19,7 @@ _PARENTS = (b"trak", b"mdia", b"minf", b"stbl", b"edts")
 
 
 def check_video(path: Path) -> None:
-    """Raise ExportError unless a file is a regular one that consists of whole mp4 boxes."""
+    """Raise ExportError unless a file is a regular one that consists of complete mp4 boxes."""
     try:
         with open_regular(path) as file:
             for _ in _boxes(file, 0, os.fstat(file.fileno()).st_size):
@@ -34,9 +34,9 @@ def _read(file: BinaryIO, begin: int, layout: str) -> tuple[Any, ...]:
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """(kind, first byte of its content, byte behind it) of the boxes in a part of a file.
+    """(type, first byte of its content, end) of the boxes in a part of a file.
 
-    A box has its length (1: 64 bits follow; 0: to the end) and its kind in front.
+    A box begins with its length (1: 64 bits follow; 0: to the end) and its type.
     """
     while start + 8 <= end:
         (length, kind), head = _read(file, start, ">I4s"), 8
@@ -44,13 +44,13 @@ def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, i
             (length,), head = _read(file, start + 8, ">Q"), 16
         length = length or end - start
         if length < head or start + length > end:
-            raise ValueError("a box that is cut off" if start else "no mp4 file")
+            raise ValueError("a box that is cut off" if start else "not an mp4 file")
         yield kind, start + head, start + length
         start += length
 
 
 def _flat(file: BinaryIO, start: int, end: int) -> dict[bytes, bytes]:
-    """Kind -> content of all boxes in a part of a file, those within others included."""
+    """Type -> content of all boxes in a part of a file, including nested ones."""
     found, waiting = {}, [(start, end)]
     for part in waiting:
         for kind, begin, stop in _boxes(file, *part):
@@ -63,12 +63,13 @@ def _flat(file: BinaryIO, start: int, end: int) -> dict[bytes, bytes]:
 
 
 Index = tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.bool_], NDArray[np.float64]]
-"""Of N images in the order in which they are stored, (N,) each: where they begin in the file and their lengths, bytes;
-whether they are keyframes; when they are shown, s."""
+"""(N,) arrays for N images in storage order: offsets in the file and lengths, bytes; whether they are keyframes;
+display times, s.
+"""
 
 
 def mp4_index(path: Path) -> Index:
-    """Read the index of the first video track. Raises ExportError for a file that is cut off or not mp4."""
+    """Read the index of the first video track. Raises ExportError for a truncated file or one that is not mp4."""
     check_video(path)
     try:
         with open_regular(path) as file:
@@ -91,7 +92,7 @@ def mp4_index(path: Path) -> Index:
 
 
 def _fragmented_index(path: Path) -> Index:
-    """Read the index of a file in fragments (`moof`), each with tables of its own, from libav's packets."""
+    """Read the index of a fragmented file (`moof`), with tables in each fragment, from libav's packets."""
     found: list[tuple[int, int, bool, int]] = []
     with av.open(str(path), format="mp4") as container:
         stream = container.streams.video[0]
@@ -134,7 +135,7 @@ def _numbers(box: bytes, start: int, count: int, kind: str = ">u4") -> NDArray[n
 
 
 def _repeated(box: bytes, count: int, *, signed: bool = False) -> NDArray[np.int64]:
-    """The values of a table of runs (how often, value)."""
+    """Expand a table of runs (count, value)."""
     runs = _numbers(box, 8, 2 * _count(box), ">u4").reshape(-1, 2)
     values = runs[:, 1].astype(np.uint32).astype(np.int32).astype(np.int64) if signed else runs[:, 1]
     if int(runs[:, 0].sum()) != count:
@@ -143,7 +144,7 @@ def _repeated(box: bytes, count: int, *, signed: bool = False) -> NDArray[np.int
 
 
 def _edited(box: bytes) -> int:
-    """Ticks at which the first edit that shows anything begins."""
+    """Start of the first edit that is not empty, ticks."""
     width, kind = (20, ">Qq") if box[0] else (12, ">Ii")
     for number in range(_count(box)):
         _, begin = struct.unpack_from(kind, box, 8 + number * width)
@@ -153,7 +154,7 @@ def _edited(box: bytes) -> int:
 
 
 def _offsets(track: Mapping[bytes, bytes], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Where each image begins, from the chunks that they lie in."""
+    """Offset of each image, from its chunk."""
     name, kind = (b"co64", ">u8") if b"co64" in track else (b"stco", ">u4")
     chunks = _numbers(track[name], 8, _count(track[name]), kind)
     runs = _numbers(track[b"stsc"], 8, 3 * _count(track[b"stsc"])).reshape(-1, 3)

@@ -1,4 +1,4 @@
-"""Parquet files that grow row group by row group and roll over to the next number by size."""
+"""Parquet files that grow by row groups and roll over to the next number by size."""
 
 from __future__ import annotations
 
@@ -17,11 +17,13 @@ from demorec.datasets.lerobot.layout import MEBIBYTE, DatasetInfo, FilePosition
 _ROWS_PER_TABLE = 100
 _ROWS_PER_GROUP = 4096
 _BYTES_PER_GROUP = 2 * MEBIBYTE
-"""Tables are gathered up to so many rows or bytes: a row group costs a writer and a reader far more than its rows."""
+"""Tables are collected up to this many bytes or a number of rows: a row group costs a writer and a reader far more than
+its rows.
+"""
 
 
 def next_position(folder: Path, chunks_size: int) -> FilePosition:
-    """The first number that no file of a folder (chunk-CCC/file-FFF.*) has, counting from the last one."""
+    """First number without a file in a folder (chunk-CCC/file-FFF.*), counting from the last one."""
     last: FilePosition | None = None
     for path in folder.glob("chunk-*/file-*"):
         chunk, file = path.parent.name.removeprefix("chunk-"), path.stem.removeprefix("file-")
@@ -33,17 +35,17 @@ def next_position(folder: Path, chunks_size: int) -> FilePosition:
 
 
 class RollingParquet:
-    """Writes tables into numbered files; one table is never split over two of them.
+    """Writer of tables to numbered files; a table is never split across two of them.
 
     Attributes:
-        position: Of the file that is being written, or of the next one.
-        schema: Of the tables.
+        position: Position of the current file, or of the next one.
+        schema: Schema of the tables.
         num_bytes: Size of the finished files.
 
     Args:
-        template: Of the files' paths in the dataset's folder.
-        info: Of the dataset: how large files and folders grow.
-        repeating: Columns that are worth a dictionary; all by default.
+        template: Template of the files' paths in the dataset's folder.
+        info: Limits of file and folder sizes.
+        repeating: Columns with dictionary encoding; all by default.
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class RollingParquet:
         self._limit = info.data_files_size_in_mb * MEBIBYTE
         self._chunks_size = info.chunks_size
         self._compression = compression
-        # A dictionary of numbers that hardly repeat costs time and makes the file larger.
+        # A dictionary of rarely repeated numbers costs time and makes the file larger.
         self._dictionary = True if repeating is None else list(repeating)
         self._rows = 0
         self._pending: list[Mapping[str, Any]] = []
@@ -76,7 +78,7 @@ class RollingParquet:
         self._writer: Any = None
 
     def make_room(self, rows: int) -> FilePosition:
-        """Begin the next file if these rows would not fit into this one; return where they will be."""
+        """Begin the next file if these rows would not fit into the current one; return their position."""
         if self._writer is not None:
             size = self._sink.tell() + self._waiting_bytes
             if size * (1 + rows / max(1, self._rows)) >= self._limit:
@@ -85,7 +87,9 @@ class RollingParquet:
         return self.position
 
     def add_row(self, row: Mapping[str, Any]) -> None:
-        """Append a row: so many make a table. Columns FOLDER/chunk_index and FOLDER/file_index say where it lies."""
+        """Append a row; a table is written for every few rows. Columns FOLDER/chunk_index and FOLDER/file_index record
+        its position.
+        """
         self._pending.append(row)
         if len(self._pending) >= _ROWS_PER_TABLE:
             self._write_rows()
@@ -121,7 +125,7 @@ class RollingParquet:
             self._waiting, self._waiting_rows, self._waiting_bytes = [], 0, 0
 
     def close(self) -> None:
-        """Finish the last file; harmless when called twice."""
+        """Finish the last file; idempotent."""
         self._write_rows()
         if self._writer is not None:
             self._finish_file()
@@ -136,14 +140,14 @@ class RollingParquet:
             self._sink.close()
 
     def abort(self) -> None:
-        """Let go of the file after an error, whatever state it is in."""
+        """Close the file after an error, in any state."""
         if self._sink is not None and not self._sink.closed:
             self._writer = None
             self._sink.close()
 
 
 def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa.Array:
-    """A column of scalars (T,) or fixed-size vectors (T, D); a column that is one already keeps every bit."""
+    """Build a column of scalars (T,) or fixed-size vectors (T, D); an existing column stays bit-exact."""
     if isinstance(values, pa.Array):
         values = plain_column(values)
         if pa.types.is_primitive(arrow_type) and not pa.types.is_primitive(values.type):
@@ -156,7 +160,7 @@ def vector_array(values: NDArray[Any] | pa.Array, arrow_type: pa.DataType) -> pa
 
 
 def _only_elements(lists: pa.Array) -> pa.Array:
-    """Numbers of a column of lists of one, which other writers make of scalars; other columns stay."""
+    """Unwrap a column of one-element lists, which other writers use for scalars; return other columns unchanged."""
     is_list = pa.types.is_list(lists.type) or pa.types.is_fixed_size_list(lists.type)
     numbers = lists.flatten() if is_list and not lists.null_count else lists
     return numbers if len(numbers) == len(lists) else lists

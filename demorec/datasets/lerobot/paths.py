@@ -1,4 +1,4 @@
-"""Names that a LeRobot dataset is known by; a module of its own, so that asking needs no PyArrow."""
+"""File names that identify a LeRobot dataset; a separate module so that checking needs no PyArrow."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ from demorec.core.replacing import ReplaceableKind, files_below, json_object
 INFO_PATH = "meta/info.json"
 CARD_PATH = "README.md"
 SIDECAR_DIR = "demorec"
-"""Folder inside the dataset for what LeRobot has no place for."""
+"""Folder inside the dataset for data without a place in LeRobot's format."""
 SECOND_CARD_PATH = f"{SIDECAR_DIR}/README.md"
-"""Where the card goes if the dataset has a README.md that demorec did not write."""
+"""Path of the card if the dataset has a README.md that demorec did not write."""
 
 
 def is_dataset(path: Path) -> bool:
@@ -37,7 +37,7 @@ _PARTS = re.compile(
     rf"|{SIDECAR_DIR}/(configs\.json|export\.json|README\.md)"
     r"|README\.md|\.gitattributes|\.cache/huggingface/.*"
 )
-"""Files of a dataset in LeRobot's formats 2.0 to 3.0, of ours, GR00T's, and of the Hub's."""
+"""Files of a dataset in LeRobot's formats 2.0 to 3.0, including demorec's, GR00T's and the Hub's."""
 
 
 def _is_dataset(folder: Path) -> bool:
@@ -46,7 +46,7 @@ def _is_dataset(folder: Path) -> bool:
 
 
 def is_dataset_file(name: str) -> bool:
-    """Whether a file of that name, relative to the dataset's folder, belongs to a dataset."""
+    """Whether a file name, relative to the dataset's folder, belongs to a dataset."""
     return _PARTS.fullmatch(name) is not None
 
 
@@ -68,4 +68,4 @@ def _unlinkable(folder: Path) -> list[str]:
 
 
 GROWING_DATASET = ReplaceableKind(name=DATASET.name, is_folder=True, recognises=_is_dataset, strangers=_unlinkable)
-"""One that is appended to: all its files are taken over, whoever's they are; links to folders and devices cannot be."""
+"""A dataset to append to: all its files are kept, from any writer; links to folders and devices cannot be."""

@@ -42,7 +42,7 @@ class ExportedEpisode:
         data: Rows, videos and row of the sidecar.
         traits: Properties that all episodes of the dataset share.
         info: Description of a dataset made from this episode.
-        depth_left_out: Depth cameras that were not asked for.
+        depth_left_out: Depth cameras that were not requested.
         transcoded: Cameras with transcoded images, and the reason.
         meanings: Feature -> its description in the recording.
     """
@@ -59,7 +59,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
     """Read an episode into memory.
 
     Raises:
-        ConfigError: No camera has the segmentation that was asked for.
+        ConfigError: Segmentation was requested, but no camera has it.
         ExportError: The episode has no frames, or frames without images.
         RecordingError: The recording is damaged.
     """
@@ -130,7 +130,7 @@ def _dataset_features(episode: LeRobotEpisode, video_infos: Mapping[str, dict[st
 
 
 def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
-    """Return the statements about the episode; empty unless asked for.
+    """Return the statements about the episode; empty unless requested.
 
     Without a scene, the only statements are the subtasks that the source specifies.
     """
@@ -145,7 +145,7 @@ def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
 
 
 def _facts(episode: LeRobotEpisode) -> dict[str, Any]:
-    """Return the facts about an episode with a scene, with its stages if asked for."""
+    """Return the facts about an episode with a scene, with its stages if requested."""
     if episode.scene is None:
         return {}
     facts = episode_facts(episode.recording)
@@ -175,18 +175,18 @@ def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:
 
 
 def reasons_to_transcode(episode: LeRobotEpisode) -> dict[ExportCamera, str]:
-    """Return colour camera -> why its images must be transcoded; "" where they pass through."""
+    """Return colour camera -> reason why its images must be transcoded; "" if they pass through."""
     return {camera: reason_to_transcode(episode, camera) for camera in episode.cameras if not camera.is_depth}
 
 
 def reason_to_transcode(episode: LeRobotEpisode, camera: ExportCamera) -> str:
     """Explain why the images of a camera cannot pass through; "" if they can.
 
-    With frames left out, the others stay decodable only if they are all keyframes.
+    If frames are left out, the rest stay decodable only if they are all keyframes.
     """
     settings = episode.recording.video_settings(camera.name)
     if settings.codec == "jpeg":
-        return "jpeg images are no video"
+        return "jpeg images are not a video"
     numbers, stride = episode.numbers(camera), episode.stride
     if (np.diff(numbers) != stride).any():
         return "frames show images again, or leave some out"
@@ -210,7 +210,7 @@ def _lead(recording: Recording, camera: str, number: int) -> int:
 
 
 def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[EncodedVideo, VideoSettings]:
-    """Encode the images of a camera again, one a frame."""
+    """Re-encode the images of a camera, one per frame."""
     size, options = episode.recording.video_settings(camera.name), episode.options
     video = VideoConfig(codec=options.transcode_codec, crf=options.transcode_crf)
     encoder = make_encoder(video=video, width=size.width, height=size.height, fps=episode.fps)
@@ -222,7 +222,7 @@ def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[En
 
 
 def recorded_videos(episode: LeRobotEpisode, cameras: Sequence[ExportCamera]) -> dict[str, EncodedVideo]:
-    """Return camera feature -> the recorded packets, one a frame, for cameras without a reason to transcode."""
+    """Return camera feature -> the recorded packets, one per frame, for cameras without a reason to transcode."""
     recording = episode.recording
     recorded = recording.coded_images([camera.name for camera in cameras])
     videos = {}
@@ -239,8 +239,8 @@ def recorded_videos(episode: LeRobotEpisode, cameras: Sequence[ExportCamera]) ->
         )
         if not is_whole and not video.is_keyframe.all():
             raise ExportError(
-                f"The recording says that every {_ordinal(settings.gop)} image of camera {camera.name} is a keyframe, "
-                f"but it is not so: {recording.path}"
+                f"The recording lists every {_ordinal(settings.gop)} image of camera {camera.name} as a keyframe, "
+                f"but the packets differ: {recording.path}"
             )
         videos[camera.feature] = video
     return videos
@@ -254,8 +254,8 @@ def _mp4_codec(settings: VideoSettings) -> str:
 def _video_info(settings: VideoSettings) -> dict[str, Any]:
     """Return the `info` of a camera feature: properties of the video and its encoder settings, null where unknown.
 
-    LeRobot transcodes with these settings when it extracts episodes from a dataset. It replaces null by its own
-    default, and refuses a GOP of 0.
+    LeRobot transcodes with these settings when it extracts episodes. It replaces null by its default and rejects a GOP
+    of 0.
     """
     preset = int(settings.preset) if settings.preset.isdigit() else settings.preset or None
     return {

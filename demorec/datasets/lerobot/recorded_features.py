@@ -1,4 +1,4 @@
-"""Features of a dataset as recordings of other robots hold them."""
+"""Features of a dataset in the form of external recordings."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _RECORDED: Mapping[str, Literal["float32", "float64"]] = {
     **dict.fromkeys(("bool", "int8", "uint8", "int16", "uint16", "float16", "float32"), "float32"),
     **dict.fromkeys(("int32", "uint32", "int64", "uint64", "float64"), "float64"),
 }
-"""Type of a column -> the type that holds all its numbers, except the largest integers."""
+"""Type of a column -> recording type that holds all its values, except the largest integers."""
 NOT_HELD = "imported recordings hold none"
 _NEXT: Mapping[str, str] = {
     "next.success": "its last value becomes the outcome of the episode",
     "next.done": "an export writes it anew, true in the last row of an episode",
     "next.reward": "imported recordings hold an outcome, and no rewards",
 }
-"""Columns of LeRobot's environments -> what becomes of them."""
+"""Columns of LeRobot's environments -> their treatment in an import."""
 
 
 def camera_name(key: str) -> str:
@@ -34,7 +34,7 @@ def camera_name(key: str) -> str:
 
 
 def why_not_recorded(name: str, feature: DatasetFeature) -> str:
-    """Why a feature is in no recording, "" for one that is."""
+    """Reason why a feature is not recorded, "" if it is."""
     if name in AUTOMATIC_FEATURES:
         return ""
     if name.startswith("next."):
@@ -53,7 +53,7 @@ def why_not_recorded(name: str, feature: DatasetFeature) -> str:
 
 
 def _why_no_distances(feature: DatasetFeature) -> str:
-    """Why the distances of a depth feature cannot be read, "" if they can."""
+    """Reason why the distances of a depth feature cannot be read, "" if they can."""
     if not feature.is_video:
         return "its depth is in images, and depth is read from videos"
     try:
@@ -64,7 +64,7 @@ def _why_no_distances(feature: DatasetFeature) -> str:
 
 
 def recorded_feature(name: str, feature: DatasetFeature, elements: Sequence[str]) -> Feature:
-    """Describe a feature of numbers with these elements, with the type that recordings hold it in."""
+    """Describe a numeric feature with these elements, in recordings' type."""
     count = int(np.prod(feature.shape))
     names = tuple(name.replace(",", " ") for name in elements)
     if len(set(names)) != count:

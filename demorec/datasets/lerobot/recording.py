@@ -36,22 +36,22 @@ _MAX_REASON = 10_000
 
 
 class DatasetRecording:
-    """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps, or
-    where their timestamps were measured.
+    """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps, or at
+    measured timestamps.
 
-    One after the other they are read in one pass.
+    Reading episodes in order takes one pass.
 
     Args:
-        dataset: Opened.
-        number: Of the episode's place in it, from 0.
+        dataset: An open dataset.
+        number: Position of the episode in it, from 0.
 
     Attributes:
         path: The dataset's folder.
-        dataset, place: Where it lies.
-        known: What the sidecar says of it; empty where none is.
+        dataset, place: Dataset and location of the episode.
+        known: The sidecar's data about it; empty if there are none.
         num_frames: T.
 
-    Methods and properties raise ExportError where the files cannot be read.
+    Methods and properties raise ExportError for unreadable files.
     """
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
@@ -65,13 +65,13 @@ class DatasetRecording:
 
     @cached_property
     def info(self) -> EpisodeInfo:
-        """What is known of it; its robot and cameras as the sidecar describes them."""
+        """Description of the episode; its robot and cameras are those in the sidecar."""
         is_stated = self.known.get("robot_digest") is not None or self.dataset.motors is not None
         robot = self.robot if self.dataset.has_one_robot and is_stated else None
         links = set() if robot is None else {robot.model.root, *(joint.child for joint in robot.model.joints)}
         described = {camera["name"]: camera for camera in self.known.get("cameras") or () if camera is not None}
         cameras = [
-            # A depth camera of a simulated episode has no entry of its own there.
+            # The sidecar has no entry for a depth camera of a simulated episode.
             _described(
                 self.dataset.camera(name), described.get(name, described.get(name.removesuffix(DEPTH_SUFFIX))), links
             )
@@ -99,7 +99,7 @@ class DatasetRecording:
 
     @cached_property
     def robot(self) -> DatasetRobot | None:
-        """The arm that the sidecar keeps, that of the named servos, or one of ours that has joints of these names."""
+        """The arm in the sidecar, the arm of the named servos, or one of demorec's arms with joints of these names."""
         if (name := self.known.get("robot_digest")) is not None:
             return self.dataset.robot(str(name))
         if self.dataset.motors is not None:
@@ -109,7 +109,7 @@ class DatasetRecording:
 
     @cached_property
     def outcome(self) -> Outcome:
-        """As the sidecar has it, or else as the last row says."""
+        """Outcome in the sidecar, otherwise by the last row."""
         success, reason = self.known.get("success"), self.known.get("failure_reason") or ""
         if len(reason) > _MAX_REASON or not reason.isprintable():
             reason = ""
@@ -119,7 +119,7 @@ class DatasetRecording:
 
     @property
     def success(self) -> bool | None:
-        """How it ended; None where nobody said."""
+        """Success; None if unknown."""
         return self.outcome.success
 
     @cached_property
@@ -127,14 +127,14 @@ class DatasetRecording:
         rows, info = self.dataset.recorded_rows.numbers(self.place), self.dataset.info
         for feature in self.dataset.features:
             found, claimed = rows[feature.name].dtype, np.dtype(info.features[feature.name].dtype)
-            are_floats = found.kind == claimed.kind == "f"  # read as info.json says, as LeRobot reads them
+            are_floats = found.kind == claimed.kind == "f"  # read with info.json's type, as LeRobot does
             if self.num_frames and found != claimed and not are_floats:
                 raise ExportError(f"The column {feature.name} holds {found}, not {claimed}: {self.path}")
         return rows
 
     @cached_property
     def measured_ns(self) -> NDArray[np.int64] | None:
-        """(T,) stamps of rows whose timestamps were measured; None for multiples of 1/fps."""
+        """(T,) ns of rows with measured timestamps; None for multiples of 1/fps."""
         seconds, fps = self._rows["timestamp"][:, 0].astype(np.float64), int(self.dataset.info.fps)
         if are_on_grid(seconds, fps):
             return None
@@ -150,20 +150,20 @@ class DatasetRecording:
 
     @property
     def time_ns(self) -> NDArray[np.int64]:
-        """(T,) stamps of the frames."""
+        """(T,) time of each frame, ns."""
         return self.table().time_ns
 
     @property
     def phases(self) -> tuple[str, ...]:
-        """No phases: datasets state none of each row."""
+        """Empty: datasets have no phase for each row."""
         return ()
 
     def events(self) -> Iterator[tuple[int, Event]]:
-        """No events: datasets have none."""
+        """Empty: datasets have no events."""
         return iter(())
 
     def table(self) -> Table:
-        """Read the features of every frame, each in the type that recordings hold it in."""
+        """Read the features of every frame, in recordings' types."""
         return self._table
 
     @cached_property
@@ -171,10 +171,10 @@ class DatasetRecording:
         return self.table_with({name: self.lead(name) for name in self.dataset.keys})
 
     def table_with(self, leads: Mapping[str, int]) -> Table:
-        """Read the features of every frame, with this number of images of each camera before the first frame."""
+        """Read the features of every frame, with this number of images for each camera before the first frame."""
         begin, fps = max(leads.values(), default=0), int(self.dataset.info.fps)
         times = frame_times(begin + self.num_frames, fps)
-        if self.measured_ns is not None:  # behind the images that come before the first frame
+        if self.measured_ns is not None:  # after the images that precede the first frame
             times[begin:] = self.measured_ns + times[begin]
         features = {item.name: self._rows[item.name].astype(item.dtype) for item in self.dataset.features}
         return Table(
@@ -186,7 +186,7 @@ class DatasetRecording:
         )
 
     def motion(self) -> SceneMotion:
-        """The motion of the joints that are known."""
+        """Motion of the known joints."""
         return measured_motion(self.info, self.table())
 
     def description(self, body: str = "") -> str:
@@ -198,34 +198,36 @@ class DatasetRecording:
         return False
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
-        """No images, as of `has_segmentation`."""
+        """Empty, see `has_segmentation`."""
         return iter(())
 
     def segment_names(self) -> Mapping[int, str]:
-        """No names, as of `has_segmentation`."""
+        """Empty, see `has_segmentation`."""
         return {}
 
     def lead(self, camera: str) -> int:
-        """Count the images of a camera before the first frame, from which that is decoded."""
+        """Count a camera's images before the first frame from which that frame is decoded."""
         video = self._video(camera) if self._has_packets(camera) else None
         return 0 if video is None else video.lead
 
     def _has_packets(self, camera: str) -> bool:
-        """Whether the packets of a camera are of a codec that recordings hold."""
+        """Whether recordings can hold a camera's codec."""
         return camera not in self.depth_cameras and self.dataset.camera(camera).kept != ""
 
     def _video(self, camera: str) -> EpisodeVideo | None:
-        """The video of a camera; None where its images are in rows of tables."""
+        """Video of a camera; None if its images are in table rows."""
         key = self.dataset.keys[camera]
         return self.dataset.video(key, self.place) if self.dataset.info.features[key].is_video else None
 
     def video_settings(self, camera: str) -> VideoSettings:
-        """How the images of a camera are encoded; those in rows, or of a codec of no recording, are given as JPEG."""
+        """Encoding of a camera's images; images in rows, or with a codec that recordings cannot hold, are provided as
+        JPEG.
+        """
         found = self.dataset.camera(camera)
         return settings_of_coded(found.kept or "jpeg", found.width, found.height, int(self.dataset.info.fps))
 
     def packets(self, camera: str) -> Iterator[VideoPacket]:
-        """The encoded images of a camera in order; `frame_index` is their number, by which frames hold them."""
+        """Encoded images of a camera in order; `frame_index` is the image number to which frames refer."""
         lead, times = self.lead(camera), self.table().image_stamps[camera]
         video = self._video(camera)
         if video is not None and self._has_packets(camera):
@@ -242,37 +244,37 @@ class DatasetRecording:
             yield VideoPacket(frame_index=number, time_ns=int(times[number]), data=data, is_keyframe=True)
 
     def images(self, camera: str) -> Iterator[Rgb]:
-        """The decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
+        """Decoded images of a camera, (H, W, 3) uint8 RGB, in order."""
         if (video := self._video(camera)) is not None:
             return video.images(-self.lead(camera))
         return self.dataset.stored_images[self.dataset.keys[camera]].read(self.place)
 
     def images_at(self, camera: str, frames: Sequence[int]) -> Iterator[Rgb]:
-        """What some frames, in rising order, show of a camera, (H, W, 3) uint8 RGB."""
+        """Images of a camera at some frames, ascending, (H, W, 3) uint8 RGB."""
         if (video := self._video(camera)) is not None:
             return video.images_at(frames)
         return self.dataset.stored_images[self.dataset.keys[camera]].read(self.place, frames)
 
     def distances(self, camera: str) -> Iterator[NDArray[np.float32]]:
-        """The images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""
+        """Images of a depth camera in order, (H, W) float32 metres, 0 where nothing was measured."""
         return self.dataset.video(self.dataset.keys[camera], self.place).distances()
 
     depth = distances
 
     @cached_property
     def spoken(self) -> EpisodeLanguage:
-        """What its language columns hold; nothing in a dataset without them."""
+        """Content of its language columns; empty if the dataset has none."""
         rows = self.dataset.language_rows
         return EpisodeLanguage() if rows is None else spoken_of(rows.batches(self.place), self.path)
 
     @property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
-        """(frame, what is begun there), in order; empty where none is known, or one cannot be held."""
+        """(first frame, subtask), in order; empty if unknown, or if a recording cannot hold one."""
         return tuple(sorted(self._subtasks[0].items()))
 
     @property
     def language_left_out(self) -> str:
-        """What of its language a recording cannot hold, "" for nothing."""
+        """Language that a recording cannot hold, "" if it can hold all."""
         return self._subtasks[1]
 
     @cached_property
@@ -285,31 +287,31 @@ class DatasetRecording:
             if row.get("style") != "subtask" or not 0 <= frame < self.num_frames:
                 left_out = "all but its subtasks"
             elif len(text) > MAX_SUBTASK or not text.isprintable():
-                return {}, f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+                return {}, f"a subtask is not a single line of at most {MAX_SUBTASK} characters"
             else:
                 texts[round(frame)] = text
         return texts, left_out
 
     def boxes(self, camera: str) -> Iterator[Box]:
-        """What a camera sees, frame by frame, of a dataset with boxes beside it."""
+        """Visible objects of a camera, frame by frame, from the dataset's boxes."""
         stored = self.dataset.boxes(self.dataset.keys[camera])
         return iter(()) if stored is None else stored.drawn(self._number, self.num_frames)
 
 
 def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeInfo:
-    """The description with an arm, and which of its joints the features move."""
+    """Add an arm and the joints that the features move to a description."""
     features = tuple(robot.record.described(feature, roles.usual_name(feature.name)) for feature in info.features)
     return replace(info, urdf=robot.urdf, features=features)
 
 
 def _described(camera: Camera, found: Mapping[str, Any] | None, links: set[str]) -> Camera:
-    """A camera with what the sidecar says of it."""
+    """Add the sidecar's data to a camera."""
     if found is None:
         return camera
     intrinsics, pose = found["intrinsics"], found["mount_from_camera"]
     if intrinsics is not None and len(intrinsics) == 9 and all(map(_is_finite, intrinsics)):
         camera = replace(camera, intrinsics=tuple(intrinsics))
-    # A camera that stands in the world of a simulation hangs on no link, and where the arm stands there is not said.
+    # A camera fixed in a simulated world has no link, and the sidecar does not record the arm's position in it.
     is_pose = (
         pose is not None and len(pose) == 7 and all(map(_is_finite, pose)) and abs(math.hypot(*pose[3:]) - 1) < 1e-3
     )

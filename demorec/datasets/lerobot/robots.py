@@ -36,11 +36,11 @@ ROBOTS_DIR = f"{SIDECAR_DIR}/robots"
 
 _DIGEST = re.compile(r"[0-9a-f]{16}")
 IN_MOTOR_UNITS = {"so101": SO101_FOLLOWER}
-"""Row of `ROBOTS` that LeRobot drives too, in other units -> LeRobot's arm."""
+"""Row of `ROBOTS` that LeRobot also drives, in other units -> LeRobot's arm."""
 _IN_METRES = "gripper.width"
-"""Name of a gripper's element in metres; LeRobot's own is gripper.pos."""
+"""Name of a gripper's element in metres; LeRobot's own name is gripper.pos."""
 _KEPT = ("material", "link", "joint")
-"""Parts of a URDF that place and draw links; the others are for simulators and controllers, and full of paths."""
+"""Parts of a URDF that place and draw links; the rest is for simulators and controllers, and contains many paths."""
 _IN_PACKAGE = re.compile(r"^(?:file:/*)?/.*/share/([^/]+/.+)$")
 """An absolute path into an installed ROS package."""
 _ABSOLUTE = re.compile(r"^(file:|/|~|[A-Za-z]:[\\/]|\\\\)")
@@ -52,8 +52,8 @@ class RobotRecord:
 
     Attributes:
         name: The dataset's `robot_type`.
-        urdf_sha256: SHA-256 (hex) of the URDF's file.
-        joints: Feature -> joint of the URDF for each element that is its position, "" for the others.
+        urdf_sha256: SHA-256 (hex) of the URDF file.
+        joints: Feature -> for each element the URDF joint with that position, "" for other elements.
         units: Feature -> units of its elements, if known; positions are in rad and m otherwise.
         calibration: Feature -> calibration of its elements (`Feature.calibration`), for servos in other units.
         spec: TCP link, limits and gripper of a simulated arm, and `urdf`, its model with meshes; the URDF here has
@@ -68,11 +68,11 @@ class RobotRecord:
     calibration: Mapping[str, tuple[tuple[float, float], ...]] = field(default_factory=dict)
 
     def described(self, feature: Feature, usual_name: str = "") -> Feature:
-        """Return a feature with its joints, units and calibration, as far as they fit its elements.
+        """Return a feature with its joints, units and calibration, if they fit its elements.
 
-        Args:
+        feature: Description in the dataset.
             feature: As the dataset describes it.
-            usual_name: Under which it is known here, where its own name is not; "" for none.
+            usual_name: Name for the lookup if its own name is unknown; "" for none.
         """
 
         def fitting[T](found: Mapping[str, tuple[T, ...]]) -> tuple[T, ...]:
@@ -89,7 +89,7 @@ class RobotRecord:
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetRobot:
-    """The content of an arm's two files."""
+    """Content of an arm's two files."""
 
     record: RobotRecord
     urdf: str
@@ -125,7 +125,7 @@ def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
 
 
 def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> DatasetRobot:
-    """Build an arm whose joints these features move; `known` are further attributes of its record."""
+    """Build an arm with the joints that these features move; `known` are further attributes of its record."""
     record = RobotRecord(
         name=name,
         urdf_sha256=_sha256(urdf),
@@ -139,13 +139,12 @@ def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> Dat
 
 @functools.cache
 def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
-    """Return the row of `ROBOTS` whose joints name the elements of observation.state, such as "panda_joint1.pos".
+    """Return the row of `ROBOTS` with joints named like the elements of observation.state, such as "panda_joint1.pos".
 
-    This is for datasets without a description of the robot; lengths are those of the model. LeRobot's own arms are left
-    out unless the name of the gripper implies metres: their joints have the same names in degrees and in shares of
-    their ranges.
+    For datasets without a description of the robot; lengths are those of the model. LeRobot's own arms are left out
+    unless the gripper's name implies metres: their joints have the same names in degrees and in shares of their ranges.
     """
-    from demorec.mcap.description import robot_description  # loads all that reads recordings
+    from demorec.mcap.description import robot_description  # loads all code for reading recordings
 
     stems = [joint_of(name) for name in names]
     for row in ROBOTS.names():
@@ -154,7 +153,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
             continue
         if set(robot.arm_joints) <= set(stems):
             urdf = robot_description(robot.urdf, 1.0)
-            # An opening in metres is not an angle of the jaw.
+            # An opening in metres is not a jaw angle.
             known = zip(names, stems, strict=True)
             joints = tuple(stem if stem in robot.joint_names and name != _IN_METRES else "" for name, stem in known)
             return _robot(robot.name, urdf, [Feature(name=STATE, names=names, joints=joints)])
@@ -170,18 +169,18 @@ def motor_features(motors: Motors) -> tuple[Feature, ...]:
 @functools.cache
 def robot_of_motors(motors: Motors) -> DatasetRobot:
     """Return the arm with these servos."""
-    from demorec.mcap.description import robot_description  # loads all that reads recordings
+    from demorec.mcap.description import robot_description  # loads all code for reading recordings
 
     (model,) = (ROBOTS.load(name).urdf for name, arm in IN_MOTOR_UNITS.items() if arm.robot_type == motors.robot_type)
     return _robot(motors.robot_type, robot_description(model, 1.0), motor_features(motors))
 
 
-@functools.lru_cache(maxsize=8)  # nearly always the same in all recordings of a run
+@functools.lru_cache(maxsize=8)  # usually the same for all recordings of a run
 def portable_urdf(text: str) -> str:
-    """Return the links, joints and materials of a URDF, without paths of the machine that it comes from.
+    """Return the links, joints and materials of a URDF, without paths of the source machine.
 
-    Files in a ROS package are named by it (package://NAME/...), other absolute paths by the file's name alone. Comments
-    are removed, since xacro writes the folder in which it ran.
+    Files in a ROS package are named by package (package://NAME/...), files with other absolute paths by file name only.
+    Comments are removed, because xacro writes its working folder into one.
     """
     robot = parse_xml(text)
     for part in list(robot):
@@ -219,7 +218,7 @@ def read_robot(root: Path, name: str) -> DatasetRobot:
     path = root / ROBOTS_DIR / f"{name}.json"
     try:
         if not _DIGEST.fullmatch(name):
-            raise ValueError(f"{name[:20]!r} is no digest")
+            raise ValueError(f"{name[:20]!r} is not a digest")
         record = from_json(read_text_limited(path, MAX_JSON_BYTES), RobotRecord)
         robot = DatasetRobot(record=record, urdf=read_text_limited(path.with_suffix(".urdf"), MAX_BYTES))
         if robot.digest != name or _sha256(robot.urdf) != record.urdf_sha256:

@@ -1,7 +1,7 @@
-"""Episodes found by the rows of a dataset, for a table of episodes that is missing or names other files.
+"""Episodes located by a dataset's rows, if the table of episodes is missing or names other files.
 
-Each row names its episode. The images are found by their number: an episode has as many as rows, the videos of a camera
-hold the episodes in order, and no episode straddles two files.
+Each row contains the number of its episode. The images are located by counting: an episode has as many as rows, a
+camera's videos hold the episodes in order, and no episode spans two files.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class EpisodeRun:
     """Consecutive rows of one episode in a data file.
 
     Attributes:
-        episode_index: As the rows have it.
+        episode_index: Number in the rows.
         data: The file.
-        first_row: Of its rows in that file.
-        counters: Column of `COUNTERS` that the file has -> (T,) its values.
+        first_row: Index of its first row in that file.
+        counters: Column in `COUNTERS` that the file has -> (T,) its values.
     """
 
     episode_index: int
@@ -51,14 +51,14 @@ class EpisodeRun:
 
 
 def episode_runs(files: Sequence[Path], first: int = 0) -> list[EpisodeRun]:
-    """Find the episodes in data files, in the order of their rows: another one begins where `frame_index` falls, too.
+    """Find the episodes in data files, in row order: a decrease of `frame_index` also begins a new one.
 
     Args:
         files: The data files.
         first: Number of the first episode, if the rows have no `episode_index`.
 
     Raises:
-        ExportError: A file cannot be read, or nothing in its rows tells the episodes apart.
+        ExportError: A file cannot be read, or its rows have no column that separates episodes.
     """
     runs: list[EpisodeRun] = []
     for path in files:
@@ -83,7 +83,7 @@ def _runs_in(path: Path, first: int) -> Iterator[EpisodeRun]:
 
 
 def _numbered(path: Path, counters: Mapping[str, NDArray[np.int64]], first: int) -> NDArray[np.int64]:
-    """Number the rows' episodes, (T,): by the name of the file before v3.0, else where `frame_index` falls."""
+    """Number the rows' episodes, (T,): by the file name before v3.0, otherwise by decreases of `frame_index`."""
     if "frame_index" not in counters:
         raise ExportError(
             f"The rows have no episode_index and no frame_index, so episodes cannot be told apart: {path}"
@@ -103,16 +103,16 @@ def _counters(path: Path) -> dict[str, NDArray[np.int64]]:
             values = column_numbers(batch.column(name)).reshape(-1)
             is_whole = values.dtype.kind in "iu" or bool(values.dtype.kind == "f" and (values % 1 == 0).all())
             if len(values) != len(batch) or not is_whole:
-                raise ExportError(f"The column {name} does not hold one whole number a row: {path}")
+                raise ExportError(f"The column {name} does not hold one integer per row: {path}")
             parts[name].append(values.astype(np.int64))
     return {name: np.concatenate(values) for name, values in parts.items()}
 
 
 def places_by_rows(root: Path, info: DatasetInfo, tasks: Sequence[str]) -> tuple[EpisodePlace, ...]:
-    """Find every episode by its rows, in the order of their numbers.
+    """Locate every episode by its rows, in the order of their numbers.
 
     Raises:
-        ExportError: Two episodes have one number, or it cannot be known which images are an episode's.
+        ExportError: Two episodes have the same number, or the images of an episode cannot be determined.
     """
     runs = sorted(episode_runs(tables_in(root, "data")), key=lambda run: run.episode_index)
     numbers = [run.episode_index for run in runs]
@@ -126,11 +126,11 @@ def places_by_rows(root: Path, info: DatasetInfo, tasks: Sequence[str]) -> tuple
 def placed(
     runs: Sequence[EpisodeRun], images: Mapping[str, Sequence[tuple[Path, int]]], tasks: Sequence[str]
 ) -> tuple[EpisodePlace, ...]:
-    """Place the episodes one after the other.
+    """Place the episodes in sequence.
 
     Args:
-        runs: Their rows.
-        images: Camera feature -> file and first image of each.
+        runs: Rows of the episodes.
+        images: Camera feature -> file and first image of each episode.
         tasks: Instructions by number.
     """
     begins = np.cumsum([0, *(run.length for run in runs)]).tolist()
@@ -149,10 +149,10 @@ def placed(
 
 
 def images_by_rows(root: Path, info: DatasetInfo, key: str, runs: Sequence[EpisodeRun]) -> list[tuple[Path, int]]:
-    """Find the images of a camera by their number: file and first image of each episode, one after the other.
+    """Locate a camera's images by counting: file and first image of each episode, in order.
 
     Raises:
-        ExportError: The videos hold another number of images.
+        ExportError: The videos have a different number of images.
     """
     if info.is_old:
         template, size = info.video_path or VIDEO_PATH, int(info.chunks_size)
@@ -161,7 +161,7 @@ def images_by_rows(root: Path, info: DatasetInfo, key: str, runs: Sequence[Episo
         return [(path if path.exists() else elsewhere(root, path, key) or path, 0) for path in paths]
     counts = {path: len(mp4_index(path)[0]) for path in sorted(root.glob(f"videos/{key}/*/*.mp4"))}
     rows, total = sum(run.length for run in runs), sum(counts.values())
-    # Images beyond the rows are those of episodes whose rows were lost, the last ones of an interrupted recording.
+    # Extra images belong to episodes with lost rows, the last ones of an interrupted recording.
     if total not in (rows, int(info.total_frames)) or total < rows:
         raise _unknown_images(root, key, f"{total} images for {rows} rows")
     found: list[tuple[Path, int]] = []
@@ -178,13 +178,13 @@ def images_by_rows(root: Path, info: DatasetInfo, key: str, runs: Sequence[Episo
 
 def _unknown_images(root: Path, key: str, found: str) -> ExportError:
     return ExportError(
-        f"It cannot be known which images of {key} belong to which rows ({found}): leave the camera out (demorec "
+        f"The images of {key} cannot be assigned to rows ({found}): leave the camera out (demorec "
         f"dataset drop-features), or restore its videos: {root}"
     )
 
 
 def relocated(root: Path, listed: Sequence[EpisodePlace]) -> tuple[EpisodePlace, ...] | None:
-    """Find the rows of episodes if their table names other data files; None if the table fits, or no file does.
+    """Locate the rows of episodes if their table names other data files; None if the table fits, or no file does.
 
     Raises:
         ExportError: A data file cannot be read.
@@ -204,7 +204,7 @@ def relocated(root: Path, listed: Sequence[EpisodePlace]) -> tuple[EpisodePlace,
 
 
 def _num_rows(places: Sequence[EpisodePlace]) -> dict[Path, int]:
-    """Data file -> number of rows that its episodes have."""
+    """Data file -> number of its episodes' rows."""
     found: dict[Path, int] = {}
     for place in places:
         found[place.data] = found.get(place.data, 0) + place.length

@@ -1,4 +1,4 @@
-"""Rows of a dataset's tables by episode: those of the data files, and those of tables with an `episode_index`."""
+"""Rows of a dataset's tables by episode: in the data files, and in tables with an `episode_index`."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from demorec.datasets.lerobot.paths import INFO_PATH
 
 _NUMBERS = ("float32", "float64", "int64", "bool")
 OWN_COUNTERS = ("episode_index", "frame_index")
-"""Columns that prove whose rows these are."""
+"""Columns that verify the episode of a row."""
 _INDEX_ROWS = 4096
 
 
 class DataRows:
-    """Some columns of the data files, episode after episode, in any order; one batch of a file is in memory.
+    """Some columns of the data files, for episodes in any order; one batch of a file is in memory.
 
-    Every row is proven to be the episode's own: by its `episode_index` and, where the file has one, `frame_index`.
-    Counters and timestamps that a file lacks follow from the place of the rows.
+    Every row is verified by its `episode_index` and, if the file has one, `frame_index`. Missing counters and
+    timestamps are derived from the position of the rows.
 
     Args:
         features: Features of the dataset.
-        num_rows: Data file -> number of rows that its episodes have.
+        num_rows: Data file -> number of its episodes' rows.
         names: Columns to read.
         fps: Frames per second.
-        task_number: Gives the number of an episode's task.
-        own: Columns that prove whose rows are read, where a file has them.
+        task_number: Returns the number of an episode's task.
+        own: Columns that verify the rows, if a file has them.
 
     Attributes:
         names: Columns to read.
 
-    Methods raise ExportError if the rows cannot be read, or are those of other episodes.
+    Methods raise ExportError if the rows cannot be read, or belong to other episodes.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class DataRows:
         own: Sequence[str] = OWN_COUNTERS,
     ) -> None:
         if missing := [name for name in names if name not in features]:
-            raise ExportError(f"The dataset has no {', '.join(missing)}, by {INFO_PATH}")
+            raise ExportError(f"The dataset has no {', '.join(missing)}, according to {INFO_PATH}")
         self.names = list(names)
         self._features = {name: features[name] for name in names}
         self._num_rows, self._fps, self._task_number, self._own = num_rows, fps, task_number, own
@@ -73,8 +73,8 @@ class DataRows:
         there, listed = (self._tables.num_rows(place.data), self._num_rows[place.data]) if place.length else (0, 0)
         if there > listed:
             raise ExportError(
-                f"The data file has {there} rows, the episodes' table only lists {listed} of them, so that it is not "
-                f"complete: {place.data}"
+                f"The data file has {there} rows, the episodes' table lists only {listed} of them and is "
+                f"incomplete: {place.data}"
             )
         for batch in self._tables.read(place.data, place.first_row, place.length) if place.length else ():
             _check_own(batch, place, found, self._own)
@@ -82,13 +82,13 @@ class DataRows:
             found += len(batch)
         if found < place.length:
             raise ExportError(
-                f"Episode {place.episode_index} has {place.length} frames, its data file ends before: {place.data}"
+                f"Episode {place.episode_index} has {place.length} frames, but its data file ends earlier: {place.data}"
             )
 
     def _completed(self, batch: pa.RecordBatch, place: EpisodePlace, begin: int) -> pa.RecordBatch:
-        """Add the counters and timestamps that a file lacks, and make counters whole numbers.
+        """Add missing counters and timestamps, and convert counters to integers.
 
-        The first row of the batch is the frame `begin`.
+        The first row of the batch is frame `begin`.
         """
         frames = np.arange(begin, begin + len(batch))
         for name in self._automatic:
@@ -105,14 +105,14 @@ class DataRows:
         """Read all rows of an episode. Raises ExportError also if it has none."""
         if not place.length:
             raise ExportError(
-                f"Episode {place.episode_index} has no frames, drop that episode: its data would be in {place.data}"
+                f"Episode {place.episode_index} has no frames, drop this episode: its data file would be {place.data}"
             )
         return pa.Table.from_batches(list(self.batches(place)))
 
     def numbers(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
         """Read feature -> (T, D) numbers of an episode as info.json describes them, or (T, 1) texts.
 
-        Of language and of stored images, the texts are digests of each row.
+        For language and stored images, the texts are digests of each row.
         """
         parts = [
             [self._values(name, batch.column(name), place) for name in self.names] for batch in self.batches(place)
@@ -151,7 +151,7 @@ def _implied(
 
 
 def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequence[str]) -> None:
-    """Raise ExportError unless a batch, the first row of which is the frame `begin`, has rows of this episode."""
+    """Raise ExportError unless a batch, which starts at frame `begin`, has rows of this episode."""
     expected = {"episode_index": place.episode_index, "frame_index": np.arange(begin, begin + len(batch))}
     for name, numbers in expected.items():
         if name not in own or name not in batch.schema.names:
@@ -160,7 +160,7 @@ def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequ
             found = column_values(batch.column(name))[:, 0]
         if len(wrong := np.flatnonzero(found != numbers)):
             raise ExportError(
-                f"The rows of episode {place.episode_index} are not its own: frame {begin + int(wrong[0])} has the "
+                f"The rows of episode {place.episode_index} are another one's: frame {begin + int(wrong[0])} has the "
                 f"{name} {found[wrong[0]]}. Restore the file, or drop the episode: {place.data}"
             )
 
@@ -171,7 +171,7 @@ def _column_errors(name: str, place: EpisodePlace) -> Iterator[None]:
     try:
         yield
     except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
-        raise ExportError(f"The column {name} holds something else than numbers: {place.data}") from error
+        raise ExportError(f"The column {name} holds values that are not numbers: {place.data}") from error
 
 
 def column_values(column: pa.Array) -> NDArray[Any]:
@@ -193,7 +193,7 @@ class IndexedRows:
 
     Args:
         paths: The tables.
-        schema: Columns to read, null where a table lacks one; by default those of the first table.
+        schema: Columns to read, null if a table lacks one; default those of the first table.
         rows: Maximum number of rows in a batch.
 
     Methods raise ExportError if the tables cannot be read.
@@ -214,7 +214,7 @@ class IndexedRows:
         self._tables = TableReader(["episode_index"], optional=self._schema.names, rows=rows)
 
     def read(self, episode_index: int) -> pa.Table | None:
-        """Read all rows of an episode; None if there are none."""
+        """Read all rows of an episode; None if it has none."""
         batches = [
             self._conformed(batch, path)
             for path, first, count in self._parts.get(episode_index, ())
@@ -223,7 +223,7 @@ class IndexedRows:
         return pa.Table.from_batches(batches) if batches else None
 
     def frames(self, episode_index: int, first: int, last: int) -> pa.Table | None:
-        """Read the rows with a `frame_index` from `first` to before `last`, in order."""
+        """Read the rows with a `frame_index` of `first` to `last` - 1, in order."""
         if (rows := self.read(episode_index)) is None:
             return None
         frames = rows.column("frame_index").to_numpy()
@@ -240,4 +240,4 @@ class IndexedRows:
             ]
             return pa.RecordBatch.from_arrays(columns, schema=self._schema)
         except (ValueError, pa.ArrowException) as error:
-            raise ExportError(f"The table has columns of other types ({describe_error(error)}): {path}") from error
+            raise ExportError(f"The table has columns with other types ({describe_error(error)}): {path}") from error

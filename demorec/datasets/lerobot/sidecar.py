@@ -1,13 +1,13 @@
-"""The sidecar: data that LeRobot has no place for, in the folder `demorec/` of the dataset.
+"""The sidecar: data without a place in LeRobot's format, in the folder `demorec/` of the dataset.
 
 - `episodes/`: one row per episode: its source (run's episode number, attempt, seed, config digest), its outcome (every
-  check with its value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and
-  `episode_info`: the complete description of scene and robot as JSON, from which `demorec` can build the world again.
+check with value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and `episode_info`:
+the complete description of scene and robot as JSON, from which `demorec` can rebuild the world.
 - `camera_poses/`: one row per frame, for cameras that move.
-- `attempts/`: one row per attempt, failed ones included, for success rates. A failed attempt precedes the attempt that
+- `attempts/`: one row per attempt, including failed ones, for success rates. A failed attempt precedes the attempt that
   became an episode.
 - `robots/`: the arms as URDFs (`demorec.datasets.lerobot.robots`).
-- `configs.json`: config digest -> resolved configuration; `export.json`: how the dataset was made.
+- `configs.json`: config digest -> resolved configuration; `export.json`: options of the export.
 """
 
 from __future__ import annotations
@@ -105,8 +105,8 @@ class EpisodeRecord:
 
     Attributes:
         row: Row of the table of episodes, without the index.
-        attempt: Row of the table of attempts, likewise.
-        failed: Rows of the failed attempts before it, of an episode that comes from another dataset.
+        attempt: Row of the table of attempts, also without the index.
+        failed: Rows of the failed attempts before it, for an episode from another dataset.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config: Configuration of the run.
         robot: The arm; None if unknown.
@@ -144,7 +144,7 @@ class EpisodeRecord:
 
 
 def _simulated_row(simulation: Simulation, episode: ExportEpisode[Any]) -> dict[str, Any]:
-    """Return the columns that need a simulation; one that was cut off had no outcome yet."""
+    """Return the columns that need a simulation; a truncated recording has no outcome."""
     trajectory, recording = episode.recording.trajectory(), episode.recording
     outcome = recording.outcome or Outcome(num_frames=recording.num_frames)
     return {
@@ -207,7 +207,7 @@ class SidecarWriter(Closing):
             table.abort()
 
     def add(self, episode_index: int, digest: str, record: EpisodeRecord) -> None:
-        """Add an episode of the dataset, its digest, and the attempts that led to it."""
+        """Add an episode of the dataset, its digest, and the attempts before it."""
         self._episodes.add_row({**record.row, "episode_index": episode_index, "content_digest": digest})
         if record.robot is not None:
             write_robot(self._root, record.robot)
@@ -244,7 +244,7 @@ class SidecarWriter(Closing):
 
 
 def attempt_row(recording: Recording) -> dict[str, Any]:
-    """Return one attempt, less `episode_index`, from the recording's metadata; `success` is None if unknown."""
+    """Return one attempt, without `episode_index`, from the recording's metadata; `success` is None if unknown."""
     info, outcome = recording.info, recording.outcome
     return {
         "source": recording.path.name,
@@ -257,15 +257,15 @@ def attempt_row(recording: Recording) -> dict[str, Any]:
 
 
 class Attempts:
-    """The rows of a sidecar's table of attempts, by the episode to which each belongs.
+    """The rows of a sidecar's table of attempts, grouped by episode.
 
     Args:
         paths: Tables of the sidecar.
 
     Attributes:
-        own: Episode -> the attempt that became it.
+        own: Episode -> the attempt that produced it.
         failed: Episode -> failed attempts before it.
-        homeless: Failed attempts at episodes that the dataset does not have.
+        homeless: Failed attempts at episodes that are not in the dataset.
         failures: All failed attempts, in order.
 
     Raises:

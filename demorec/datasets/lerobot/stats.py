@@ -1,6 +1,6 @@
-"""The ten numbers that LeRobot keeps of every feature, exact: of vectors from the values, of images from histograms.
+"""LeRobot's ten statistics of each feature, computed exactly: of vectors from the values, of images from histograms.
 
-LeRobot estimates quantiles with histograms of 5,000 bins; here each is what `numpy.quantile` gives.
+LeRobot estimates quantiles from histograms with 5,000 bins; here they equal `numpy.quantile`.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ NAMES = ("min", "max", "mean", "std", "count", *QUANTILES)
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Statistics:
-    """The ten numbers of one feature.
+    """The ten statistics of one feature.
 
     Attributes:
-        values: Every name of `NAMES` but "count" -> (D,) float64.
-        count: Frames.
-        is_camera: Images have the shape (channels, 1, 1) in LeRobot's files.
+        values: Every name in `NAMES` except "count" -> (D,) float64.
+        count: Number of frames.
+        is_camera: Whether the arrays have the shape (channels, 1, 1) in LeRobot's files.
     """
 
     values: Mapping[str, Array]
@@ -39,37 +39,37 @@ class Statistics:
     is_camera: bool = False
 
     def nested(self, name: str) -> list[Any]:
-        """One of them as LeRobot writes it."""
+        """One statistic in LeRobot's form."""
         if name == "count":
             return [self.count]
         numbers = self.values[name].tolist()
         return [[[number]] for number in numbers] if self.is_camera else numbers
 
     def to_json(self) -> dict[str, list[Any]]:
-        """All of them."""
+        """All statistics in LeRobot's form."""
         return {name: self.nested(name) for name in NAMES}
 
     @classmethod
     def from_json(cls, entry: Mapping[str, Any]) -> Statistics | None:
-        """Inverse; None when the entry has not all ten, ValueError or TypeError when they are no numbers."""
+        """Inverse of `to_json`; None if one of the ten is missing, ValueError or TypeError if they are not numbers."""
         if any(name not in entry for name in NAMES):
             return None
         try:
             values = {name: np.asarray(entry[name], dtype=np.float64).reshape(-1) for name in NAMES if name != "count"}
             count = int(np.asarray(entry["count"]).reshape(-1)[0])
         except (IndexError, OverflowError) as error:
-            raise ValueError("statistics that are no numbers") from error
+            raise ValueError("statistics that are not numbers") from error
         return cls(values=values, count=count, is_camera=np.asarray(entry["mean"]).ndim == 3)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PixelHistogram:
-    """How often each level of each channel occurs.
+    """Count of each level in each channel.
 
     Attributes:
         counts: (channels, levels) int64.
-        level_values: (levels,) what a level stands for: 0..1 for colour, metres for depth.
-        num_images: Of how many images.
+        level_values: (levels,) value of each level: 0..1 for colour, metres for depth.
+        num_images: Number of images counted.
     """
 
     counts: NDArray[np.int64]
@@ -80,7 +80,7 @@ class PixelHistogram:
         return replace(self, counts=self.counts + other.counts, num_images=self.num_images + other.num_images)
 
     def statistics(self) -> Statistics:
-        """Exact, over all counted pixels."""
+        """Exact statistics over all counted pixels."""
         channels = [_of_levels(counts, self.level_values) for counts in self.counts]
         values = {name: np.array([channel[name] for channel in channels]) for name in NAMES if name != "count"}
         return Statistics(values=values, count=self.num_images, is_camera=True)
@@ -106,12 +106,12 @@ def _of_levels(counts: NDArray[np.int64], levels: Array) -> dict[str, float]:
 
 
 def colour_levels() -> Array:
-    """What the 256 levels of a colour channel stand for: 0..1."""
+    """Values of the 256 levels of a colour channel, 0..1."""
     return np.arange(256) / 255.0
 
 
 def vector_statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, Statistics]:
-    """Of one episode: feature -> statistics, in one sort over all components.
+    """Statistics of one episode by feature, in one sort over all components.
 
     Args:
         columns: Feature -> (T,) or (T, D) numbers or bools.
@@ -136,14 +136,16 @@ def vector_statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, Statisti
 
 
 def quantile_ranks(q: float, count: int) -> tuple[int, int, float]:
-    """The two order statistics between which the quantile lies, and the weight of the upper one (as NumPy)."""
+    """The two order statistics around the quantile, and the weight of the upper one (as NumPy)."""
     position = q * (count - 1)
     low = int(position)
     return low, min(low + 1, count - 1), position - low
 
 
 def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """Of several sets of images together: exact but for the quantiles, which are averaged as LeRobot does."""
+    """Merge the statistics of several sets of images: exact except for the quantiles, which are averaged as in
+    LeRobot.
+    """
     if len(parts) == 1:
         return parts[0]
     counts = np.array([part.count for part in parts], dtype=np.float64)
@@ -168,14 +170,14 @@ _BATCH_ROWS = 2048
 
 
 def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
-    """Feature -> statistics over all rows; of arrays of several dimensions, as LeRobot has them, along the last one.
+    """Feature -> statistics over all rows; for arrays of several dimensions along the last one, as in LeRobot.
 
     Args:
         files: Parquet files with the columns of `features`.
-        features: All features; what is no numbers is left out.
+        features: All features; those that are not numeric are left out.
 
     Raises:
-        ExportError: A column holds what is no number, or no rows at all.
+        ExportError: A column holds values that are not numbers, or has no rows.
     """
     paths = list(files)
     groups: dict[int, dict[str, int]] = {}
@@ -189,12 +191,12 @@ def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature
 
 
 def _group_statistics(paths: Sequence[Path], widths: Mapping[str, int], times: int) -> dict[str, Statistics]:
-    """Of features whose frames have that many vectors each; name -> D."""
+    """Statistics of features with `times` vectors per frame; `widths` maps names to D."""
 
     def vectors() -> Iterator[Array]:
         for arrays in _batches(paths, list(widths)):
-            if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of several lengths
-                raise ExportError("A column of the dataset holds values that are no numbers, so it has no statistics.")
+            if any(array.dtype.kind not in "fiub" for array in arrays):  # nulls, or lists of different lengths
+                raise ExportError("A column of the dataset holds values that are not numbers, so it has no statistics.")
             blocks = [array.reshape(times * len(array), -1) for array in arrays]
             yield np.concatenate(blocks, axis=1, dtype=np.float64)
 
@@ -214,7 +216,7 @@ def _quantiles(paths: Sequence[Path], name: str, shape: tuple[int, int]) -> dict
     ranks = {key: quantile_ranks(q, shape[1]) for key, q in QUANTILES.items()}
     wanted = sorted({rank for low, high, _ in ranks.values() for rank in (low, high)})
     found = np.empty((shape[0], len(wanted)))
-    # One component after another, in a file beside the data: /tmp may be memory.
+    # One component at a time, in a file next to the data: /tmp may be in memory.
     with tempfile.TemporaryFile(dir=paths[0].parent, buffering=0) as file:
         start = 0
         for (rows,) in _batches(paths, [name]):
@@ -237,7 +239,7 @@ def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[A
 
 
 def _moments(parts: Iterable[Array]) -> tuple[int, dict[str, Array]]:
-    """How many rows numbers (T, D) that come in parts have; their minimum, maximum, mean and deviation.
+    """Number of rows of arrays (T, D) that arrive in parts, and their minimum, maximum, mean and standard deviation.
 
     Chan, Golub and LeVeque 1979.
     """

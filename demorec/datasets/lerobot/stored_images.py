@@ -38,7 +38,7 @@ class StoredImages:
         yield from self.decode(place, columns if frames is None else _some_rows(columns, frames))
 
     def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
-        """Yield (H, W, 3) uint8 RGB of some rows of an episode, whose column was read already."""
+        """Yield (H, W, 3) uint8 RGB of some rows of an episode, from their column."""
         path = place.data
         shape: tuple[int, ...] | None = None
         for column in columns:
@@ -48,7 +48,7 @@ class StoredImages:
                 try:
                     image = self._decoded(data or b"")
                     if shape not in (None, image.shape):
-                        raise ValueError(f"it is of another size, {image.shape[1]}x{image.shape[0]} pixels")
+                        raise ValueError(f"it has another size, {image.shape[1]}x{image.shape[0]} pixels")
                 except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
                     raise ExportError(
                         f"An image of {self._key} cannot be read ({describe_error(error)}): {path}"
@@ -63,12 +63,12 @@ class StoredImages:
             if image.width * image.height > MAX_PIXELS:
                 raise ValueError(f"{image.width}x{image.height} pixels, at most {MAX_PIXELS:,} are read")
             if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
-                raise ValueError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
+                raise ValueError(f"its pixels are {image.mode!r}, which is not 8-bit colour")
             return np.asarray(image.convert("RGB"))
 
 
 def _some_rows(columns: Iterable[pa.Array], wanted: Collection[int]) -> Iterator[pa.Array]:
-    """Yield the rows with some numbers of a column that comes in pieces."""
+    """Yield the rows with these numbers from a column that arrives in parts."""
     first = 0
     for column in columns:
         is_wanted = [first + row in wanted for row in range(len(column))]

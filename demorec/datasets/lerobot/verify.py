@@ -1,7 +1,7 @@
 """Comparison of a finished dataset, read by the installed LeRobot, with the recordings.
 
-LeRobot alone finds the rows, files and images. It runs in a separate process, since it loads PyTorch (seconds,
-hundreds of megabytes) and keeps copies of the tables in a cache, here a temporary folder.
+Only LeRobot locates the rows, files and images. It runs in a separate process, because it loads PyTorch (seconds,
+hundreds of megabytes) and caches copies of the tables, here in a temporary folder.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ MAX_EPISODES = 500
 _TRANSCODED_TOLERANCE = 12.0
 """Maximum mean absolute difference of a transcoded image, in levels (0..255); others must be equal."""
 _DEPTH_TOLERANCE = 6e-4
-"""Metres; LeRobot rounds distances to millimetres."""
+"""Metres; LeRobot rounds depth to millimetres."""
 
 _GRACE_S = 5.0
-"""Time for the process to end by itself."""
+"""Maximum time for the process to end by itself."""
 
 
 def lerobot_is_installed() -> bool:
@@ -50,7 +50,7 @@ def lerobot_is_installed() -> bool:
 
 
 class Verifier:
-    """Context manager over the process that verifies; it loads LeRobot while the export runs.
+    """Context manager of the verification process, which loads LeRobot while the export runs.
 
     Leaving the context ends the process in any state: with too little memory, loading may never end.
     """
@@ -60,7 +60,7 @@ class Verifier:
         self._pipe, theirs = SPAWN.Pipe()
         self._process = SPAWN.Process(target=_serve, args=(theirs, self._cache.name), daemon=True)
         self._process.start()
-        theirs.close()  # else the pipe would never report that the process is gone
+        theirs.close()  # otherwise the pipe would never report that the process has ended
 
     def __enter__(self) -> Verifier:
         return self
@@ -75,10 +75,10 @@ class Verifier:
         self._cache.cleanup()
 
     def verify(self, root: Path, samples: Sequence[tuple[int, Path]], options: ExportOptions) -> int:
-        """Compare episodes with the recordings that they come from; return how many frames were compared.
+        """Compare episodes with their recordings; return the number of frames compared.
 
         Raises:
-            ExportError: LeRobot cannot open the dataset, or shows something else than the recordings.
+            ExportError: LeRobot cannot open the dataset, or reads values that differ from the recordings.
         """
         try:
             self._pipe.send((root, tuple(samples), options))
@@ -86,7 +86,7 @@ class Verifier:
         except (EOFError, OSError) as error:
             self._process.join()
             raise ExportError(
-                f"The new dataset was dropped: the process that verifies ended by itself (exit code "
+                f"The new dataset was dropped: the verification process ended unexpectedly (exit code "
                 f"{self._process.exitcode}), often for lack of memory; free some, or give --no-verify."
             ) from error
         if isinstance(found, DemorecError):
@@ -97,7 +97,7 @@ class Verifier:
 def _serve(pipe: Connection[Any, Any], cache: str) -> None:
     """Load LeRobot, verify the dataset named through the pipe, and answer with a count or an error."""
     signal.signal(signal.SIGTERM, exit_silently)  # an orderly end: libraries left semaphores
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; who exports ends us
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the exporting process ends this one
     os.environ.update(HF_HUB_OFFLINE="1", HF_DATASETS_OFFLINE="1", HF_DATASETS_CACHE=cache)
     answer: int | DemorecError
     try:
@@ -136,7 +136,7 @@ def _verify(root: Path, samples: Sequence[tuple[int, Path]], options: ExportOpti
 def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, number: int) -> int:
     first = int(dataset.meta.episodes[episode_index]["dataset_from_index"])
     length = len(episode.rows)
-    # The last frame, where offsets add up, and one more that differs from episode to episode.
+    # The last frame, where offsets accumulate, and another one that varies between episodes.
     moments = sorted({(number * 37) % length, length - 1})
     language = language_of(episode)
     for moment in moments:
@@ -172,7 +172,7 @@ def _compare_episode(dataset: Any, episode_index: int, episode: LeRobotEpisode, 
 
 
 def _is_wrong_image(tensor: Any, episode: LeRobotEpisode, camera: ExportCamera, moment: int) -> bool:
-    """Whether an image differs from the recorded one, for depth beyond the resolution of its codes."""
+    """Whether an image differs from the recorded one; for depth, by more than the resolution of its codes."""
     number, recording = int(episode.numbers(camera)[moment]), episode.recording
     if camera.is_depth:
         recorded = next(islice(recording.depth(camera.name), number, None))

@@ -1,7 +1,8 @@
-"""The videos of a dataset: the encoded images of an episode, its pixels, its distances.
+"""Videos of a dataset: an episode's encoded images, decoded pixels and depth.
 
-A dataset's video holds many episodes. The images of one are found by the index of the file. They can be copied as they
-are, together with those from which they are decoded: from a keyframe on, and to the last one that a frame needs.
+A dataset's video holds many episodes. An episode's images are found by the index of the file. They can be copied
+without re-encoding, together with the images from which they are decoded: from a keyframe to the last image that a
+frame needs.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ _TO_START_CODES = {"h264": "h264_mp4toannexb", "h265": "hevc_mp4toannexb"}
 _TEMPORAL_DELIMITER = b"\x12\x00"
 """Precedes every temporal unit of AV1 (its specification, section 7.5); mp4 files leave it out."""
 _MAX_REORDERED = 32
-"""Images by which one is stored before it is shown; codecs allow 16."""
+"""Maximum number of images by which storage order and display order differ; codecs allow 16."""
 
 OpenedVideo = tuple[av.container.InputContainer, av.video.stream.VideoStream]
 
@@ -52,7 +53,7 @@ def opened_video(path: Path) -> Iterator[OpenedVideo]:
     check_video(path)
     with _video_errors(path), av.open(str(path), format="mp4") as container:
         stream = container.streams.video[0]
-        stream.thread_type = "NONE"  # starting threads costs more than what they would save
+        stream.thread_type = "NONE"  # starting threads costs more than it saves
         width, height = stream.codec_context.width, stream.codec_context.height
         if width * height > MAX_PIXELS:
             raise ValueError(f"it has {width}x{height} pixels, allowed are {MAX_PIXELS:,} in all")
@@ -73,12 +74,12 @@ class VideoFile:
 
     Attributes:
         path: Of the file.
-        offsets, sizes, is_keyframe: (N,) of its images, in the order in which they are stored.
-        frames: (N,) int64, number of the frame at which each is shown.
-        order: (N,) by which these rise.
-        keys: (K,) numbers of the keyframes.
+        offsets, sizes, is_keyframe: (N,) of its images, in storage order.
+        frames: (N,) int64, number of the frame in which each is shown.
+        order: (N,) indices that sort `frames`.
+        keys: (K,) frame numbers of the keyframes.
         size, pixels: (width, height) and pixel format, as libav describes them.
-        has_long_lengths: Whether units of H.264 and HEVC have lengths of four bytes, as all writers use them.
+        has_long_lengths: Whether H.264 and HEVC units have four-byte lengths, as from all common writers.
 
     Raises:
         ExportError: The file cannot be read.
@@ -101,16 +102,16 @@ class VideoFile:
 
     @property
     def codec(self) -> PacketCodec | Literal[""]:
-        """The codec of its packets as recordings name it; "" for one that they cannot hold."""
+        """Codec of its packets by recordings' name; "" if recordings cannot hold it."""
         return PACKET_CODECS.get(self._codec, "")
 
     @property
     def codec_name(self) -> str:
-        """The codec as info.json names it."""
+        """Codec by info.json's name."""
         return _MP4_NAMES.get(self.codec, self.codec) or self._codec
 
     def samples(self, numbers: Iterable[int]) -> Iterator[bytes]:
-        """Yield images as the file stores them."""
+        """Yield images in their stored form."""
         try:
             with open_regular(self.path) as file:
                 for number in numbers:
@@ -120,7 +121,8 @@ class VideoFile:
 
     @contextmanager
     def access_units(self) -> Iterator[Callable[[bytes], bytes]]:
-        """Give what converts a stored image to an access unit of a stream, with start codes or a temporal delimiter.
+        """Yield the function that converts a stored image to an access unit of a stream, with start codes or a temporal
+        delimiter.
 
         Raises ExportError for a codec that recordings cannot hold.
         """
@@ -134,7 +136,9 @@ class VideoFile:
             yield lambda sample: b"".join(bytes(part) for part in bits.filter(av.Packet(sample)))
 
     def first_image(self, number: int) -> bytes:
-        """Read a first image as `EncodedVideo.first`; the parameter sets of H.264 and HEVC are the file's."""
+        """Read a first image in the form of `EncodedVideo.first`; the parameter sets of H.264 and HEVC are the
+        file's.
+        """
         if not self.codec:
             with opened_video(self.path) as (_, stream):
                 return one_image_file(next(self.samples([number])), stream)
@@ -144,7 +148,7 @@ class VideoFile:
         return self._head
 
     def stream_info(self) -> dict[str, Any]:
-        """Describe the encoding as info.json does."""
+        """Describe the encoding in info.json's form."""
         return {
             "video.height": self.size[1],
             "video.width": self.size[0],
@@ -161,10 +165,10 @@ class _Part(NamedTuple):
     """The stored images from which some frames are decoded.
 
     Attributes:
-        numbers: (lead + T + tail,) of the images in the file, in the order in which they are stored.
-        places: (lead + T + tail,) at which each is shown, from 0.
-        lead: Number of images that are shown before the first frame.
-        tail: Number of images that are shown after the last frame.
+        numbers: (lead + T + tail,) image numbers in the file, in storage order.
+        places: (lead + T + tail,) display position of each, from 0.
+        lead: Number of images shown before the first frame.
+        tail: Number of images shown after the last frame.
     """
 
     numbers: NDArray[np.intp]
@@ -177,7 +181,7 @@ class EpisodeVideo:
     """The images of a camera feature in one episode of T frames.
 
     Args:
-        open_file: Opens a video file, or gives an open one.
+        open_file: Opens a video file, or returns an open one.
         key, feature: The camera.
         place: The episode.
         fps: Frames per second.
@@ -204,7 +208,7 @@ class EpisodeVideo:
         return self._open_file(self.path)
 
     def _part(self, first: int, last: int) -> _Part:
-        """Find the frames from `first` to before `last`, with all images from which these are decoded."""
+        """Find frames `first` to `last` - 1, with all images from which they are decoded."""
         file, begin, end = self.file, self.first + first, self.first + last
         if last <= first:
             return _Part(np.zeros(0, np.intp), np.zeros(0, np.int64), lead=0, tail=0)
@@ -220,7 +224,7 @@ class EpisodeVideo:
         numbers = _without_gaps(file.frames, int(keys[-1]), int(wanted.max()) + 1)
         places = file.frames[numbers] - keyframe
         if not np.array_equal(np.sort(places), np.arange(len(places))):
-            raise ExportError(f"Two images of {self._key} are shown at one time, or none at some: {self.path}")
+            raise ExportError(f"Two images of {self._key} have the same time, or a time has none: {self.path}")
         return _Part(numbers, places, lead=begin - keyframe, tail=len(places) - (end - keyframe))
 
     @cached_property
@@ -229,14 +233,14 @@ class EpisodeVideo:
 
     @property
     def lead(self) -> int:
-        """Number of images from the keyframe on that the first frame needs, without that frame."""
+        """Number of images from the keyframe up to the first frame, excluding that frame."""
         return self._whole.lead
 
     def cut(self, first: int = 0, last: int | None = None) -> EncodedVideo:
-        """Take the images of the frames from `first` to before `last` out, with all from which these are decoded.
+        """Extract the images of frames `first` to `last` - 1, with all images from which they are decoded.
 
         Raises:
-            ExportError: They are not there, or cannot be taken out without encoding them again.
+            ExportError: They are missing, or cannot be extracted without re-encoding.
         """
         file, part = self.file, self._part(first, self.length if last is None else last)
         if not file.has_long_lengths:
@@ -257,19 +261,21 @@ class EpisodeVideo:
         )
 
     def digest(self) -> str:
-        """SHA-256 (hex) of the T stored images, as `EncodedVideo.digest`."""
+        """SHA-256 (hex) of the T stored images, as in `EncodedVideo.digest`."""
         part, digest = self._whole, hashlib.sha256()
         for sample in self.file.samples(part.numbers[part.lead : part.lead + self.length]):
             digest.update(sample)
         return digest.hexdigest()
 
     def packets(self) -> Iterator[tuple[int, bytes, bool]]:
-        """Yield (frame, access unit, whether it is a keyframe) of the `lead`, with frames below 0, and of T frames."""
+        """Yield (frame, access unit, whether it is a keyframe) for the `lead`, with negative frames, and for T
+        frames.
+        """
         file, part = self.file, self._whole
         claimed = str((self._feature.info or {}).get("video.codec"))
         if PACKET_CODECS.get(claimed, file.codec) != file.codec:
             raise ExportError(
-                f"The video cannot be read (its codec is {file.codec}, and meta/info.json says {claimed}): {self.path}"
+                f"The video cannot be read (its codec is {file.codec}, and meta/info.json lists {claimed}): {self.path}"
             )
         frames = part.places - part.lead
         shown = np.flatnonzero(frames < self.length)
@@ -284,12 +290,12 @@ class EpisodeVideo:
                 yield frame, convert(sample), is_key
 
     def why_transcoded(self) -> str:
-        """Why the packets of the episode cannot pass through, or ""."""
-        from demorec.mcap.video import is_keyframe  # loads all that reads recordings
+        """Reason why the episode's packets cannot pass through, or ""."""
+        from demorec.mcap.video import is_keyframe  # loads all code for reading recordings
 
         file, part = self.file, self._whole
         if not file.codec:
-            return f"no recording holds {file.codec_name}"
+            return f"recordings cannot hold {file.codec_name}"
         if (np.diff(file.frames) < 0).any():
             return "images are not shown in the order in which they were encoded"
         _, keyframe, _ = next(self.packets())
@@ -298,14 +304,14 @@ class EpisodeVideo:
         return ""
 
     def images(self, begin: int = 0) -> Iterator[Rgb]:
-        """Yield (H, W, 3) uint8 RGB of every frame from one on, which may be one of the lead (below 0)."""
-        reformatter = VideoReformatter()  # a frame's own would be set up again for each
+        """Yield (H, W, 3) uint8 RGB of every frame from `begin`, which may be in the lead (below 0)."""
+        reformatter = VideoReformatter()  # a frame's own reformatter would be set up again for each frame
         for frame in self.decoded(begin):
             yield cast("Rgb", reformatter.reformat(frame, format="rgb24").to_ndarray())
 
     @cached_property
     def depth_scale(self) -> DepthScale:
-        """The distances that the codes of its depth stand for. Raises ExportError if they are not known."""
+        """Scale from its depth codes to distances. Raises ExportError if it is unknown."""
         try:
             return DepthScale.of(self._feature.info or {})
         except ValueError as error:
@@ -314,19 +320,19 @@ class EpisodeVideo:
             ) from error
 
     def codes(self, begin: int = 0) -> Iterator[NDArray[np.uint16]]:
-        """Yield (H, W) codes of depth, 0 to 4095, of every frame from one on."""
+        """Yield (H, W) depth codes, 0 to 4095, of every frame from `begin`."""
         height, width = self._feature.shape[:2]
         for frame in self.decoded(begin, (width, height)):
             yield np.minimum(frame.to_ndarray(format="gray12le"), LARGEST_CODE)
 
     def distances(self) -> Iterator[NDArray[np.float32]]:
-        """Yield (H, W) metres of every frame, 0 where nothing was measured."""
+        """Yield (H, W) metres for every frame, 0 where nothing was measured."""
         metres = self.depth_scale.shown()
         for codes in self.codes():
             yield metres[codes]
 
     def images_at(self, frames: Sequence[int]) -> Iterator[Rgb]:
-        """Yield (H, W, 3) uint8 RGB of some frames, numbered from 0 within the episode."""
+        """Yield (H, W, 3) uint8 RGB of selected frames, numbered from 0 within the episode."""
         with opened_video(self.path) as (container, stream):
             for frame in frames:
                 image = next(self._from(container, stream, frame))
@@ -335,12 +341,12 @@ class EpisodeVideo:
     def decoded(
         self, begin: int = 0, size: tuple[int, int] | None = None, opened: OpenedVideo | None = None
     ) -> Iterator[av.VideoFrame]:
-        """Yield the decoded images from a frame on, one a frame.
+        """Yield the decoded images from a frame on, one per frame.
 
         Args:
             begin: The first frame.
-            size: (width, height) that info.json claims; any by default.
-            opened: The file, if it is open already.
+            size: (width, height) in info.json, to be checked; any by default.
+            opened: The file, if already open.
         """
         with (
             _video_errors(self.path),
@@ -348,14 +354,14 @@ class EpisodeVideo:
         ):
             found = (stream.codec_context.width, stream.codec_context.height)
             if size not in (None, found):
-                raise ValueError(f"it has {found[0]}x{found[1]} pixels, and meta/info.json says {size[0]}x{size[1]}")
+                raise ValueError(f"it has {found[0]}x{found[1]} pixels, and meta/info.json lists {size[0]}x{size[1]}")
             if begin < self.length:
                 yield from self._from(container, stream, begin)
 
     def _from(
         self, container: av.container.InputContainer, stream: av.video.stream.VideoStream, begin: int
     ) -> Iterator[av.VideoFrame]:
-        """As `decoded`, of an opened video. Raises ValueError if an image is missing or of another size."""
+        """Implement `decoded` for an opened video. Raises ValueError if an image is missing or has another size."""
         assert stream.time_base is not None
         rate, number = self._fps * stream.time_base, begin
         container.seek(round((self.first + begin) / rate), stream=stream)
@@ -372,15 +378,15 @@ class EpisodeVideo:
             number += 1
             if number == self.length:
                 return
-        raise ValueError(f"episode {self._episode} has {self.length} frames, and frame {number} no image")
+        raise ValueError(f"episode {self._episode} has {self.length} frames, but no image for frame {number}")
 
 
 def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np.intp]:
-    """Number the images from one on, in the order in which they are stored, with those that later ones need.
+    """Indices of the images from `begin`, in storage order, with those that later ones need.
 
-    Images may be shown in another order than they are stored in. Those that are stored after the keyframe and shown
-    before it need images that are not taken. After the last wanted one follow as many as it takes until at every
-    moment one is shown.
+    Storage order and display order may differ. Images stored after the keyframe and shown before it are left out,
+    because they need images that are not included. Images after the last requested one are included until every moment
+    has an image.
     """
     last = min(end + _MAX_REORDERED, len(frames))
     while True:
@@ -391,7 +397,7 @@ def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np
 
 
 def _spans(offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
-    """Return (begin, bytes) of the parts of a file in which images are adjacent."""
+    """Return (begin, bytes) of the contiguous parts of a file."""
     ends = offsets + sizes
     begins = np.flatnonzero(np.append(True, offsets[1:] != ends[:-1]))
     lasts = np.append(begins[1:], len(offsets)) - 1

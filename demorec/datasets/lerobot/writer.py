@@ -1,7 +1,7 @@
-"""Writes a LeRobot v3.0 dataset episode by episode, at the same cost for the first and the ten-thousandth.
+"""Write a LeRobot v3.0 dataset episode by episode, at the same cost for the first and the ten-thousandth.
 
-Nothing that was written is read or written again while episodes come in; tables roll over by size, each kind on its
-own; an episode never straddles two files. The format's rules come from LeRobot's own reader and writer.
+Written files are neither read nor rewritten while episodes are added; tables roll over by size, each kind separately;
+an episode never spans two files. The format's rules come from LeRobot's own reader and writer.
 """
 
 from __future__ import annotations
@@ -57,10 +57,11 @@ from demorec.datasets.lerobot.stats import (
 )
 
 _MOST_UNSEEN = 100
-"""Statistics of images that were not seen, before they are merged."""
+"""Maximum number of separate statistics of images without histograms, before they are merged."""
 _MAX_SECONDS_PER_VIDEO = 900.0
 """LeRobot compares timestamps as float32, whose step is 6e-5 s beyond 512 s and 1.2e-4 s beyond 1024 s, with a
-tolerance of 1e-4 s: a new mp4 file is begun before that, except for a single episode that is longer."""
+tolerance of 1e-4 s: a new mp4 file begins before that, unless a single episode is longer.
+"""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -69,17 +70,17 @@ class EpisodeData:
 
     Attributes:
         task: Instruction.
-        columns: Feature -> (T,) or (T, D), or a column of Arrow's of T values, which stays as it is; without videos and
-            the automatic features.
+        columns: Feature -> (T,) or (T, D), or an Arrow column of T values, which is written unchanged; without videos
+        and the automatic features.
         videos: Camera feature -> encoded images, T of them.
-        video_info: Camera feature -> how they were encoded, the `info` of the feature.
-        pixels: Camera feature -> histogram for the statistics, or the statistics where the images were not seen.
-        language: What is said about it; written where the dataset has the columns for it and `columns` has none.
-        facts: Column of the table of episodes -> value; written where the dataset has the column.
-        row_tasks: Instruction of each row, where there is more than one; `task` is the first.
+        video_info: Camera feature -> its encoding, the feature's `info`.
+        pixels: Camera feature -> histogram for the statistics, or the statistics if the images were not decoded.
+        language: Statements; written if the dataset has language columns that `columns` lacks.
+        facts: Column of the table of episodes -> value; written if the dataset has the column.
+        row_tasks: Instruction of each row, if there are several; `task` is the first.
         timestamps: (T,) float32 or float64 seconds; None for multiples of 1/fps.
-        record: What the sidecar has about it; None in a dataset without one.
-        boxes: Camera feature -> visible objects, where they are known.
+        record: Its data for the sidecar; None in a dataset without one.
+        boxes: Camera feature -> visible objects, if known.
     """
 
     task: str
@@ -106,7 +107,7 @@ class DatasetStart:
 
     Attributes:
         info: Features, limits, and the numbers of existing episodes and frames.
-        facts: Columns of the episodes' facts in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
+        facts: Fact columns in the table of episodes -> type (`demorec.datasets.lerobot.facts`).
         tasks: Existing instructions in the order of their indices.
         statistics: Statistics of the camera features over the existing episodes.
         configs: Config digest -> configuration, of the existing episodes; None for a dataset without a sidecar.
@@ -123,8 +124,8 @@ class DatasetWriter(Closing):
     """Context manager; `finish` completes the metadata.
 
     Args:
-        root: Folder of the dataset; it holds the existing files already.
-        start: What it begins with.
+        root: Folder of the dataset, which already holds the existing files.
+        start: State before the first new episode.
     """
 
     def __init__(self, root: Path, start: DatasetStart) -> None:
@@ -159,7 +160,7 @@ class DatasetWriter(Closing):
         self._boxes = BoxWriter(root, fps=info.fps)
 
     def close(self) -> None:
-        """Let go of the files; those that are not finished are dropped, or left as they are."""
+        """Release the files; unfinished ones are dropped, or left in place."""
         self._boxes.close()
         if self._sidecar is not None:
             self._sidecar.close()
@@ -169,8 +170,8 @@ class DatasetWriter(Closing):
         self._episodes.abort()
 
     def add(self, episode: EpisodeData) -> str:
-        """Append an episode; return its digest (`demorec.datasets.lerobot.layout`), "" where images are in rows, or its
-        videos have none.
+        """Append an episode; return its digest (`demorec.datasets.lerobot.layout`), "" if its images are in rows or its
+        videos have no digest.
         """
         frames = episode.num_frames
         if frames == 0:
@@ -239,13 +240,13 @@ class DatasetWriter(Closing):
                 arrays.append(vector_array(columns[item.name], item.type))
             except pa.ArrowException as error:
                 raise ExportError(
-                    f"The column {item.name} of what would be episode {self.num_episodes} is not as {INFO_PATH} says "
+                    f"The column {item.name} of the new episode {self.num_episodes} does not match {INFO_PATH} "
                     f"({describe_error(error)})."
                 ) from error
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
 
     def _number_statistics(self, values: Mapping[str, NDArray[Any]], frames: int) -> dict[str, Statistics]:
-        """Return the statistics of all numeric features; those of arrays are over their last dimension."""
+        """Return the statistics of all numeric features; those of arrays are along the last dimension."""
         statistics = vector_statistics({name: values[name] for name in self._numeric if name not in self._arrays})
         for name, width in self._arrays.items():
             vectors = vector_statistics({name: values[name].reshape(-1, width)})[name]
@@ -253,7 +254,7 @@ class DatasetWriter(Closing):
         return statistics
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
-        """The statistics of a camera in an episode, which those of all episodes take in."""
+        """Statistics of a camera in an episode, merged into those of all episodes."""
         if isinstance(pixels, Statistics):
             unseen = self._unseen.setdefault(key, [])
             unseen.append(pixels)
@@ -291,10 +292,10 @@ class DatasetWriter(Closing):
         }
 
     def finish(self, export: Mapping[str, Any]) -> DatasetInfo:
-        """Close all files, write tasks, statistics and info.json; return the content of the last.
+        """Close all files, write tasks, statistics and info.json; return the content of info.json.
 
         Args:
-            export: How the dataset was made, for the sidecar.
+            export: Options and sources of the export, for the sidecar.
         """
         for video in self._videos.values():
             video.close()
@@ -341,14 +342,14 @@ class DatasetWriter(Closing):
 
 
 def values_of(column: NDArray[Any] | pa.Array) -> NDArray[Any]:
-    """Numbers or texts of a column, digests of one of language."""
+    """Numbers or texts of a column, or digests of a language column."""
     if not isinstance(column, pa.Array):
         return column
     return column_digests(column) if is_language(column.type) else column_values(column)
 
 
 def write_tasks(path: Path, tasks: Sequence[str]) -> None:
-    """tasks.parquet: LeRobot looks tasks up in the index of the data frame that pandas makes of it."""
+    """Write tasks.parquet: LeRobot looks up tasks in the index of the data frame that pandas reads from it."""
     column = {"pandas_type": "unicode", "numpy_type": "object", "metadata": None}
     number = {"pandas_type": "int64", "numpy_type": "int64", "metadata": None}
     index = {"name": None, "field_name": None, **column, "metadata": {"encoding": "UTF-8"}}
