@@ -13,11 +13,11 @@ from support.recording import write_episode
 BAD: dict[str, tuple[int, str]] = {
     "no bag": (2, "No bag is given"),
     "no mapping": (2, "An import needs --mapping and --out"),
-    "a bag that is not there": (2, "There is no bag that could be read"),
-    "a mapping that is not there": (2, "There is no mapping (demorec import ... --suggest > FILE writes one)"),
-    "a word for a format that is misspelt": (2, "There is no bag 'lerobt'. Did you mean 'lerobot'?"),
+    "a bag that is not there": (2, "No readable bag"),
+    "a mapping that is not there": (2, "No mapping (demorec import ... --suggest > FILE writes one)"),
+    "a word for a format that is misspelt": (2, "No bag 'lerobt'. Did you mean 'lerobot'?"),
     "no toml": (2, "The mapping is not valid TOML"),
-    "unknown encoding": (1, "the encoding 'cbor' is not read"),
+    "unknown encoding": (1, "the encoding 'cbor' is not supported"),
     "two types on a topic": (1, "has messages of several types"),
     "a text file": (1, "This is not "),
     "an empty file": (1, "The bag is empty"),
@@ -111,5 +111,5 @@ def test_a_recording_of_demorec_needs_no_import(tmp_path: Path, capsys: pytest.C
     path = write_episode(tmp_path / "a.mcap", num_frames=5)
     assert exit_code("import", "--suggest", path) == 0
     out, err = capsys.readouterr()
-    assert err == f"Note: demorec made this recording, and reads it as it is, without an import: {path}\n"
+    assert err == f"Note: demorec made this recording, and reads it directly, without an import: {path}\n"
     assert out.startswith("# A mapping for a.mcap")

@@ -84,7 +84,7 @@ def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.Ca
     mapping = tmp_path / "robot.toml"
     mapping.write_text(text)
     assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 2
-    assert "there is no feature 'observation.state'" in capsys.readouterr().err
+    assert "missing feature 'observation.state'" in capsys.readouterr().err
 
 
 def test_joints_that_stop_coming_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,4 +101,4 @@ def test_joints_that_stop_coming_are_a_finding(tmp_path: Path, capsys: pytest.Ca
     assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
     assert f"early_end: observation.state ({lost}): /joint_states: '{lost}' stop" in told
-    assert "Nothing odd was found." not in told
+    assert "No findings." not in told

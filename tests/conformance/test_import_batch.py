@@ -77,7 +77,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "cut": (lambda path: path.write_bytes(path.read_bytes()[:2000]), "The bag holds no messages"),
     "no camera": (
         lambda path: _bag(path, change=lambda notes: [note for note in notes if note.topic != FRONT]),
-        f"there is no message of '{FRONT}'",
+        f"no message of '{FRONT}'",
     ),
     "another size": (lambda path: _bag(path, change=_resized), "camera front is 32x24 jpeg instead of 64x48 jpeg"),
     "odd size": (lambda path: _bag(path, change=_odd), "63x47 pixels cannot be h264 video, which needs even sizes"),
@@ -87,11 +87,11 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "year 2043": (
         lambda path: _bag(path, change=lambda notes: [_recorded(note, 2**61) for note in notes]),
-        "a message is of the time 2305843009 s, allowed are 0 to 2147483647 s",
+        "a message has the time 2305843009 s, allowed are 0 to 2147483647 s",
     ),
     "nowhere": (
         lambda path: _moved(path).symlink_to("nowhere.mcap"),
-        "There is no bag that could be read (No such file or directory)",
+        "No readable bag (No such file or directory)",
     ),
 }
 
@@ -197,7 +197,7 @@ def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.Mo
     """A mistyped name, a full disk, too little memory."""
     bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
     mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
-    with pytest.raises(ConfigError, match="There is no bag"):
+    with pytest.raises(ConfigError, match="No readable bag"):
         import_bags([bag, tmp_path / "b.mcap"], mapping, run, skip_bad=True)
     full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
     for place, name, error, words in (
@@ -258,7 +258,7 @@ def test_only_bags_and_episodes_of_datasets_are_skipped(
     words: list[str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code("import", *words, "--out", tmp_path / "run") == 2
-    assert "Only bags can be imported by several workers" in capsys.readouterr().err
+    assert "--workers is for bags" in capsys.readouterr().err
 
 
 def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:

@@ -124,7 +124,7 @@ def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imp
     notes = real()
     code, told, _ = imports(notes, _with_gripper(stamp="log"))
     assert code == 0
-    assert "Nothing odd was found." in told
+    assert "No findings." in told
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         table = recording.table()
     states, grippers = bags.of_topic(notes, STATE), [note for note in notes if note.topic == GRIPPER]
@@ -154,7 +154,7 @@ def test_simulated_headers_beside_none_are_suggested_by_one_clock(imports: Impor
     assert code == 0
     clock = tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]
     assert (clock["stamp"], clock["fps"]) == ("log", 23)  # the rows' clock is that of the recorder
-    assert "Nothing odd was found." in told
+    assert "No findings." in told
 
 
 def test_simulated_headers_beside_none_are_refused(imports: Imports) -> None:

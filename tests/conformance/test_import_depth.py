@@ -177,7 +177,7 @@ def test_the_commands_take_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 FAULTS: dict[str, tuple[dict[str, Any], str]] = {
-    "quantised": ({"format": "32FC1; compressedDepth png"}, "does not keep what was measured"),
+    "quantised": ({"format": "32FC1; compressedDepth png"}, "loses measured values"),
     "cut off": ({"data": np.zeros(15, np.uint8)}, "cut off"),
     "no image": ({"data": np.zeros(400, np.uint8)}, "0x0 pixels"),
 }

@@ -174,7 +174,7 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
             assert [packet.data for packet in recording.packets(camera)] == given
     mapping = file.with_suffix(".toml")
     mapping.write_text(mapping.read_text().replace('"observations/qvel"', '"observations/images/cam_high"'))
-    with pytest.raises(Hdf5Error, match="cam_high cannot be used, since it holds objects, no plain numbers"):
+    with pytest.raises(Hdf5Error, match="cam_high cannot be used, since it holds objects, not plain numbers"):
         import_hdf5([file], mapping, tmp_path / "other")
 
 
@@ -420,7 +420,7 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, capsys: pytest.Captur
     file = write_robomimic(tmp_path / "demo.hdf5")
     mapping = suggested(file)
     data = file.read_bytes()
-    for length, told in ((0, "This is no HDF5 file"), (9, "HDF5 file cannot"), (len(data) // 2, "it is cut off")):
+    for length, told in ((0, "This is not an HDF5 file"), (9, "HDF5 file cannot"), (len(data) // 2, "it is cut off")):
         file.write_bytes(data[:length])
         _refused(file, mapping, told, capsys)
 

@@ -185,8 +185,8 @@ def test_where_nobody_says_anything_none_is_invented(tmp_path: Path, capsys: pyt
 
 
 FAULTS: dict[str, tuple[bags.Notes, str, int, str]] = {
-    "no topic": ([], SUBTASKS, 1, "there is no message of '/subtask'"),
-    "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is no text"),
+    "no topic": ([], SUBTASKS, 1, "no message of '/subtask'"),
+    "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is not text"),
     "no field": (texts("/subtask", SAID), SUBTASKS + 'field = "dta"\n', 1, "Did you mean 'data'?"),
     "another field": (
         texts("/subtask", SAID),

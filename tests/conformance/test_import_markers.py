@@ -64,7 +64,7 @@ def test_what_is_discarded_is_no_episode(
     dropped = f", {len(left_out)} dropped" if left_out else ""
     assert f"{len(kept)} episode{'s' * (len(kept) > 1)}, " in told
     assert f" frames{dropped}: " in told
-    assert told.endswith("Nothing odd was found.\n")
+    assert told.endswith("No findings.\n")
     assert FILE_CHECKS.load("import_dropped").run(CheckedRun(tmp_path / "run")).level == "pass"  # nothing is missing
 
 

@@ -238,7 +238,7 @@ def test_what_is_given_as_a_bag_gets_its_word(
     values = {"MAPPING": places["mcap with --mapping"][-1], "NEW": tmp_path / "new"}
     assert exit_code("import", path, *(values.get(flag, flag) for flag in flags)) == 2
     told = capsys.readouterr().err
-    assert f"no bag: demorec import {word} {path} imports it" in told
+    assert f"not a bag: demorec import {word} {path} imports it" in told
     assert told.count("\n") == 1
     assert not (tmp_path / "new" / "run.json").exists()
 
@@ -262,7 +262,7 @@ def test_what_was_left_out_and_the_mapping_are_reported(
     plain = json.loads(printed.out)
     assert plain["path"] == str(source)
     assert f"{source}: read by the suggested mapping (observation.state from obs/robot0_joint_pos and" in printed.err
-    assert "so the run does not have: dones, rewards, states, next_obs." in printed.err
+    assert "because the mapping does not name them: dones, rewards, states, next_obs." in printed.err
 
 
 def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -289,7 +289,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
         (
             "mcap",
             ["--mapping", "x.toml"],
-            "There is no mapping (demorec import ... --suggest > FILE writes one): x.toml",
+            "No mapping (demorec import ... --suggest > FILE writes one): x.toml",
         ),
     ],
 )

@@ -181,7 +181,7 @@ MAPPINGS: dict[str, tuple[str, str]] = {
     "a number of 5,000 digits": (_NO_CAMERA.replace("fps = 30", f"fps = {'9' * 5000}"), "no valid TOML"),
     "an infinity": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = inf"), "is not a finite number"),
     "NUL in urdf": (_NO_CAMERA.replace('name = "r"', 'name = "r"\nurdf = "a\\u0000b"'), "The URDF cannot be read"),
-    "NUL in a topic": (_NO_CAMERA.replace('"/joints"', '"/jo\\u0000nts"'), r"there is no message of '/jo\x00nts'"),
+    "NUL in a topic": (_NO_CAMERA.replace('"/joints"', '"/jo\\u0000nts"'), r"no message of '/jo\x00nts'"),
     "a date": (_NO_CAMERA.replace("fps = 30", "fps = 2001-99-99"), "no valid TOML"),
 }  # fmt: skip
 

@@ -34,7 +34,7 @@ WRONG = [
     ('[robot]', '[episodes]\ncut = "service"\n[robot]', r"'service' is not one of 'file', 'marker', 'gap', 'times'"),
     ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
     ('text = "stack the cups"', '', r"\[task\] needs one of text, topic and file_name"),
-    ('[features.action]', '[features.act]', r"there is no feature 'action'"),
+    ('[features.action]', '[features.act]', r"missing feature 'action'"),
     ('[cameras.front]', '[cameras."a b"]', r"a camera cannot be called 'a b'"),
     ('topic = "/leader/joint_states"', 'next = "observation.stat"', r"Did you mean 'observation.state'\?"),
     ('topic = "/leader/joint_states"', 'next = "observation.state"\ntopic = "/x"', r"either a topic or next"),

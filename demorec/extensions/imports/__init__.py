@@ -1,6 +1,6 @@
-"""Episodes of other people's robots: bags are read, mapped to features, brought to one clock and recorded.
+"""Import of third-party robots' episodes: bags are read, mapped to features, aligned to one clock and recorded.
 
-    bag files -> messages -> streams (mapping) -> rows (clock) -> episodes, with a report of all that was found
+    bag files -> messages -> streams (mapping) -> rows (clock) -> episodes, with a report of all findings
 
-Nothing is invented: a row holds messages that are in the bag, and says how old they are.
+Nothing is invented: a row holds messages of the bag and records their age.
 """

@@ -1,7 +1,7 @@
 """Bags: MCAP, .db3 and ROS 1 .bag files, and the folders of rosbag2 with their metadata.yaml, compressed or not.
 
-The first bytes of a file tell its format, not its name. A bag is read from the front to the end, once for each call
-of `messages`, in the memory of a chunk.
+A file's format is determined by its first bytes, not by its name. A bag is read from start to end for each call of
+`messages`, with one chunk in memory.
 """
 
 from __future__ import annotations
@@ -35,15 +35,15 @@ from demorec.runs.find import BAG_SUFFIXES, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLIT
 
 NS = 1_000_000_000
 _SUFFIXES = (".mcap", *BAG_SUFFIXES)
-"""Suffixes of files that a folder of bags holds; other files in it are ignored."""
+"""Suffixes of bag files in a folder; other files are ignored."""
 _MAX_METADATA_BYTES = 16 << 20
 _MAX_PROBLEMS = 100
 _MAX_UNPACKED_RATIO = 1000
-"""Bytes of a compressed bag's content for each of the file: no more fill the disk."""
+"""Maximum ratio of decompressed to compressed size, to protect the disk."""
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _READERS = {MCAP_MAGIC: read_mcap, SQLITE_MAGIC: read_sqlite, ROS1_MAGIC: read_ros1}
 Files = tuple[tuple[str, str], ...]
-"""Name and SHA-256, hex digits, of each of a bag's files."""
+"""Name and SHA-256, hex digits, of each file of a bag."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,7 +52,7 @@ class Bag:
 
     Attributes:
         files: Files that hold its messages, in order.
-        messages_are_compressed: Whether each message is compressed by itself (rosbag2's compression mode MESSAGE).
+        messages_are_compressed: Whether each message is compressed separately (rosbag2's compression mode MESSAGE).
     """
 
     path: Path
@@ -70,16 +70,16 @@ class Bag:
         return sum(file.stat().st_size for file in self.files)
 
     def sha256s(self) -> Files:
-        """Digests of its files, by which the bag is known again."""
+        """Digests of its files, which identify the bag."""
         return tuple((path.name, sha256_of(path)) for path in self.files)
 
     def messages(self, problems: list[str], topics: Topics = None) -> Iterator[ScannedMessage]:
         """Read its messages, file after file.
 
         Args:
-            problems: Gets a reason for each file that cannot be read to its end, or each message that is left out; the
-                same one once.
-            topics: Wanted topics (None: all).
+            problems: Collects, without duplicates, a reason for each file that cannot be read completely and each
+            message left out.
+            topics: Selected topics (None: all).
 
         Raises:
             BagError: A file cannot be read at all.
@@ -103,15 +103,15 @@ def _unpacked_message(message: ScannedMessage, report: Report) -> ScannedMessage
     try:
         return message._replace(data=zstandard.ZstdDecompressor().decompressobj().decompress(message.data))
     except zstandard.ZstdError as error:
-        report(f"a message of {message.channel.topic} cannot be unpacked: {error}")
+        report(f"a message of {message.channel.topic} cannot be decompressed: {error}")
         return message._replace(data=b"")
 
 
 def bags_in(path: Path) -> list[Path]:
-    """The bag at a path, or, of a folder without metadata.yaml, the bags in it, in the natural order of their names.
+    """The bag at a path, or, for a folder without metadata.yaml, the bags in it, in natural order of their names.
 
-    They are rosbag2 folders, MCAP, .db3 and .bag files, and those files in folders in it whose metadata.yaml was lost.
-    A folder that holds none of them is given back itself.
+    These are rosbag2 folders, MCAP, .db3 and .bag files, and such files in subfolders that lost their metadata.yaml. A
+    folder without any of them is returned itself.
     """
     if not path.is_dir() or os.path.lexists(path / ROSBAG2) or import_word(find(path).kind):
         return [path]
@@ -136,18 +136,16 @@ def _entries(folder: Path) -> list[Path]:
 
 
 def open_bag(path: Path) -> Bag:
-    """Open the bag at a path, without reading its messages.
+    """Open the bag at a path without reading its messages.
 
     Raises:
-        ConfigError: There is none, or a dataset.
-        BagError: Its format is not read.
+        ConfigError: The path is missing, or is a dataset.
+        BagError: Its format is not supported.
     """
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        raise resource_error(error, path) or ConfigError(
-            f"There is no bag that could be read ({error.strerror}): {path}"
-        ) from error
+        raise resource_error(error, path) or ConfigError(f"No readable bag ({error.strerror}): {path}") from error
     if not is_utf8(path):
         raise ConfigError(f"{NOT_UTF8}: {path}")
     if stat.S_ISDIR(mode):
@@ -157,7 +155,7 @@ def open_bag(path: Path) -> Bag:
 
 
 def _magic_of(path: Path) -> bytes:
-    """The first bytes of a file, which tell its format: a key of `_READERS`, or zstd's."""
+    """First bytes of a file, which determine its format: a key of `_READERS`, or zstd's."""
     try:
         with open_regular(path) as file:
             head = file.read(max(map(len, (*_READERS, _ZSTD_MAGIC))))
@@ -170,18 +168,20 @@ def _magic_of(path: Path) -> bytes:
             return magic
     _refuse_other_formats(path)
     what = "This is not an MCAP file" if path.suffix == ".mcap" else "This is not a bag"
-    raise BagError(f"{what}: MCAP, .db3 and .bag files and rosbag2 folders are read: {path}")
+    raise BagError(f"{what}: MCAP, .db3 and .bag files and rosbag2 folders are supported: {path}")
 
 
 def _refuse_other_formats(path: Path) -> None:
-    """Raise ConfigError for a format that another word of `demorec import` reads."""
+    """Raise ConfigError for a format with another subcommand of `demorec import`."""
     kind = find(path).kind
     if word := import_word(kind):
-        raise ConfigError(f"This is {name_of(kind)}, no bag: demorec import {word} {path} imports it: {path}") from None
+        raise ConfigError(
+            f"This is {name_of(kind)}, not a bag: demorec import {word} {path} imports it: {path}"
+        ) from None
 
 
 def _folder(path: Path) -> Bag:
-    """Open a folder of rosbag2 by its metadata.yaml."""
+    """Open a rosbag2 folder by its metadata.yaml."""
     from ruamel.yaml import YAML
 
     metadata = path / ROSBAG2
@@ -196,17 +196,17 @@ def _folder(path: Path) -> Bag:
     except FileNotFoundError:
         _refuse_other_formats(path)
         raise BagError(
-            f"The folder holds no {ROSBAG2}, so it is no bag of rosbag2, and no bags (rosbag2 folders, "
+            f"The folder holds no {ROSBAG2}, so it is not a rosbag2 bag, and no bags (rosbag2 folders, "
             f"{', '.join('*' + suffix for suffix in _SUFFIXES)}): {path}"
         ) from None
     except (BagError, MemoryError):
         raise
-    except Exception as error:  # the parser's own errors, and those of what it does not foresee
+    except Exception as error:  # the parser's own errors, and unforeseen ones
         raise resource_error(error, path) or BagError(
             f"The bag's {ROSBAG2} cannot be read ({describe_error(error)}): {path}"
         ) from error
     if mode not in ("", "none") and compression != "zstd":
-        raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is read: {path}")
+        raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is supported: {path}")
     if not names:
         raise BagError(f"The bag's {ROSBAG2} names no files: {path}")
     files = _renamed(tuple(path / name for name in dict.fromkeys(names)))
@@ -219,7 +219,7 @@ def _folder(path: Path) -> Bag:
 
 
 def _renamed(files: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Find the only file of a bag under its new name, if it is not there under the old one."""
+    """Find a bag's only file under its new name if it is missing under the old one."""
     if len(files) != 1 or os.path.lexists(files[0]):
         return files
     found = tuple(files[0].parent.glob(f"*{files[0].suffix}"))
@@ -227,14 +227,14 @@ def _renamed(files: tuple[Path, ...]) -> tuple[Path, ...]:
 
 
 def _refuse_link(file: Path) -> None:
-    """Raise BagError for a link out of the bag's folder, to a file that the user did not name."""
+    """Raise BagError for a link to a file outside the bag's folder, which the user did not name."""
     if file.is_symlink() and file.resolve().parent != file.parent.resolve():
         raise BagError(f"The bag's file is a link to another folder: name {file.name} itself, or copy it: {file}")
 
 
 @contextmanager
 def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
-    """A file and its first bytes; a compressed one is unpacked into a temporary file."""
+    """Yield a file and its first bytes; a compressed one is decompressed to a temporary file."""
     magic = _magic_of(path)
     if magic != _ZSTD_MAGIC:
         yield path, magic
@@ -244,7 +244,7 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
         try:
             _unpack(path, plain)
         except (zstandard.ZstdError, ValueError) as error:
-            raise BagError(f"The compressed bag cannot be unpacked ({error}): {path}") from error
+            raise BagError(f"The bag cannot be decompressed ({error}): {path}") from error
         kind = _magic_of(plain)
         if kind == _ZSTD_MAGIC:
             raise BagError(f"The bag is compressed twice: {path}")
@@ -252,7 +252,7 @@ def _unpacked(path: Path) -> Iterator[tuple[Path, bytes]]:
 
 
 def _unpack(path: Path, target: Path) -> None:
-    """Unpack a file; ValueError when its content is far larger than any bag's."""
+    """Decompress a file; ValueError if its content is far larger than any bag's."""
     most = _MAX_UNPACKED_RATIO * path.stat().st_size
     with open_regular(path) as source, target.open("wb") as file:
         for block in zstandard.ZstdDecompressor().read_to_iter(source):
@@ -268,7 +268,7 @@ class TopicSummary:
     Attributes:
         type: Type of the messages, as the bag names it.
         count: Number of messages.
-        first_ns, last_ns: Earliest and latest time of recording.
+        first_ns, last_ns: Earliest and latest log time.
     """
 
     type: str
@@ -278,22 +278,22 @@ class TopicSummary:
 
     @property
     def rate_hz(self) -> float:
-        """Mean rate by the times of recording; 0 for fewer than two messages."""
+        """Mean rate by log times; 0 for fewer than two messages."""
         span_s = (self.last_ns - self.first_ns) / NS
         return (self.count - 1) / span_s if self.count > 1 and span_s > 0 else 0.0
 
     def add(self, time_ns: int) -> None:
-        """Count a message that was recorded at this time."""
+        """Count a message with this log time."""
         self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
         self.count += 1
 
 
 def summarize_bag(path: Path) -> dict[str, Any]:
-    """Read a bag as far as it can be read, and count the messages of each topic, as `demorec info --json` prints it.
+    """Summarise the readable part of a bag with the message count of each topic, for `demorec info --json`.
 
     Raises:
-        ConfigError: There is no bag.
-        BagError: Its format is not read, or a file of it cannot be opened.
+        ConfigError: The path holds no bag.
+        BagError: Its format is not supported, or a file cannot be opened.
     """
     bag = open_bag(path)
     problems: list[str] = []

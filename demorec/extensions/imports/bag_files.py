@@ -1,4 +1,4 @@
-"""Files of bags as messages: MCAP as recordings are read, SQLite (.db3) and ROS 1 (.bag) by `rosbags`."""
+"""Messages of bag files: MCAP by the reader of recordings, SQLite (.db3) and ROS 1 (.bag) by `rosbags`."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from demorec.core.files import MCAP_MAGIC, open_regular
 from demorec.mcap.scan import CutOffError, ScannedChannel, ScannedMessage, scan
 
 MAX_TIME_NS = 1 << 62
-"""Latest time of a message, in the year 2116: the difference of two fits 64 bits."""
+"""Maximum time of a message, in the year 2116: the difference of two fits 64 bits."""
 Topics = Collection[str] | None
-"""Topics that are wanted; None: all."""
+"""Selected topics; None: all."""
 Report = Callable[[str], None]
-"""Called with the reason, for the inside of a sentence, when part of a file cannot be read."""
+"""Called with the reason, as a sentence part, if part of a file cannot be read."""
 
 
 class BagError(DemorecError):
-    """A bag cannot be read, or does not hold what its mapping says."""
+    """A bag cannot be read, or lacks content that its mapping names."""
 
 
 def read_mcap(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
-    """Read an MCAP file in the order of the file: with or without chunks and an index, whole or cut off.
+    """Read an MCAP file in file order: with or without chunks and an index, complete or truncated.
 
-    `mcap`'s own readers make an object of each field's bytes, which makes the import of a bag a tenth dearer.
+    `mcap`'s own readers create an object for each field's bytes, which makes an import 10 % slower.
     """
     with open_regular(path) as file:
         file.seek(len(MCAP_MAGIC))
@@ -36,29 +36,29 @@ def read_mcap(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMes
                     yield item
         except MemoryError:
             raise
-        except Exception as error:  # the parsers' own errors share no other base class
+        except Exception as error:  # the parsers' own errors have no other common base class
             report(str(error) if isinstance(error, CutOffError) else f"a record is damaged: {describe_error(error)}")
 
 
 def read_sqlite(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
-    """Read a .db3 file of rosbag2 in the order of the times of recording; BagError when it is damaged."""
+    """Read a rosbag2 .db3 file in the order of log times; BagError if it is damaged."""
     from rosbags.rosbag2.storage_sqlite3 import Sqlite3Reader
 
     journal = Path(f"{path}-wal")
     if journal.is_file() and journal.stat().st_size:
         report(f"messages in {journal.name} are not read: open a copy of the bag with sqlite3, which takes them in")
-    reader = Sqlite3Reader(Path(quote(str(path.resolve()))))  # which makes a URI of it
+    reader = Sqlite3Reader(Path(quote(str(path.resolve()))))  # which becomes a URI
     try:
         reader.open()
     except (MemoryError, OSError):
         raise
-    except Exception as error:  # its own errors, and those of what it does not foresee
+    except Exception as error:  # its own errors, and unforeseen ones
         raise BagError(f"The bag is damaged ({describe_error(error).rstrip('.')}): {path}") from error
     yield from _rosbags_messages(reader, topics, report)
 
 
 def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
-    """Read a bag of ROS 1 in the order of the times of recording, or of the file where its index is missing."""
+    """Read a ROS 1 bag in the order of log times, or in file order if its index is missing."""
     from rosbags.rosbag1 import Reader
 
     reader = Reader(path)
@@ -66,7 +66,7 @@ def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMes
         reader.open()
     except (MemoryError, OSError):
         raise
-    except Exception as error:  # its own errors, and those of what it does not foresee
+    except Exception as error:  # its own errors, and unforeseen ones
         report(f"it was not finished ({describe_error(error).rstrip('.')}), so it is read without its index")
         from demorec.extensions.imports.ros1_scan import scan_ros1
 
@@ -80,7 +80,7 @@ def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMes
 
 
 def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
-    """Read the messages of an open reader of `rosbags`, and close it."""
+    """Read the messages of an open `rosbags` reader, and close it."""
     try:
         wanted = [connection for connection in reader.connections if topics is None or connection.topic in topics]
         channels = {connection.id: _channel(connection) for connection in wanted}
@@ -95,7 +95,7 @@ def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[S
 
 
 def _channel(connection: Any) -> ScannedChannel:
-    """Channel of a connection of `rosbags`."""
+    """Channel of a `rosbags` connection."""
     encoding = getattr(connection.ext, "serialization_format", "ros1")
     definition = connection.msgdef
     return ScannedChannel(

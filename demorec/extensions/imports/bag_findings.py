@@ -1,4 +1,4 @@
-"""What is odd between the streams of a bag, and in the rows that are made of them."""
+"""Findings about a bag that compare its streams, and about the rows made from it."""
 
 from __future__ import annotations
 
@@ -22,18 +22,20 @@ from demorec.extensions.imports.findings import (
 from demorec.extensions.imports.rows import RATE, EpisodeRows, Timelines
 
 _EPOCH_S = 1e8
-"""Between two clocks: three years. No clock is as wrong; one of the two counts from another beginning."""
+"""Difference between two clocks that implies another epoch: three years. No clock is that wrong, so one of the two
+counts from another epoch.
+"""
 _YEAR_S = 365.25 * 86_400
 _RESTS = 0.02
-"""Of the range of all elements, within which they stay while a robot stands still."""
+"""Maximum range of a resting robot's elements, relative to their whole range."""
 MAX_ENCODER_NOISE = 1e-3
-"""Range of a joint that stands still: radians or metres, or the same share of larger values in degrees or counts."""
+"""Maximum range of a resting joint: radians or metres, or the same ratio of larger values in degrees or counts."""
 _SLOW = 1.15
-"""Periods of the rows, from which on a stream is called slower than they are."""
+"""Minimum ratio of a stream's period to the rows' period for a slow stream."""
 
 
 def all_findings(lines: Timelines) -> tuple[Finding, ...]:
-    """What is odd in a bag, each thing once."""
+    """All findings about a bag, each once."""
     once: dict[tuple[str, str], Finding] = {}
     for finding in _findings(lines):
         once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
@@ -59,10 +61,10 @@ def _findings(bag: Timelines) -> Iterator[Finding]:
 
 
 def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
-    """(K,) of each stream: time of recording minus that of the header, nanoseconds.
+    """(K,) skews of each stream: log time minus header time, nanoseconds.
 
-    Where all headers count from another beginning than times of recording (simulated time), that difference says
-    nothing of a single stream: then it is the one to the difference of the stream that has most messages.
+    If all headers have another epoch than the log times (simulated time), the absolute difference implies nothing about
+    a stream: the result is then relative to the stream with most messages.
     """
     skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
     known = _of_another_epoch(lines)
@@ -78,13 +80,13 @@ def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
 
 
 def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
-    """Return the streams whose headers have times, if all these count from another beginning than the recorder."""
+    """Return the streams with header times if all of these have another epoch than the log times."""
     known = [line for line in lines if len(line.skews_ns)]
     return known if all(abs(np.median(line.skews_ns)) >= _EPOCH_S * NS for line in known) else []
 
 
 def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """Headers of simulated time, or of a clock that was never set, by which the rows go."""
+    """Header times that are simulated or from a clock that was never set, and that the rows use."""
     known = [line for line in _of_another_epoch(lines) if line.is_header]
     if known:
         years = float(np.median([np.median(line.skews_ns) for line in known])) / NS / _YEAR_S
@@ -96,7 +98,7 @@ def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
 
 
 def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """What goes by the time of recording where other streams go by headers, and these are of another clock."""
+    """Streams on log time, although others use header times with another epoch."""
     skews = [float(np.median(line.skews_ns)) / NS for line in lines if line.is_header]
     if not skews or abs(usual := float(np.median(skews))) <= SKEW_S:
         return
@@ -109,7 +111,7 @@ def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Findi
 
 
 def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
-    """Joints that stop coming while others of their topic, or the same ones from another publisher, go on."""
+    """Joints that end while others of their topic, or the same ones from another publisher, continue."""
     for line in regular:
         joints = line.stream.reader.joints if line.stream.reader else ()
         key = (line.stream.topic, line.is_header)
@@ -135,7 +137,7 @@ def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
 
 
 def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """Streams whose headers are on another clock than those of most."""
+    """Streams with another header clock than most."""
     skews = {line.stream.label: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
     if len(skews) < 2:
         return
@@ -147,7 +149,7 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
 
 
 def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """Cameras that hang. A rendered one repeats its image while the robot stands still for a moment."""
+    """Cameras that froze. A rendered camera repeats its image while the robot rests for a moment."""
     for line in lines:
         if (run := frozen_images(line)) is None:
             continue
@@ -159,7 +161,7 @@ def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
 
 
 def _still_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """A robot of which nothing moves in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
+    """A robot without any motion in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
     measured = [line for line in lines if line.stream.names and len(line.times_ns) > 1]
     if measured and not any(_moves(line) for line in measured):
         text = f"nothing moves: no number of {', '.join(line.stream.label for line in measured)} changes in this bag"
@@ -176,7 +178,7 @@ def _moves(line: Timeline) -> bool:
 
 
 def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
-    """Whether all that is measured of the robot stands still in a time; False where nothing is."""
+    """Whether all measured elements of the robot rest in an interval; False if nothing is measured."""
     moves = []
     for line in lines:
         if not line.stream.names or line.stream.label.partition(" (")[0] == ACTION:
@@ -188,12 +190,12 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
         for start in line.stream.quaternions:
             within[:, start : start + 4] *= signs_of_course(within[:, start : start + 4])[:, None]
         whole = np.linalg.norm(np.ptp(np.nan_to_num(values), axis=0))
-        moves.append(not np.linalg.norm(np.ptp(within, axis=0)) <= _RESTS * whole)  # nor where a number is none
+        moves.append(not np.linalg.norm(np.ptp(within, axis=0)) <= _RESTS * whole)  # also true for NaN
     return bool(moves) and not any(moves)
 
 
 def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
-    """Streams that are slower than the rows: a note of numbers, which hold; cameras where none has enough images."""
+    """Streams slower than the rows: a note for numbers, which are held; cameras if none has enough images."""
     slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
     is_filmed = any(line.stream.heads and line not in slow for line in regular)
     for line in slow:
@@ -206,7 +208,7 @@ def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
 
 
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
-    """What is odd in the rows of a bag's episodes, each thing once."""
+    """Findings about the rows of a bag's episodes, each once."""
     fps = lines.mapping.clock.fps
     for rows in (rows for rows in episodes if rows.follows and len(rows.table.time_ns) > 1):
         steps = np.diff(rows.table.time_ns)
@@ -222,7 +224,7 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
 
 
 def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
-    """Streams of numbers of which many messages are in no row; cameras, where there are any, decide on the rows."""
+    """Streams of numbers with many messages in no row; cameras, if any, decide the rows."""
     for line in (line for line in lines.lines.values() if line.stream.names and line.is_regular):
         num_used = num_messages = 0
         for rows in episodes:
@@ -239,7 +241,7 @@ def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[F
 
 
 def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
-    """What becomes of a camera's images: a finding where rows could show more of them, else a note."""
+    """Use of a camera's images: a finding if other rows could show more of them, else a note."""
     line, clock = lines.lines[name], lines.mapping.clock
     num_repeated = num_free = num_skipped = num_images = 0
     for rows in episodes:
@@ -247,7 +249,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
         steps = np.diff(shown)
         repeated = shown[1:][steps == 0]
         num_repeated += len(repeated)
-        # Not those where an image is missing, or the stream is at its end; and an episode may begin between two images.
+        # Except rows with a missing image or at the stream's end; an episode may also begin between two images.
         repeated = repeated[repeated < len(line.times_ns) - 1]
         waits = line.times_ns[repeated + 1] - line.times_ns[repeated]
         num_free += max(0, int(np.sum(waits <= LOST * line.period_ns)) - 1)
@@ -257,7 +259,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
     rate = NS / max(line.period_ns, 1)
     repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows show the image before"
     skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"
-    if min(num_free, num_skipped):  # where a row repeats and another skips, other rows would lose nothing
+    if min(num_free, num_skipped):  # one row repeats while another skips, so other rows would lose nothing
         advice = 'use rows = "camera"'
         if abs(rate - clock.fps) > max(RATE * clock.fps, 0.5):
             advice = f"use fps = {max(1, round(rate))}"
@@ -266,7 +268,7 @@ def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) 
         yield of_stream(line.stream, "repeats", f"{repeats} and {skips}: {advice}")
     elif max(num_free / num_rows, num_skipped / num_images) > RATE:
         text = f"{repeats if num_free else skips}, since it comes {rate:.1f} times a second and rows {clock.fps} times"
-        # Every second image can be meant; now the next one and now the one after it only beside a slower camera.
+        # Taking every second image can be intended; an irregular step is only justified by a slower camera.
         is_uneven = abs(rate / clock.fps - round(rate / clock.fps)) > RATE
         if num_skipped and is_uneven and not any(rows.follows for rows in episodes):
             yield of_stream(line.stream, "skips", f"{text}: use fps = {max(1, round(rate))}")

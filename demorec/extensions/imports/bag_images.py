@@ -27,11 +27,11 @@ from demorec.runs.external import external_line
 from demorec.runs.run_file import Attempt
 
 _Taker = tuple[int, int, str, int]
-"""Number of a message in its topic, of the episode that takes it, its camera, number of the image there."""
+"""Number of a message in its topic, the episode that takes it, its camera, and number of the image there."""
 
 
 def write_bag(planned: PlannedBag, folder: Path, video: VideoConfig) -> tuple[BagReport, list[Attempt]]:
-    """Write a bag's episodes into a run; return its report, and the episodes' lines of run.json.
+    """Write a bag's episodes to a run; return its report, and the episodes' lines of run.json.
 
     Raises:
         BagError: The bag has changed, or an image cannot be decoded.
@@ -55,11 +55,11 @@ def write_bag(planned: PlannedBag, folder: Path, video: VideoConfig) -> tuple[Ba
 
 
 class _BagImages:
-    """Images of a bag, which wait here until their episode is written.
+    """Images of a bag, held until their episode is written.
 
     Args:
         bag: The bag.
-        episodes: Its episodes in the order in which they are written.
+        episodes: Its episodes in writing order.
     """
 
     def __init__(self, bag: Bag, episodes: Sequence[EpisodeRows]) -> None:
@@ -78,7 +78,7 @@ class _BagImages:
         self._messages = bag.messages([], taken.keys())
 
     def of(self, episode: int) -> Iterator[tuple[str, Image]]:
-        """Yield (camera, image) of an episode as they come, each camera's in the order of their times.
+        """Yield (camera, image) of an episode as they arrive, sorted by time for each camera.
 
         Raises:
             BagError: The bag has changed, or an image cannot be decoded.
@@ -100,7 +100,7 @@ class _BagImages:
                     raise self._unusable(cameras[name].topic, error) from error
 
     def _read_on(self, episode: int) -> None:
-        """Read one message on; its image waits for the episodes that take it."""
+        """Read one more message; hold its image for the episodes that take it."""
         message = next(self._messages, None)
         if message is None:
             missing = next(iter(self._episodes[episode].cameras.values())).topic

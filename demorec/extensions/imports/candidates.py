@@ -1,7 +1,7 @@
-"""Numbers of a topic that may be part of a robot's state or action, by message types and usual names.
+"""Numbers of a topic that may belong to a robot's state or action, found by message types and usual names.
 
-Recognised are joint positions (JointState and its relatives, JointTrajectory, arrays of numbers whose topic names
-joints), a gripper's opening, poses and velocities in space. A topic whose words say leader or command is the action.
+Recognises joint positions (JointState and similar types, JointTrajectory, number arrays with joint names in the topic),
+a gripper's opening, poses and velocities in space. A topic with a word such as leader or command is the action.
 """
 
 from __future__ import annotations
@@ -39,13 +39,13 @@ _SIDE = re.compile(r"(?<![a-z])(left|right|l|r|\d+)(?![a-z])")
 
 @dataclass(frozen=True, kw_only=True)
 class Candidate:
-    """Numbers of a topic that could be part of a feature.
+    """Numbers of a topic that may belong to a feature.
 
     Attributes:
         reader: Reader of the numbers, with their source.
         kind: Joints, a gripper's opening, or a pose or velocity in space.
-        is_action: Whether the topic commands the robot, or is a leader arm.
-        name: Name of the only element, where the message does not name it; "" elsewhere.
+        is_action: Whether the topic commands the robot, or belongs to a leader arm.
+        name: Name of the only element, if the message does not name it; "" otherwise.
         prefix: Prefix of each name.
     """
 
@@ -67,7 +67,7 @@ class Candidate:
 
     @property
     def words(self) -> list[str]:
-        """Words of its topic."""
+        """Words in its topic."""
         return [word for word in re.split(r"[^A-Za-z0-9]+", self.topic) if word]
 
     @property
@@ -77,11 +77,11 @@ class Candidate:
 
     @property
     def is_robot_pose(self) -> bool:
-        """Whether a pose is the robot's own, not that of an object or a tag."""
+        """Whether a pose is the robot's own and not an object's or a tag's."""
         return self.kind == "pose" and _ROBOT_POSE.search(self.topic.lower()) is not None
 
     def of_joints(self, joints: Sequence[str]) -> Candidate:
-        """The part with these joints, which are those of one publisher."""
+        """The part with these joints, which have the same publisher."""
         source = replace(self.reader.source, joints=tuple(joints))
         reader = replace(self.reader, source=source, names=tuple(joints), joints=tuple(joints))
         kind: Kind = "gripper" if _are_gripper(joints) else "joints"
@@ -89,7 +89,7 @@ class Candidate:
 
 
 def candidates_of(topic: str, type_name: str, values: Values) -> list[Candidate]:
-    """Candidates of a topic, from a message; none where nothing in it is recognised."""
+    """Candidates in a message of a topic; empty if nothing is recognised."""
     lower = topic.lower()
     is_action = bool(_LEADER.search(lower) or _COMMAND.search(lower) or _COMMAND_TYPE.search(type_name))
     for field in _JOINT_FIELDS:
@@ -107,7 +107,7 @@ def candidates_of(topic: str, type_name: str, values: Values) -> list[Candidate]
 
 
 def _candidate(topic: str, field: str, values: Values, kind: Kind, is_action: bool) -> Candidate | None:
-    """Return the candidate of a field; None where it holds no numbers."""
+    """Return the candidate of a field; None if it has no numbers."""
     try:
         return Candidate(reader=reader_of(Source(topic=topic, field=field), values), kind=kind, is_action=is_action)
     except ValueError:
@@ -115,7 +115,7 @@ def _candidate(topic: str, field: str, values: Values, kind: Kind, is_action: bo
 
 
 def _joints(topic: str, type_name: str, field: str, values: Values, is_action: bool) -> Candidate | None:
-    """The candidate of a field that usually holds joint positions, or a gripper's opening."""
+    """Candidate of a field that usually holds joint positions or a gripper's opening."""
     try:
         numbers = follow(values, parse_path(field))
     except ValueError:
@@ -139,7 +139,7 @@ def _are_gripper(joints: Sequence[str]) -> bool:
 
 
 def _has_parts(values: Values, field: str, parts: Sequence[str]) -> bool:
-    """Whether a message has these fields, of three or four numbers each."""
+    """Whether a message has these fields, with three or four numbers each."""
     try:
         found = follow(values, parse_path(field))
     except ValueError:
@@ -152,7 +152,7 @@ class Choice:
     """Features of a suggested mapping.
 
     Attributes:
-        state, action: Parts of them; an empty action is the next state.
+        state, action: Parts of them; an empty action means the next state.
         poses: Parts of observation.ee_pose.
     """
 
@@ -162,9 +162,9 @@ class Choice:
 
 
 def choose_features(candidates: Sequence[Candidate]) -> Choice:
-    """Choose state and action: joints where there are any, otherwise poses and velocities in space.
+    """Choose state and action: joints if there are any, otherwise poses and velocities in space.
 
-    A gripper alone is no state: the arm's topic was not recognised.
+    A gripper alone is not a state: the arm's topic was not recognised.
     """
     measured = [candidate for candidate in candidates if not candidate.is_action]
     commands = [candidate for candidate in candidates if candidate.is_action]
@@ -186,7 +186,7 @@ def _has_arm(candidates: Sequence[Candidate]) -> bool:
 
 
 def _own_poses(measured: Sequence[Candidate]) -> list[Candidate]:
-    """Poses and velocities of the robot, or the only ones that there are."""
+    """Poses and velocities of the robot, or the only ones available."""
     found = [candidate for candidate in measured if candidate.kind in ("pose", "twist")]
     named = {candidate.topic for candidate in found if candidate.is_robot_pose}
     if named:
@@ -195,7 +195,7 @@ def _own_poses(measured: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _distinct(candidates: Sequence[Candidate], kinds: Sequence[Kind]) -> list[Candidate]:
-    """Candidates of some kinds, none of the same joints twice: arms before grippers, a leader before a command."""
+    """Candidates of some kinds, without duplicate joints: arms before grippers, a leader before a command."""
     chosen: list[Candidate] = []
     found = [candidate for candidate in candidates if candidate.kind in kinds]
     for candidate in sorted(found, key=_preference):
@@ -210,7 +210,7 @@ def _preference(candidate: Candidate) -> tuple[bool, bool, bool, int]:
 
 
 def _are_same(candidate: Candidate, other: Candidate) -> bool:
-    """Whether two candidates are likely the same joints sent twice; left and right, 1 and 2 are two robots."""
+    """Whether two candidates are probably the same joints published twice; left and right, 1 and 2 are two robots."""
     if candidate.topic == other.topic:
         return False
     if _SIDE.sub("", candidate.topic.lower()) == _SIDE.sub("", other.topic.lower()):
@@ -222,7 +222,7 @@ def _are_same(candidate: Candidate, other: Candidate) -> bool:
 
 
 def of_publishers(candidate: Candidate, publishers: Sequence[tuple[str, ...]]) -> Iterator[Candidate]:
-    """A candidate for each set of joints that messages of the topic name."""
+    """One candidate for each set of joints named in the topic's messages."""
     named: set[str] = set()
     for joints in publishers if candidate.reader.joints else ():
         if not named & {*joints}:

@@ -1,7 +1,7 @@
-"""One clock for streams that have each their own: which message, or which two, a row takes from each stream.
+"""One clock for streams with separate clocks: the message, or the two messages, that a row takes from each stream.
 
-Integer nanoseconds throughout. Nothing is made up where a stream has nothing: a row tells how old what it holds is,
-and what is older than the mapping allows is no row.
+All times are integer nanoseconds. Missing data is never filled in: a row records the age of its data, and data older
+than the mapping allows yields no row.
 """
 
 from __future__ import annotations
@@ -19,34 +19,36 @@ from demorec.extensions.imports.streams import Stream
 
 NS = 1_000_000_000
 MISSING = 2**62
-"""Age of what is not there."""
+"""Age of missing data."""
 SKEW_S = 0.1
-"""Between the times of headers and of recording: a camera's exposure and transport take less."""
+"""Maximum difference between header time and log time; a camera's exposure and transport take less."""
 _PHASES = 64
-"""Moments of a period at which a grid may begin: a stream that jitters by a third of it leaves 21 of them free."""
+"""Number of candidate start phases of a grid within a period: a stream with jitter of a third of a period leaves 21 of
+them free.
+"""
 _ROUNDED_NS = 2_000
-"""By which the distance of two stamps is off at most that were rounded to microseconds, in whatever direction."""
+"""Maximum error, in either direction, of the distance between two timestamps rounded to microseconds."""
 _WAITS = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Of a period, for which a row may wait for an image."""
+"""Parts of a period for which a row may wait for an image."""
 Int = NDArray[np.int64]
 Numbers = NDArray[np.floating[Any]]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Timeline:
-    """A stream's messages in the order of their times.
+    """A stream's messages sorted by time.
 
     Attributes:
-        stream: Whose it is.
+        stream: The stream.
         times_ns: (M,) int64, strictly increasing.
-        order: (M,) which of the stream's messages they are. Those of equal times are left out but the first, and so
-            are those whose header has no time where others have, and video before its first keyframe.
-        is_header: Whether times are those of the headers.
-        period_ns: The usual distance of two, 0 for fewer than two.
-        is_regular: Whether distances are alike; a stream that speaks only when something changes is not.
-        is_log_asked: Whether the mapping asks for the times of recording.
-        sample: How rows take messages.
-        max_age_ns: How old what they take may be.
+        order: (M,) indices of the stream's messages. Excludes all but the first of equal times, messages without a
+        header time if others have one, and video before its first keyframe.
+        is_header: Whether times are header times.
+        period_ns: Usual interval, 0 for fewer than two messages.
+        is_regular: Whether intervals are similar; false for a stream that publishes only changes.
+        is_log_asked: Whether the mapping requests log times.
+        sample: Sampling rule of the rows.
+        max_age_ns: Maximum age of sampled messages.
     """
 
     stream: Stream
@@ -61,50 +63,50 @@ class Timeline:
 
     @property
     def label(self) -> str:
-        """Which it is, for people."""
+        """Label of the stream for people."""
         return f"{self.stream.label} ({self.stream.topic})"
 
     @property
     def rule(self) -> str:
-        """How rows take messages, in words."""
+        """Sampling rule in words."""
         return f"{self.sample} by {'header' if self.is_header else 'log'} time"
 
     @property
     def stamps_ns(self) -> Int:
-        """(N,) of the stream's messages; 0 or less where a header has no time."""
+        """(N,) header times of the stream's messages; 0 or less if a header has no time."""
         return self.stream.header_ns if self.is_header else self.stream.log_ns
 
     @property
     def skews_ns(self) -> Int:
-        """(K,) time of recording minus that of the header, of the messages whose header has a time."""
+        """(K,) log time minus header time, for messages with a header time."""
         return (self.stream.log_ns - self.stream.header_ns)[self.stream.header_ns > 0]
 
     @property
     def num_repeated(self) -> int:
-        """Messages of the time of another one."""
+        """Number of messages with the same time as another one."""
         known = self.stamps_ns[self.stamps_ns > 0]
         return len(known) - len(np.unique(known))
 
     def chosen(self, rows_ns: Int) -> ChosenSamples:
-        """What rows of these times (R,) take."""
+        """Messages that rows at these times (R,) take."""
         return choose(self.times_ns, rows_ns, self.sample)
 
     def sampled(self, chosen: ChosenSamples) -> Numbers:
-        """(R, D) the numbers of these rows, of a source."""
+        """(R, D) numbers of these rows, for a source."""
         stream = self.stream
         return sampled(stream.values, self.order, chosen, unit=stream.unit, quaternions=stream.quaternions)
 
     def within(self, begin_ns: int, end_ns: int) -> Int:
-        """Its times from one moment to another."""
+        """Times between two moments."""
         return self.times_ns[(self.times_ns >= begin_ns) & (self.times_ns <= end_ns)]
 
 
 def timeline(stream: Stream, clock: Clock) -> Timeline:
-    """The timeline of a stream, by header stamps if they are wanted and most messages have one."""
+    """Build the timeline of a stream, by header times if requested and if most messages have one."""
     by_header = (stream.part.stamp or clock.stamp) == "header"
     sample: Sampling = stream.part.sample or clock.sample
     if isinstance(stream.part, CameraSource) and sample == "linear":
-        sample = "latest"  # images are not mixed
+        sample = "latest"  # images are not interpolated
     age_s = clock.max_age_s if stream.part.max_age_s is None else stream.part.max_age_s
     stamped = stream.header_ns > 0
     is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
@@ -120,7 +122,7 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
         ordered, order = ordered[is_first], order[is_first]
     steps = np.diff(ordered)
     period = int(np.median(steps)) if len(steps) else 0
-    # Most steps of a sensor are about a period, whatever is lost; those of commands on change are of any length.
+    # Most steps of a sensor take about a period, even with losses; those of commands on change vary freely.
     is_regular = len(steps) >= 8 and bool(np.mean((steps > 0.3 * period) & (steps < 1.7 * period)) > 0.6)
     if stream.heads:
         keyframes = np.flatnonzero(stream.heads.are_keyframes[order])
@@ -141,13 +143,13 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ChosenSamples:
-    """What rows take from a stream.
+    """Messages that rows take from a stream.
 
     Attributes:
-        index: (R,) the message in its timeline; of two, the earlier one; -1 for none.
-        fraction: (R,) how far the row is between that and the next one, 0 to 1; None unless they are mixed.
-        age_ns: (R,) row minus message, below 0 where the message is later; of two, the earlier one's.
-        reach_ns: (R,) how far off the message is; of two, the farther one. MISSING where there is none.
+        index: (R,) index of the message in its timeline; for two, the earlier one; -1 for none.
+        fraction: (R,) position of the row between that message and the next one, 0 to 1; None without interpolation.
+        age_ns: (R,) row time minus message time, negative if the message is later; for two, of the earlier one.
+        reach_ns: (R,) distance of the message; for two, of the farther one. MISSING without a message.
     """
 
     index: Int
@@ -157,13 +159,14 @@ class ChosenSamples:
 
 
 def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
-    """The messages for some rows.
+    """Choose the messages for some rows.
 
     Args:
-        times_ns: (M,) strictly increasing; one at least.
+        times_ns: (M,) strictly increasing, M > 0.
         rows_ns: (R,) increasing.
-        sample: latest: the last message at or before the row; nearest: the earlier one of two that are as near;
-            linear: both neighbours, or one that is at the row.
+        sample: latest: the last message at or before the row; nearest: the closest one, the earlier of two equally
+        close;
+            linear: both neighbours, or one exactly at the row.
     """
     count = len(times_ns)
     before = np.searchsorted(times_ns, rows_ns, side="right") - 1
@@ -177,7 +180,7 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
         age = np.where(later, -until, since)
         return ChosenSamples(index=np.where(later, after, before), fraction=None, age_ns=age, reach_ns=np.abs(age))
     exact = since == 0
-    # A row outside of the stream has a neighbour on one side only, and no line to be on.
+    # A row outside the stream has a neighbour on one side only and cannot be interpolated.
     is_outside = ~exact & ((before < 0) | (before + 1 >= count))
     reach = np.where(is_outside, MISSING, np.where(exact, 0, np.maximum(since, until)))
     width = np.where(exact | is_outside, 1, times_ns[after] - times_ns[np.maximum(before, 0)])
@@ -186,17 +189,17 @@ def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
 
 
 def sampled(values: Numbers, order: Int, chosen: ChosenSamples, *, unit: str, quaternions: tuple[int, ...]) -> Numbers:
-    """(R, D) the numbers of some rows.
+    """(R, D) numbers of some rows.
 
     Args:
-        values: (N, D) in the order of the bag.
-        order: (M,) of the timeline.
-        chosen: For the rows; all of them have a message.
-        unit: Of the values: the line between two angles (rad, degree) is the short way round.
-        quaternions: First elements of x, y, z, w, which are mixed on the sphere.
+        values: (N, D) in the bag's order.
+        order: (M,) order of the timeline.
+        chosen: Choice for the rows; all of them have a message.
+        unit: Unit of the values: angles (rad, degree) are interpolated along the shorter direction.
+        quaternions: First elements of x, y, z, w groups, which are interpolated on the sphere.
 
     Returns:
-        The very bits of a message where one is taken; where two are mixed, float64.
+        Bit-exact values where one message is taken; float64 where two are interpolated.
     """
     if chosen.fraction is None or not np.any(chosen.fraction):
         return values[order[chosen.index]]
@@ -218,7 +221,7 @@ def sampled(values: Numbers, order: Int, chosen: ChosenSamples, *, unit: str, qu
 
 
 def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Numbers:
-    """(R, 4) on the shorter great arc from `first` to `second`, of the length of their mean."""
+    """(R, 4) on the shorter great arc from `first` to `second`, with the mean of their lengths."""
     lengths = [np.linalg.norm(part, axis=1, keepdims=True) for part in (first, second)]
     a, b = first / np.maximum(lengths[0], 1e-300), second / np.maximum(lengths[1], 1e-300)
     cosine = np.sum(a * b, axis=1, keepdims=True)
@@ -234,12 +237,11 @@ def _slerp(first: Numbers, second: Numbers, fraction: NDArray[np.float64]) -> Nu
 
 
 def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> Int:
-    """(R,) row times, evenly spaced, `fps` a second; the first within a period from `begin_ns` on, none after `end_ns`.
+    """(R,) evenly spaced row times, `fps` per second; the first within a period from `begin_ns`, none after `end_ns`.
 
-    Row k is k/fps s after the first, rounded down: a whole number of nanoseconds is not after that exactly if it is not
-    after the fraction. The first row is where a reader that takes the last message before each row is shown most of
-    those of `streams`, (M,) times of each, and these as soon as can be: none sits on an edge, where jitter and rounding
-    decide.
+    Row k is k/fps s after the first, rounded down: an integer is after that time exactly if it is after the rounded
+    time. The first row is placed so that a reader taking the last message before each row sees most messages of
+    `streams`, (M,) times of each, as early as possible; none is at an edge, where jitter and rounding would decide.
     """
     count = max(0, (end_ns - begin_ns) * fps // NS + 1)
     inside = [times[(times >= begin_ns) & (times <= end_ns)] for times in streams]
@@ -247,7 +249,7 @@ def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> I
     def fit(phase: int) -> tuple[int, int]:
         first, num_shown, age = begin_ns + phase, 0, 0
         for times in inside:
-            rows = np.maximum(-((first - times) * fps // NS), 0)  # the first row that is not before the message
+            rows = np.maximum(-((first - times) * fps // NS), 0)  # first row not before the message
             is_shown = np.append(rows[1:] != rows[:-1], True) & (rows <= (end_ns - first) * fps // NS)
             num_shown += int(is_shown.sum())
             age += int((first + rows * NS // fps - times)[is_shown].sum())
@@ -260,24 +262,26 @@ def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> I
 
 
 def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -> Int:
-    """(R,) row times, one for each time of `lead`: at it, or a little later where an image of `others` would be lost.
+    """(R,) row times, one for each time of `lead`: at that time, or slightly later if an image of `others` would be
+    lost.
 
-    Images that several cameras take at about the same moment come now in this order, now in that. At each image of one
-    of them, another one's would be a period old in one row and two newer in the next. So a row whose image of another
-    camera was in the row before may wait for the next one, though not until an image would be skipped: up to the part
-    of a period, of `_WAITS`, with which fewest images are skipped or shown twice, and the shortest of those.
+    Images that several cameras take at about the same moment arrive in varying order. With a row at each image of one
+    camera, another camera's image would be one period old in one row and skipped in the next. A row that would repeat
+    another camera's image may therefore wait for the next one, unless that skips an image: up to the part of a period
+    in `_WAITS` with the fewest skipped or repeated images, the shortest of equals.
 
     Args:
         lead: (R,) increasing.
-        others: (M,) of each other camera of that rate, increasing.
-        period_ns: The usual distance of two.
-        end_ns: The last moment of a row.
+        others: (M,) times of each other camera with that rate, increasing.
+        period_ns: Usual interval.
+        end_ns: Maximum time of a row.
     """
     best, fewest = lead, -1
     for part in _WAITS:
         rows = _waited(lead, others, round(part * period_ns), end_ns)
         steps = [np.diff(np.searchsorted(times, rows, side="right")) for times in others]
-        # Skipped or repeated. Cameras that always come one after the other cost the same image at both ends else.
+        # Number of skipped or repeated images. Otherwise cameras with a constant order would lose the same image at
+        # both ends.
         num_off = sum(int(np.abs(step - 1).sum()) for step in steps)
         if fewest < 0 or num_off < fewest:
             best, fewest = rows, num_off
@@ -287,7 +291,7 @@ def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -
 
 
 def _waited(lead: Int, others: Sequence[Int], wait_ns: int, end_ns: int) -> Int:
-    """(R,) the rows of `followed` that wait for `wait_ns` at most."""
+    """(R,) rows of `followed` with a maximum wait of `wait_ns`."""
     if not wait_ns or not len(lead):
         return lead
     images = [times.tolist() for times in others]

@@ -1,4 +1,4 @@
-"""`demorec import`: other robots' bags to a run."""
+"""`demorec import`: import third-party robots' bags to a run."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ if TYPE_CHECKING:
     from demorec.extensions.imports.import_file import BagReport
 
 MAX_WORKERS = 1000
-_BAGS = "Bags; each is an episode, or several, as the mapping says."
+_BAGS = "Bags; each is one episode, or several by the mapping."
 _WORDS = ", ".join(f"{word} ({form.plural})" for word, form in formats_by_word().items())
 
 
 @dataclass(frozen=True, kw_only=True)
 class Import:
-    """Make a run of another robot's bags (MCAP, rosbag2, ROS 1; without ROS), HDF5 files or LeRobot dataset.
+    """Convert another robot's bags (MCAP, rosbag2, ROS 1; without ROS), HDF5 files or LeRobot dataset to a run.
 
-    A mapping (TOML) says which topics become which features; --suggest writes one from what is in a bag. Every row
-    holds messages that are in the bag and says how old they are; what is missing or too old is an error, or drops the
-    episode, as the mapping says. Encoded images pass through. Run the same command again to continue. A folder without
-    metadata.yaml stands for the bags in it.
+    A mapping (TOML) maps topics to features; --suggest writes one from a bag's content. Every row holds messages of the
+    bag and records their age; missing or outdated data is an error or drops the episode, depending on the mapping.
+    Encoded images pass through. Run the same command again to continue. A folder without metadata.yaml means the bags
+    in it.
 
-    A LeRobot dataset (v3.0, v2.1 or v2.0, whoever wrote it) needs no mapping: its features keep their names, its
-    numbers stay bit-exact, and its video packets pass through where each episode begins with a keyframe. With
-    --motor-units its recordings have the arm's URDF and joints.
+    A LeRobot dataset (v3.0, v2.1 or v2.0, from any writer) needs no mapping: its features keep their names, its numbers
+    stay bit-exact, and its video packets pass through if each episode begins with a keyframe. With --motor-units its
+    recordings have the arm's URDF and joints.
 
-    HDF5 files in robomimic's or ALOHA's layout take a mapping as well: which datasets become which features. Their
-    numbers keep every bit, JPEG files pass through.
+    HDF5 files in robomimic's or ALOHA's layout also need a mapping, from datasets to features. Their numbers stay
+    bit-exact, JPEG files pass through.
 
     Examples:
       demorec import --suggest monday.mcap > robot.toml
@@ -55,14 +55,15 @@ class Import:
       demorec import hdf5 demo.hdf5 --mapping mapping.toml --out runs/demo
     """
 
-    bags: Annotated[Positional[tuple[Path, ...]], arg(help=f"{_BAGS} Or a word in front of what is no bag: {_WORDS}.")]
+    bags: Annotated[Positional[tuple[Path, ...]], arg(help=f"{_BAGS} Or a word before other sources: {_WORDS}.")]
     mapping: Path | None = None
-    """Mapping file (TOML): which topics or datasets become which features; required where --suggest writes one."""
+    """Mapping file (TOML) from topics or datasets to features; required except for formats without --suggest."""
     out: OptionalTarget = None
-    """Folder of the run, new or to be continued; required unless --suggest is given."""
+    """Folder of the run, new or to be continued; required without --suggest."""
     skip_bad: bool = False
-    """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and episodes of a dataset that
-    cannot be read; list them at the end and exit with 1. Else the first of them ends the import."""
+    """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and unreadable episodes of a
+    dataset; list them at the end and exit with 1. Otherwise the first of them ends the import.
+    """
     workers: int = 1
     """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
@@ -70,10 +71,10 @@ class Import:
     motors: MotorsByFlags = field(default_factory=MotorFlags)
     roles: NamedByFlags = field(default_factory=RoleFlags)
     video: Annotated[VideoConfig, arg(name="")] = field(default_factory=VideoConfig)
-    """How images are encoded that come as pixels."""
+    """Encoding of images that arrive as pixels."""
 
     def run(self) -> int:
-        """Import, or suggest a mapping; print what was found; 1 if bags or episodes were skipped."""
+        """Import, or suggest a mapping; print the findings; 1 if bags or episodes were skipped."""
         if not self.bags:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.out is not None:
@@ -86,24 +87,24 @@ class Import:
         if not paths:
             name = name_of(form.kind)
             raise ConfigError(
-                f"Name {name} after the word {word}: {form.command} {form.example}. A bag of that name is given with "
+                f"Name {name} after the word {word}: {form.command} {form.example}. Give a bag with that name with "
                 "its folder."
             )
         if form is BAGS and not paths[0].exists() and (near := nearest_match(word, formats_by_word())):
             raise ConfigError(
-                f"There is no bag {word!r}.{near} Name bags, or one of {', '.join(formats_by_word())} and its files."
+                f"No bag {word!r}.{near} Name bags, or one of {', '.join(formats_by_word())} and its files."
             )
         from demorec.extensions.imports.bag import bags_in, open_bag
 
         if self.suggest:
             lines = form.suggest(paths[0], tell)
             if find(paths[0]).kind == "recording":
-                tell(f"Note: demorec made this recording, and reads it as it is, without an import: {paths[0]}")
+                tell(f"Note: demorec made this recording, and reads it directly, without an import: {paths[0]}")
             say(*lines)
             return 0
         if form.suggester and (self.mapping is None or self.out is None):
             if form is BAGS:
-                open_bag(bags_in(paths[0])[0])  # says what it is, if it is not a bag
+                open_bag(bags_in(paths[0])[0])  # reports the kind of a path that is not a bag
             raise ConfigError(
                 f"An import needs --mapping and --out: {form.command} {paths[0]} --suggest > mapping.toml writes a "
                 "mapping."
@@ -123,12 +124,11 @@ class Import:
         if form.suggester and self.roles.named:
             raise ConfigError(
                 "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
-                "bags and HDF5 files say it in their mapping."
+                "bags and HDF5 files have roles in their mapping."
             )
         if form is not BAGS and (self.workers > 1 or (self.skip_bad and form.suggester)):
             raise ConfigError(
-                "Only bags can be imported by several workers, only they and episodes of datasets be skipped: leave "
-                "--workers, --skip-bad out."
+                "--workers is for bags, and --skip-bad for bags and episodes of datasets: leave them out."
             )
         if not form.suggester and (self.suggest or self.mapping is not None):
             name = name_of(form.kind)
@@ -172,7 +172,7 @@ class Import:
             say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
         else:
             above = f"No findings; {counted(notes, 'note')} above."
-            say(above if notes else "Nothing odd was found.")
+            say(above if notes else "No findings.")
         return _list_skipped(result.skipped, len(result.reports) + len(result.skipped), "bag")
 
 
@@ -187,7 +187,7 @@ def _report_lines(report: BagReport) -> list[str]:
 
 
 def _list_skipped(skipped: Mapping[Any, str], total: int, word: str) -> int:
-    """Print what was skipped; return the exit code."""
+    """Print the skipped items; return the exit code."""
     if not skipped:
         return 0
     say(f"Skipped {len(skipped)} of {counted(total, word)}:")

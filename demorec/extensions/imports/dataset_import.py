@@ -1,6 +1,6 @@
-"""LeRobot datasets become runs: every episode a recording, its numbers bit-exact, its packets byte for byte.
+"""Import of LeRobot datasets to runs: one recording per episode, with bit-exact numbers and packets.
 
-The same command again goes on: episodes that are there are not written.
+The same command continues: existing episodes are not written again.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from demorec.runs.external import ExternalFolder, episode_path, open_external_ru
 from demorec.runs.find import expect
 
 _MAX_EXACT = 2**53
-"""Largest whole number up to which float64 holds every one."""
+"""Maximum integer up to which float64 is exact."""
 
 
 def import_lerobot(
@@ -45,21 +45,21 @@ def import_lerobot(
     named: NamedRoles = NO_NAMES,
     skip_bad: bool = False,
 ) -> FramesImport:
-    """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, whoever wrote it, into a run.
+    """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, from any writer, to a run.
 
     Args:
-        roots: The dataset's folder, the only one.
+        roots: The dataset's folder, exactly one.
         mapping: Unused: datasets need none.
-        out: The run's folder; one that the same dataset began is continued.
-        video: How images are encoded whose packets cannot pass through.
-        motors: The servos whose values LeRobot recorded as state and action.
+        out: The run's folder; a run started from the same dataset is continued.
+        video: Encoding of images with packets that cannot pass through.
+        motors: Servos whose values LeRobot recorded as state and action.
         named: Features whose role the user names; the recordings keep it.
         skip_bad: Leave out episodes that cannot be read; otherwise the first of them ends the import.
 
     Raises:
-        ConfigError: This is no dataset, not one of these servos, it has what no recording can hold, or the folder holds
-            something else.
-        ExportError: It is damaged, or not at its rate.
+        ConfigError: This is not a dataset or not one of these servos, it has data that recordings cannot hold, or the
+        folder holds other files.
+        ExportError: It is damaged, or its timestamps do not match its rate.
         RecordingError: A number is not finite, or the disk is full.
     """
     dataset = _opened(roots, motors, named)
@@ -97,7 +97,7 @@ def import_lerobot(
 
 def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> LeRobotFolder:
     if len(roots) != 1:
-        raise ConfigError(f"One dataset becomes one run, given are {len(roots)}: import them one by one.")
+        raise ConfigError(f"One dataset becomes one run, found {len(roots)}: import them one by one.")
     root = roots[0]
     expect(root, "dataset")
     dataset = LeRobotFolder(root, motors, named)
@@ -111,7 +111,7 @@ def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> 
 
 @contextmanager
 def _reading(place: EpisodePlace, skipped: dict[int, str] | None) -> Iterator[None]:
-    """Note why an episode cannot be read in the context among those that are skipped; None: none is, raise it."""
+    """Collect the reason why an episode cannot be read; if `skipped` is None, raise it."""
     try:
         yield
     except (ExportError, RecordingError) as error:
@@ -122,12 +122,12 @@ def _reading(place: EpisodePlace, skipped: dict[int, str] | None) -> Iterator[No
 
 @dataclass(kw_only=True)
 class _Survey:
-    """What the episodes that can be read have in common.
+    """Common properties of the readable episodes.
 
     Attributes:
-        inexact: Features with whole numbers that float64 cannot hold.
+        inexact: Features with integers that float64 cannot hold.
         formats: Video camera -> (codec, (width, height)) of its files.
-        reasons: Video camera -> why its packets cannot pass through.
+        reasons: Video camera -> reason why its packets cannot pass through.
     """
 
     inexact: set[str] = field(default_factory=set)
@@ -136,7 +136,7 @@ class _Survey:
 
 
 def _surveyed(dataset: LeRobotFolder, skipped: dict[int, str] | None) -> _Survey:
-    """Look at the whole numbers and the encoded images of every episode."""
+    """Check the integers and the encoded images of every episode."""
     survey = _Survey()
     types = {feature.name: dataset.info.features[feature.name].dtype for feature in dataset.features}
     whole = [name for name, dtype in types.items() if dtype in ("int64", "uint64")]
@@ -157,7 +157,7 @@ def _surveyed(dataset: LeRobotFolder, skipped: dict[int, str] | None) -> _Survey
 
 
 def _left_out(dataset: LeRobotFolder) -> dict[str, str]:
-    """What no recording can hold, by its name in the dataset -> why."""
+    """Name in the dataset -> reason why recordings cannot hold it."""
     features = dataset.info.features.items()
     found = {name: reason for name, feature in features if (reason := why_not_recorded(name, feature))}
     if dataset.language_rows is not None:
@@ -171,7 +171,7 @@ def _left_out(dataset: LeRobotFolder) -> dict[str, str]:
 
 
 def _cameras(dataset: LeRobotFolder, survey: _Survey) -> tuple[dict[str, Camera], dict[str, str]]:
-    """The cameras as the recordings shall have them, and what becomes of the images of each, in words."""
+    """Cameras in recordings' form, and the treatment of each one's images, in words."""
     cameras: dict[str, Camera] = {}
     fates: dict[str, str] = {}
     for name, key in dataset.keys.items():
@@ -198,7 +198,7 @@ def _write(
     video: VideoConfig,
     digest: Callable[[Path], str],
 ) -> bool:
-    """Write an episode of the run, if it is not there."""
+    """Write an episode of the run unless it exists."""
     info, subtasks = _info(recording, cameras, digest), dict(recording.subtasks)
     if folder.has(info):
         return False
@@ -210,7 +210,7 @@ def _write(
 
 
 def _info(recording: DatasetRecording, cameras: Mapping[str, Camera], digest: Callable[[Path], str]) -> EpisodeInfo:
-    """What the recording shall say of an episode."""
+    """Description of an episode for its recording."""
     dataset, place = recording.dataset, recording.place
     videos = [place.videos[key][0] for key in dataset.keys.values() if key in place.videos]
     names = [INFO_PATH, *(path.relative_to(dataset.root).as_posix() for path in (place.data, *videos))]
@@ -225,7 +225,7 @@ def _info(recording: DatasetRecording, cameras: Mapping[str, Camera], digest: Ca
 
 
 def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:
-    """Of the camera's lead, where packets pass through, and of every frame."""
+    """Images of the camera's lead, if packets pass through, and of every frame."""
     if camera.is_depth:
         return recording.distances(camera.name)
     if camera.kept:

@@ -1,7 +1,7 @@
-"""Messages of any encoding as plain values: numbers, texts, NumPy arrays, lists and dictionaries of these.
+"""Decode messages of any encoding to plain values: numbers, texts, NumPy arrays, and lists and dictionaries of these.
 
-`rosbags` parses the definitions of ROS 1 and ROS 2; its own deserialisers, and those of others, are programs that are
-made of the definition's text and run. A definition from a foreign file is data here: it becomes a chain of ready-made
+`rosbags` parses the definitions of ROS 1 and ROS 2; its own deserialisers, like others, are code generated from the
+definition's text and executed. A definition from a foreign file is only data here: it becomes a chain of predefined
 readers.
 """
 
@@ -26,24 +26,24 @@ from demorec.mcap.ros2 import FieldType, Types
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
 
 Decoder = Callable[[bytes], Values]
-"""Bytes of a message to its values; ValueError when they do not fit its type."""
+"""Converts a message's bytes to values; ValueError if they do not fit its type."""
 
 
 class UnknownEncodingError(ValueError):
-    """Messages in an encoding, or of a definition, that cannot be read; `str` is the reason."""
+    """Messages with an unsupported encoding or definition; `str` is the reason."""
 
 
 class BagDecoder:
-    """Decoders of a bag's channels, made when they are first needed."""
+    """Decoders of a bag's channels, created on first use."""
 
     def __init__(self) -> None:
         self._decoders: dict[ScannedChannel, Decoder] = {}
 
     def values(self, message: ScannedMessage) -> Values:
-        """Of a message.
+        """Decode a message.
 
         Raises:
-            UnknownEncodingError: Its channel cannot be read at all.
+            UnknownEncodingError: Its channel cannot be decoded.
             ValueError: The message does not fit its type.
         """
         decoder = self._decoders.get(message.channel)
@@ -65,7 +65,7 @@ class BagDecoder:
             case "json":
                 return _decode_json
             case other:
-                raise ValueError(f"the encoding {other[:40]!r} is not read; cdr, ros1, protobuf and json are")
+                raise ValueError(f"the encoding {other[:40]!r} is not supported; cdr, ros1, protobuf and json are")
 
 
 def _refuse(reason: str, data: bytes) -> Values:
@@ -81,7 +81,7 @@ def _decode_json(data: bytes) -> Values:
 
 
 def _array_of(value: Any) -> Any:
-    """Lists of numbers as arrays, at any depth; texts without the halves of characters that cannot be written."""
+    """Convert lists of numbers to arrays, at any depth, and remove lone surrogates from texts."""
     if isinstance(value, dict):
         return {_array_of(key): _array_of(item) for key, item in value.items()}
     if isinstance(value, str):
@@ -109,7 +109,7 @@ def _protobuf_decoder(type_name: str, schema: bytes) -> Decoder:
         message_class = GetMessageClass(descriptor)
     except (DecodeError, TypeError, KeyError, RecursionError, ValueError) as error:
         raise ValueError("its protobuf definition cannot be read") from error
-    methods: Any = message_class.__mro__[1]  # a message's own fields may have the names of its methods
+    methods: Any = message_class.__mro__[1]  # a message's own fields may shadow its methods
 
     def decode(data: bytes) -> Values:
         message = message_class()
@@ -146,7 +146,7 @@ def _protobuf_values(message: Any, descriptor: Any, methods: Any, depth: int = 0
 _TIME = (FieldType("sec", "int32", False, None), FieldType("nanosec", "uint32", False, None))
 _BUILT_IN = {"builtin_interfaces/msg/Time": _TIME, "builtin_interfaces/msg/Duration": _TIME}
 _SEPARATOR = "=" * 80 + "\n"
-"""Between the definitions of types that are in one text."""
+"""Separates the definitions of several types in one text."""
 
 
 def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: bool) -> Decoder:
@@ -154,12 +154,12 @@ def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr:
 
     Args:
         type_name: "sensor_msgs/msg/JointState" (or as in ROS 1, without "msg").
-        schema_encoding: ros2msg, ros2idl, ros1msg; "" for a type of ROS itself that comes without a definition.
-        schema: The definition.
-        is_cdr: Whether messages are CDR (ROS 2), otherwise as ROS 1 serialises them.
+        schema_encoding: ros2msg, ros2idl, ros1msg; "" for a standard ROS type without a definition.
+        schema: Text of the definition.
+        is_cdr: Whether messages are CDR (ROS 2) rather than serialised by ROS 1.
 
     Raises:
-        ValueError: The definition cannot be read; or, from the decoder, a message does not fit it.
+        ValueError: The definition cannot be parsed; the decoder raises it for a message that does not fit.
     """
     parts = type_name.split("/")
     name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
@@ -178,7 +178,9 @@ def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr:
 
 @lru_cache(maxsize=512)
 def _types(name: str, schema_encoding: str, schema: bytes) -> Types:
-    """Fields of a type and of all that it refers to; a bag is read twice, and the next one has the same definitions."""
+    """Fields of a type and of all types that it refers to; cached, because a bag is read twice and bags share
+    definitions.
+    """
     try:
         if schema_encoding in ("ros2msg", "ros1msg"):
             parsed = make_typesdict(MSGParser(f"MSG: {name}\n{schema.decode()}").specification())
@@ -196,20 +198,20 @@ def _types(name: str, schema_encoding: str, schema: bytes) -> Types:
         raise ValueError("its definition is nested too deeply") from None
     except (ValueError, MemoryError):
         raise
-    except Exception as error:  # the parser's own errors, and what it does not foresee
+    except Exception as error:  # the parser's own errors, and unforeseen ones
         raise ValueError("its definition cannot be read") from error
     if name not in parsed:
-        raise ValueError("it comes without a definition, and is no type of ROS itself")
+        raise ValueError("it has no definition, and is not a standard ROS type")
     found = {kind: tuple(_field_type(*field) for field in fields) for kind, (_, fields) in parsed.items()}
     return found | {kind: fields for kind, fields in _BUILT_IN.items() if not found.get(kind)}
 
 
 def _field_type(name: str, description: Any) -> FieldType:
-    """A field as the definitions of recordings have it; ValueError for lists of lists."""
+    """Convert a field to recordings' form; ValueError for lists of lists."""
     kind, rest = description
     if kind not in (Nodetype.SEQUENCE, Nodetype.ARRAY):
         return FieldType(name, rest[0] if kind == Nodetype.BASE else rest, False, None)
     (inner, of), length = rest
     if inner not in (Nodetype.BASE, Nodetype.NAME):
-        raise ValueError("it has lists of lists, which are not read")
+        raise ValueError("it has lists of lists, which are not supported")
     return FieldType(name, of[0] if inner == Nodetype.BASE else of, True, length if kind == Nodetype.ARRAY else None)

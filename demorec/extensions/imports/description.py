@@ -30,7 +30,7 @@ def importing_versions() -> Mapping[str, str]:
 def imported_feature(
     name: str, dtype: DTypeLike, names: tuple[str, ...], units: Iterable[str], *, called: Iterable[str], source: str
 ) -> Feature:
-    """A feature as recordings know it; `called` is how the joints are called that its elements may be of."""
+    """Describe a feature in recordings' form; `called` has the names of the joints to which its elements may belong."""
     units = tuple("deg" if unit == "degree" else unit for unit in units)
     return Feature(
         name=name,
@@ -56,7 +56,7 @@ def imported_info(
     """Describe an episode that was imported by a mapping.
 
     Args:
-        urdf: The robot's model; None if there is none.
+        urdf: The robot's model; None if unknown.
 
     Raises:
         FieldError: The model is not a URDF.
@@ -87,7 +87,7 @@ _MAX_URDF_BYTES = 4 << 20
 
 
 def urdf_text(mapping: SourceMapping, mapping_path: Path) -> str | None:
-    """The URDF that a mapping names a file for; None when it names none. ConfigError when it cannot be read."""
+    """Read the URDF file that a mapping names; None if it names none. Raises ConfigError if it cannot be read."""
     if not mapping.robot.urdf:
         return None
     path = mapping_path.parent / mapping.robot.urdf
@@ -95,5 +95,7 @@ def urdf_text(mapping: SourceMapping, mapping_path: Path) -> str | None:
         text = read_text_limited(path, _MAX_URDF_BYTES)
         remember_model(text, path)
         return text or None
-    except (OSError, ValueError) as error:  # no text, or NUL in the name
-        raise ConfigError(f"The URDF cannot be read ({getattr(error, 'strerror', 'it is no text')}): {path}") from error
+    except (OSError, ValueError) as error:  # not text, or a NUL in the name
+        raise ConfigError(
+            f"The URDF cannot be read ({getattr(error, 'strerror', 'it is not text')}): {path}"
+        ) from error

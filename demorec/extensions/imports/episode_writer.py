@@ -1,4 +1,4 @@
-"""Record imported episodes, each whole or not at all."""
+"""Atomic recording of imported episodes."""
 
 from __future__ import annotations
 
@@ -17,20 +17,20 @@ from demorec.mcap import SampledWriter
 from demorec.runs.external import ExternalFolder, episode_path
 
 Image = bytes | NDArray[Any]
-"""A packet that stays as it is, (H, W, 3) uint8 RGB, or (H, W) distances as `SampledWriter.image` takes them."""
+"""A passthrough packet, (H, W, 3) uint8 RGB, or (H, W) depth in the form for `SampledWriter.image`."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class FramesImport:
-    """Result of an import of episodes whose frames are evenly spaced, as in datasets.
+    """Result of an import of episodes with evenly spaced frames, such as from datasets.
 
     Attributes:
-        num_episodes, num_frames: In the run.
-        num_new: Episodes that were written now; the others were there.
-        cameras: Camera -> what became of its images, in words.
-        left_out: What the run does not have, by its name in the source -> why; "" for what the mapping does not name.
-        skipped: Episode that cannot be read -> why.
-        notes: Sentences on how the source was read.
+        num_episodes, num_frames: Size of the run.
+        num_new: Episodes written now; the others existed.
+        cameras: Camera -> treatment of its images, in words.
+        left_out: Name in the source -> reason why it is not in the run; "" if the mapping does not name it.
+        skipped: Episode that cannot be read -> reason.
+        notes: Sentences about the reading of the source.
     """
 
     num_episodes: int
@@ -42,11 +42,11 @@ class FramesImport:
     notes: tuple[str, ...] = ()
 
     def left_out_lines(self) -> Iterator[str]:
-        """Describe how the source was read and what the run does not have."""
+        """Describe notes and the data left out of the run."""
         yield from self.notes
         yield from (f"{name} is left out: {reason}." for name, reason in self.left_out.items() if reason)
         if unnamed := [name for name, reason in self.left_out.items() if not reason]:
-            yield f"The mapping does not name, and so the run does not have: {', '.join(unnamed)}."
+            yield f"Left out, because the mapping does not name them: {', '.join(unnamed)}."
 
 
 def add_episode(
@@ -59,10 +59,10 @@ def add_episode(
     video: VideoConfig,
     subtasks: Mapping[int, str],
 ) -> None:
-    """Record an episode whose cameras have an image in each frame; see `write_episode`.
+    """Record an episode with an image in each frame for every camera; see `write_episode`.
 
     Raises:
-        ConfigError: The run holds episodes of another kind.
+        ConfigError: The run's episodes differ from this one.
         RecordingError: A number is not finite, or the disk is full.
     """
     folder.check_fits(info)
@@ -95,10 +95,10 @@ def write_episode(
     Args:
         folder: The run.
         info: Description of the episode.
-        table: Its numbers, and which image each frame shows.
-        images: (camera, image), each camera's in order; a frame is written when its images are there.
-        outcome: How it ended; the number of frames is set here.
-        video: How pixels are encoded.
+        table: Its numbers, and the image that each frame shows.
+        images: (camera, image), in order for each camera; a frame is written when all its images are there.
+        outcome: Outcome; the number of frames is set here.
+        video: Encoding of pixels.
         subtasks: Frame -> subtask that begins there.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Where in a message something is: paths of fields, times of headers, the numbers of a source."""
+"""Access to message content: field paths, header times, and the numbers of a source."""
 
 from __future__ import annotations
 
@@ -33,15 +33,17 @@ Step = str | int | tuple[str, str]
 
 
 class FieldError(ValueError):
-    """A message or dataset is not what the mapping takes it for; `str` says why, for the inside of a sentence."""
+    """A message or dataset does not fit the mapping; `str` is the reason, for use inside a sentence."""
 
 
 class OtherPublisherError(ValueError):
-    """A message names none of the joints: it is of another publisher on the same topic, and no mistake."""
+    """A message names none of the joints: it comes from another publisher on the same topic, which is not an error."""
 
 
 def parse_path(path: str) -> tuple[Step, ...]:
-    """The steps of "transforms[child_frame_id=hand].transform" or "points[0].positions"; FieldError when it is none."""
+    """Parse the steps of "transforms[child_frame_id=hand].transform" or "points[0].positions"; FieldError if
+    invalid.
+    """
     steps: list[Step] = []
     position = 0
     while position < len(path):
@@ -49,7 +51,7 @@ def parse_path(path: str) -> tuple[Step, ...]:
             position += 1
         found = _STEP.match(path, position)
         if found is None:
-            raise FieldError(f"{path!r} is no path of a field")
+            raise FieldError(f"{path!r} is not a field path")
         if found["name"] is not None:
             steps.append(found["name"])
         elif found["index"] is not None:
@@ -61,7 +63,7 @@ def parse_path(path: str) -> tuple[Step, ...]:
 
 
 def follow(values: Any, steps: Sequence[Step]) -> Any:
-    """What is at a path; of a list of messages, the field of each."""
+    """Value at a path; for a list of messages, the field of each."""
     for step in steps:
         if isinstance(step, str):
             if isinstance(values, list):
@@ -91,7 +93,7 @@ def follow(values: Any, steps: Sequence[Step]) -> Any:
 
 
 def stamp_of(values: Values) -> int | None:
-    """The time in a message's header, nanoseconds; None when it has no header."""
+    """Header time of a message, nanoseconds; None if it has no header."""
     for path in _STAMP_PATHS:
         found: Any = values
         for step in path:
@@ -110,28 +112,28 @@ def _nanoseconds(value: Any) -> int | None:
         rest = next((value[key] for key in _NANOSECONDS if key in value), 0)
         if not isinstance(seconds, int | float) or not isinstance(rest, int | float):
             return None
-        if abs(seconds) < MAX_TIME_NS and abs(rest) < MAX_TIME_NS:  # no NaN either
+        if abs(seconds) < MAX_TIME_NS and abs(rest) < MAX_TIME_NS:  # also false for NaN
             time_ns = int(seconds) * 1_000_000_000 + int(rest)
             return time_ns if abs(time_ns) < MAX_TIME_NS else None
     return None
 
 
 def whole(values: Mapping[str, Any], name: str) -> int:
-    """A whole number of a message, which JSON may have as anything; FieldError when it is none, or none of 32 bits."""
+    """An integer of a message, which JSON may store in any form; FieldError if it is not a 32-bit integer."""
     value = values[name]
     if isinstance(value, int | float | np.integer | np.floating) and -(2**31) <= value < 2**32:
         return int(value)
-    raise FieldError(f"its {name} is no number of 32 bits")
+    raise FieldError(f"its {name} is not a 32-bit number")
 
 
 def image_bytes(values: Mapping[str, Any]) -> bytes:
-    """The bytes of an image; JSON has them in base64."""
+    """Bytes of an image; JSON has them in base64."""
     data = values["data"]
     if isinstance(data, str):
         try:
             return base64.b64decode(data, validate=True)
-        except ValueError as error:  # binascii's, and of texts that are not ASCII
-            raise FieldError("its image is no base64") from error
+        except ValueError as error:  # binascii's error, and that for texts that are not ASCII
+            raise FieldError("its image is not base64") from error
     if isinstance(data, np.ndarray):
         return data.tobytes()
     if isinstance(data, bytes):
@@ -140,7 +142,7 @@ def image_bytes(values: Mapping[str, Any]) -> bytes:
 
 
 def numbers_in(value: Any, name: str = "") -> Iterator[tuple[str, Any]]:
-    """(name, number or array) of all numbers in a value, in the order of its fields; headers and texts are left out."""
+    """Yield (name, number or array) for all numbers in a value, in field order; headers and texts are left out."""
     if isinstance(value, Mapping):
         for key, item in value.items():
             if key != "header":
@@ -154,17 +156,17 @@ _FLOATS = (np.dtype(np.float32), np.dtype(np.float64))
 
 @dataclass(kw_only=True)
 class SourceReader:
-    """Reads the vector of a source from message after message, as its first message lays it out.
+    """Reader of a source's vectors, with the layout of its first message.
 
     Attributes:
-        source: That one.
-        names: Of the elements of the feature.
-        joints: What messages call these elements, which may stand at another place in each; empty where elements have
-            no names, or one name is that of several.
+        source: The source.
+        names: Names of the feature's elements.
+        joints: Names of these elements in messages, where their order may vary; empty if elements have no names, or
+        several share one.
         steps: Path of the numbers.
-        names_steps: Path of the names beside them; None where elements have none.
-        quaternions: First element of each x, y, z, w among them.
-        others: Names in messages beside those of the first one, where the source takes all that there are.
+        names_steps: Path of the corresponding names; None if elements have none.
+        quaternions: First element of each x, y, z, w group.
+        others: Names that later messages add, if the source takes all elements.
     """
 
     source: Source
@@ -177,15 +179,15 @@ class SourceReader:
     _orders: dict[tuple[str, ...], list[int]] = field(init=False, compare=False, default_factory=dict)
 
     def read(self, values: Values) -> NDArray[np.floating[Any]]:
-        """(D,) float32 or float64, in the unit of the bag.
+        """(D,) float32 or float64, in the bag's unit.
 
         Raises:
-            FieldError: The message does not have what the first one had.
+            FieldError: The message lacks content of the first one.
             OtherPublisherError: It has none of the joints.
         """
         found = follow(values, self.steps)
         if isinstance(found, np.ndarray) and found.ndim == 1 and found.dtype in _FLOATS:
-            vector: NDArray[np.floating[Any]] = found  # as it is in most messages, of which there are many
+            vector: NDArray[np.floating[Any]] = found  # the fast path for most messages
         else:
             vector = _joined([found] if isinstance(found, np.ndarray) else [item for _, item in numbers_in(found)])
         if self.joints:
@@ -219,10 +221,10 @@ class SourceReader:
 
 
 def reader_of(source: Source, values: Values) -> SourceReader:
-    """What reads a source, from its first message.
+    """Create the reader of a source from its first message.
 
     Raises:
-        FieldError: The message does not have what the source names.
+        FieldError: The message lacks content that the source names.
         OtherPublisherError: It has none of the joints.
     """
     steps = parse_path(source.field)
@@ -232,7 +234,7 @@ def reader_of(source: Source, values: Values) -> SourceReader:
         raise FieldError(f"the field {source.field!r} holds no numbers")
     count = sum(np.size(item) for _, item in parts)
     if count > MAX_ELEMENTS:
-        raise FieldError(f"the field {source.field!r} holds {count:,} numbers, at most {MAX_ELEMENTS:,} are taken")
+        raise FieldError(f"the field {source.field!r} holds {count:,} numbers, at most {MAX_ELEMENTS:,} are supported")
     if source.names_field:
         names_steps: tuple[Step, ...] | None = parse_path(source.names_field)
     else:
@@ -263,14 +265,14 @@ def reader_of(source: Source, values: Values) -> SourceReader:
 
 
 def picked[T](source: Source, elements: Sequence[T], place: str) -> list[T]:
-    """Those of all elements of a place that a source takes; FieldError when there are fewer."""
+    """The elements that a source selects; FieldError if there are too few."""
     if outside := [index for index in source.elements if index >= len(elements)]:
-        raise FieldError(f"there is no element {outside[0]} among the {len(elements)} of {place}")
+        raise FieldError(f"no element {outside[0]} among the {len(elements)} of {place}")
     return [elements[index] for index in source.elements or range(len(elements))]
 
 
 def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ...]:
-    """What the elements that a source takes are called in the feature; FieldError when it speaks of more or fewer."""
+    """Names in the feature of the selected elements; FieldError if their numbers differ."""
     for what, given in (("names", source.names), ("limits", source.limits)):
         if given and len(given) != len(labels):
             raise FieldError(f"{what}: {len(given)} given for the {len(labels)} elements of {place}")
@@ -278,7 +280,7 @@ def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ..
 
 
 def _names_beside(values: Values, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], list[str]]]:
-    """Path and texts of each list of names that may be those of the numbers at a path."""
+    """Path and texts of each list of names that may belong to the numbers at a path."""
     for place in dict.fromkeys([*((*steps[:-1], name) for name in _NAME_FIELDS), *((name,) for name in _NAME_FIELDS)]):
         try:
             names = follow(values, place)
@@ -304,7 +306,7 @@ def _labels(field: str, parts: Sequence[tuple[str, Any]]) -> list[str]:
 
 
 def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
-    """Where four elements are x, y, z, w of the same parent."""
+    """Positions of four elements that are x, y, z, w of the same parent."""
     starts = []
     for index in range(len(labels) - 3):
         four = [label.rpartition(".") for label in labels[index : index + 4]]
@@ -314,14 +316,14 @@ def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
 
 
 def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
-    """One vector of some numbers: float32 where all are, otherwise float64, which holds the others exactly."""
+    """Concatenate numbers to a vector: float32 if all are, otherwise float64, which holds the others exactly."""
     arrays = [np.atleast_1d(np.asarray(part)) for part in parts]
     single = all(array.dtype.newbyteorder("=") == np.float32 for array in arrays)
     return np.concatenate([array.astype(np.float32 if single else np.float64) for array in arrays])
 
 
 def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
-    """Return (N, D) in the unit of the feature; the same array if that is the source's."""
+    """Return (N, D) in the feature's unit; the same array if the units are equal."""
     factor = CONVERSIONS.get((part.unit, part.to or part.unit))
     if factor is None:
         return vectors

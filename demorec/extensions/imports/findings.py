@@ -1,7 +1,7 @@
-"""What is odd in a stream of a bag: lost, repeated and late messages, clocks, images, with names for each kind.
+"""Findings about a stream of a bag: lost, repeated and late messages, clocks, images, with a name for each kind.
 
-The limits are such that sensors with ordinary jitter and latency, and robots that stand still for a while, give none.
-Nothing is repaired: a finding tells what the rows hold.
+The limits give no findings for sensors with ordinary jitter and latency, or for robots that rest for a while. Nothing
+is repaired: a finding describes the data in the rows.
 """
 
 from __future__ import annotations
@@ -15,31 +15,33 @@ from demorec.extensions.imports.clock import NS, SKEW_S, Int, Numbers, Timeline
 from demorec.extensions.imports.streams import NO_STAMP, Stream
 
 _JITTER = 0.25
-"""Of a period: what nine of ten steps of a sensor stay within."""
+"""Maximum deviation of nine in ten sensor steps, as a ratio of the period."""
 GAP = 5.0
-"""Periods without a message that are reported as a gap; shorter ones are lost messages."""
+"""Minimum periods without a message for a gap; shorter ones are lost messages."""
 _STEP_S = 0.05
-"""By which a clock must jump, or drift in a bag, to be reported."""
+"""Minimum jump or drift of a clock in a bag that is reported."""
 STILL_S = 0.5
-"""How much later than others a stream may begin, or earlier end; a camera repeats no image for that long."""
+"""Minimum time by which a stream must begin later or end earlier than others; no camera repeats an image for
+that long.
+"""
 FROZEN = 5
-"""Images in a row with the same bytes: no camera without noise."""
+"""Minimum images in a row with the same bytes: no real camera is free of noise."""
 _EARLY_S = 0.05
-"""By which a header may be later than its recording, in which it was no more: clocks that NTP sets differ by less."""
+"""Maximum time by which a header may be later than its log time: clocks set by NTP differ by less."""
 LOST = 1.6
-"""Periods, from which on a message is missing between two."""
+"""Minimum step in periods that implies a lost message."""
 NOTE = "note"
-"""Kind of what is not odd, but good to know."""
+"""Kind of an observation that is not a problem."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Finding:
-    """Something odd.
+    """A finding or note.
 
     Attributes:
-        kind: What, in one word of a fixed list.
-        stream: Which ("observation.state", "camera front"), "" for the bag as a whole.
-        text: What was found, with figures.
+        kind: Kind, one word of a fixed list.
+        stream: Stream ("observation.state", "camera front"), "" for the whole bag.
+        text: Description with figures.
     """
 
     kind: str
@@ -48,14 +50,14 @@ class Finding:
 
 
 def stream_findings(line: Timeline, skew: Numbers) -> Iterator[Finding]:
-    """What is odd in a stream; (K,) its skews, as they compare with those of the others."""
+    """Findings about a stream; (K,) its skews relative to the others."""
     found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skew), *_image_findings(line))
     for kind, text in found:
         yield of_stream(line.stream, kind, text)
 
 
 def of_stream(stream: Stream, kind: str, text: str) -> Finding:
-    """A finding of a stream."""
+    """Create a finding about a stream."""
     return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
@@ -97,16 +99,16 @@ def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
 
 
 def _unevenness(line: Timeline) -> float:
-    """What nine of ten steps of a stream are off its period by at most, nanoseconds."""
+    """Maximum deviation of nine in ten steps of a stream from its period, nanoseconds."""
     steps = np.diff(line.times_ns)
     regular = steps[steps <= LOST * line.period_ns]
     return float(np.percentile(np.abs(regular - line.period_ns), 90)) if len(regular) else 0.0
 
 
 def lost_in(line: Timeline) -> Int:
-    """(M - 1,) how many messages of a regular stream are missing between each two.
+    """(M - 1,) number of lost messages between each two of a regular stream.
 
-    Where its steps are uneven, a long one is no loss: nine of ten are within 1.6 deviations, nearly all within 4.
+    If its steps are uneven, a long one is not a loss: nine in ten are within 1.6 deviations, nearly all within 4.
     """
     steps = np.diff(line.times_ns)
     least = max(LOST * line.period_ns, line.period_ns + 4 / 1.6 * _unevenness(line))
@@ -114,7 +116,7 @@ def lost_in(line: Timeline) -> Int:
 
 
 def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
-    """Of the difference between the times of recording and of headers."""
+    """Findings about the difference between log times and header times."""
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
@@ -124,7 +126,7 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
         yield "clock_offset", f"its headers are {-median:.3f} s later than the times of recording"
     width = max(3, min(20, len(skew) // 4))
     smooth = np.array([np.median(part) for part in np.array_split(skew, max(2, len(skew) // width))]) / NS
-    # A jump in the middle of a part is half in the step to it and half in the one from it.
+    # A jump in the middle of a part is split between the steps before and after it.
     steps = np.diff(smooth)
     pairs = steps[:-1] + steps[1:] if len(steps) > 1 else steps
     largest = int(np.argmax(np.abs(pairs)))
@@ -138,14 +140,15 @@ def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
 
 
 def frozen_images(line: Timeline) -> tuple[int, int] | None:
-    """First and last index of images in a row with the very same bytes, of a camera that repeats none for less."""
+    """First and last index of consecutive images with the same bytes, for a camera without shorter repetitions."""
     if not line.stream.heads:
         return None
     sums = np.asarray(line.stream.image_sums)[line.order].astype(np.int64)
     edges = np.concatenate(([0], np.flatnonzero(np.diff(sums) != 0) + 1, [len(sums)]))
     runs = np.diff(edges)
     longest = int(np.argmax(runs))
-    has_noise = not ((runs > 1) & (runs < FROZEN)).any()  # a drawn camera gives the same again wherever all rests
+    # a rendered camera repeats its image whenever everything rests
+    has_noise = not ((runs > 1) & (runs < FROZEN)).any()
     is_frozen = runs[longest] >= FROZEN and has_noise
     return (int(edges[longest]), int(edges[longest + 1]) - 1) if is_frozen else None
 

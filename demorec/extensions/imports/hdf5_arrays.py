@@ -1,4 +1,4 @@
-"""What datasets of an HDF5 file hold: vectors with every bit as it is, and images, JPEG and distances as they are."""
+"""Content of an HDF5 file's datasets: bit-exact vectors, and images as pixels, JPEG or depth."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from demorec.extensions.imports.mapping import MAX_ELEMENTS, CameraSource, Sourc
 from demorec.mcap.cdr import Values
 
 _EXACT = 2**53
-"""Up to which float64 holds every whole number."""
+"""Maximum integer up to which float64 is exact."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -33,7 +33,7 @@ class _Column:
     names: tuple[str, ...]
 
     def rows(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
-        """Read (end - begin, D): float32 where that holds all numbers, otherwise float64.
+        """Read (end - begin, D): float32 if it holds all numbers, otherwise float64.
 
         Raises:
             FieldError: A number is not finite, or float64 cannot hold it.
@@ -60,7 +60,7 @@ class StoredFeature:
     Args:
         name: Its name.
         parts, arrays: Its parts, and the dataset of each.
-        shift: Number of rows by which the frames are behind the datasets' rows: 1 for the next row of a feature.
+        shift: Number of rows by which frames precede the datasets' rows: 1 for the next row of a feature.
 
     Raises:
         FieldError: The datasets are not vectors.
@@ -72,20 +72,20 @@ class StoredFeature:
         self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
 
     def described(self, dtype: DTypeLike) -> Feature:
-        """Describe it, with vectors of a type, as recordings do."""
+        """Describe it in recordings' form, with vectors of this type."""
         names = tuple(name for column in self.columns for name in column.names)
         units = (column.part.to or column.part.unit for column in self.columns for _ in column.names)
-        called = (name.removesuffix(".pos") for name in names)  # as LeRobot calls the position of a joint
+        called = (name.removesuffix(".pos") for name in names)  # LeRobot's suffix for the position of a joint
         source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
         return imported_feature(self.name, dtype, names, units, called=called, source=source)
 
     def vectors(self, count: int) -> NDArray[np.floating[Any]]:
-        """Read (T, D) of the first `count` frames; errors are those of `_Column.rows`."""
+        """Read (T, D) of the first `count` frames; errors as in `_Column.rows`."""
         return np.concatenate([column.rows(self.shift, self.shift + count) for column in self.columns], axis=1)
 
 
 def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
-    """Return the names of the elements that are taken."""
+    """Return the names of the selected elements."""
     if len(array.shape) > 2:
         shape = "x".join(map(str, array.shape))
         raise FieldError(f"{array.place} is an array of {shape}, a feature takes rows of numbers")
@@ -96,7 +96,7 @@ def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
 
 
 def _labels(array: StoredArray, count: int) -> list[str]:
-    """What the dataset's attribute `names` calls its elements, where it has one, or else its own name and a number."""
+    """Names of the dataset's elements in its attribute `names`, or else its own name and a number."""
     try:
         named = json.loads(str(array.attribute("names") or ""))
     except (ValueError, RecursionError, Hdf5Error):
@@ -109,7 +109,7 @@ def _labels(array: StoredArray, count: int) -> list[str]:
 
 
 _LEAST_SIDE = 16
-"""Pixels, below which arrays of floats are no images unless the mapping says so."""
+"""Minimum side in pixels: smaller arrays of floats are not images unless the mapping names them as such."""
 _JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 
 
@@ -118,19 +118,17 @@ class StoredCamera:
 
     Attributes:
         width, height: Pixels.
-        kept: "jpeg" where JPEG files stay as they are, "16UC1" or "32FC1" of distances; "" for pixels, which are
-            encoded once.
-        description: What becomes of the images, in words.
+        kept: "jpeg" for passthrough JPEG files, "16UC1" or "32FC1" for depth; "" for pixels, which are encoded once.
+        description: Treatment of the images, in words.
 
     Args:
-        name: Of the camera.
-        camera: What the mapping says of it.
+        name: Name of the camera.
+        camera: Its entry in the mapping.
         array: Its dataset.
-        lengths: (C, T) of the JPEG files of all cameras, in an order of cameras that nobody tells; None where the file
-            has none.
+        lengths: (C, T) lengths of all cameras' JPEG files, in unknown camera order; None if the file has none.
 
     Raises:
-        FieldError: They are no images.
+        FieldError: They are not images.
         Hdf5Error: They cannot be read.
     """
 
@@ -170,15 +168,15 @@ class StoredCamera:
             self.description = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.description}"
 
     def described(self) -> Camera:
-        """The camera as recordings know it."""
+        """The camera in recordings' form."""
         place = self._camera.dataset
         return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=place)
 
     def images(self) -> Iterator[Image]:
-        """One a row.
+        """Yield one image per row.
 
         Raises:
-            FieldError: A JPEG file is cut off, or of another size.
+            FieldError: A JPEG file is truncated, or has another size.
             Hdf5Error: They cannot be read.
         """
         for number, row in enumerate(self._array.rows()):
@@ -199,22 +197,22 @@ class StoredCamera:
         return image if self._camera.colors == "rgb" else np.ascontiguousarray(image[:, :, ::-1])
 
     def _file(self, row: NDArray[np.generic], number: int) -> tuple[bytes, int, int]:
-        """The JPEG file of a row, without what pads it (it ends with its own mark, never with a zero), and its size."""
+        """JPEG file of a row without padding (it ends with its end marker, never with a zero), and its size."""
         data = row.tobytes().rstrip(b"\0")
         if not data.endswith(_JPEG_END):
             raise FieldError(f"{self._array.place} holds no whole JPEG file in row {number}")
         if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
             raise FieldError(
-                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, which is none of the lengths "
-                "that compress_len tells"
+                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, unlike the lengths "
+                "in compress_len"
             )
         head = self._used(image_head, data, number)
         if head.format != "jpeg":
-            raise FieldError(f"{self._array.place} holds {head.format} in row {number}, no JPEG file")
+            raise FieldError(f"{self._array.place} holds {head.format} in row {number}, not a JPEG file")
         return data, head.width, head.height
 
     def _used[T](self, read: Callable[[Values], T], data: bytes, number: int) -> T:
-        """What is read of the JPEG file in a row."""
+        """Apply `read` to the JPEG file in a row."""
         try:
             return read({"format": "jpeg", "data": data})
         except FieldError as error:
@@ -222,7 +220,7 @@ class StoredCamera:
 
 
 def _float_scale(array: StoredArray) -> float:
-    """What pixels that are floats are multiplied with: 255 where none is above 1; FieldError for other numbers."""
+    """Factor for floating-point pixels: 255 if none is above 1; FieldError for other ranges."""
     lowest, highest = 0.0, 0.0
     for number, row in enumerate(array.rows()):
         values = row.astype(np.float64)
@@ -237,7 +235,7 @@ def _float_scale(array: StoredArray) -> float:
 
 
 def is_camera(array: StoredArray) -> bool:
-    """Whether a dataset holds images, JPEG files or, by its name or its last axis, distances.
+    """Whether a dataset holds images, JPEG files or, by its name or last axis, depth.
 
     Raises:
         Hdf5Error: Its first row cannot be read.
@@ -245,15 +243,15 @@ def is_camera(array: StoredArray) -> bool:
     form, place = image_form(array), array.place.rpartition("/")[2]
     if form == "jpeg":
         return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
-    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are arrays like these
+    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are similar arrays
         first = array.read(0, min(1, len(array))).astype(np.float64)
         return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
-    is_image = len(array.shape) == 4 and min(array.shape[1:3]) >= _LEAST_SIDE  # as our own exports have distances
+    is_image = len(array.shape) == 4 and min(array.shape[1:3]) >= _LEAST_SIDE  # form of depth in demorec's own exports
     return form == "pixels" or (form == "depth" and (is_image or "depth" in place))
 
 
 def image_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
-    """What the rows of a dataset can be as images; None for numbers that are none."""
+    """Image format that the rows of a dataset may have; None for numbers that are not images."""
     shape, kind = array.shape, array.dtype
     if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
         return "jpeg"

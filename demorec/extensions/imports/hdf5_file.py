@@ -1,7 +1,7 @@
-"""HDF5 files of unknown origin, read in pieces.
+"""HDF5 files of unknown origin, read in parts.
 
-A link can lead into any other file of the machine, and a dataset can have its numbers elsewhere or rows that nobody
-wrote: all of these are refused. Only numbers and texts are made of the content.
+A link can refer to any other file of the machine, and a dataset can store its numbers elsewhere or have rows that were
+never written: all of these are refused. Only numbers and texts are read from the content.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from demorec.core.registry import nearest_match
 Kind = Literal["group", "dataset", "other"]
 Scalar = str | bool | int | float
 _MAX_DEPTH = 6
-"""Levels of groups that are searched for datasets."""
+"""Maximum depth of groups searched for datasets."""
 _BLOCK_BYTES = 8 << 20
-"""Of rows that are read at once; whole chunks of the file, unless these are larger than `_MAX_BLOCK_BYTES`."""
+"""Size of the rows read at once; whole chunks of the file, unless these exceed `_MAX_BLOCK_BYTES`."""
 _MAX_BLOCK_BYTES = 64 << 20
 _KINDS: dict[int, Kind] = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "dataset"}
 _REASONS = (
     ("truncated file", "it is cut off"),
     ("required filter", "it is compressed in a way that is not installed here"),
-    ("can't open directory", "it is compressed in a way that is not installed here"),  # that of filters
-    ("No NumPy equivalent", "it is of a kind that is no plain number"),
+    ("can't open directory", "it is compressed in a way that is not installed here"),  # message of filters
+    ("No NumPy equivalent", "its type is not a plain number"),
 )
-"""What the HDF5 library says, and what it means; all else means that the file is damaged."""
+"""Messages of the HDF5 library and their meaning; all others mean that the file is damaged."""
 
 
 class Hdf5Error(DemorecError):
-    """An HDF5 file cannot be read, or does not hold what it should."""
+    """An HDF5 file cannot be read, or lacks expected content."""
 
 
 class StoredArray:
-    """A dataset whose numbers are all in the file.
+    """A dataset with all its numbers in the file.
 
     Attributes:
         place: Its name in the file.
-        shape: Of all rows.
-        dtype: Of a number: integer, float or bool.
-        is_ragged: Whether each row is as long as it likes: files in a dataset of variable length.
+        shape: Shape of all rows.
+        dtype: Type of a number: integer, float or bool.
+        is_ragged: Whether rows differ in length: files in a dataset of variable length.
     """
 
     def __init__(self, file: Path, place: str, dataset: h5py.Dataset) -> None:
@@ -62,23 +62,23 @@ class StoredArray:
         return self.shape[0]
 
     def read(self, begin: int, end: int) -> NDArray[np.generic]:
-        """Rows from `begin` to before `end`; Hdf5Error when they cannot be read."""
+        """Read rows `begin` to `end` - 1; Hdf5Error if they cannot be read."""
         with _errors_reported(f"{self.place} cannot be read", self._file):
             rows: NDArray[np.generic] = self._dataset[begin:end]
         return rows
 
     def rows(self) -> Iterator[NDArray[np.generic]]:
-        """One row after the other, some of them in memory at a time."""
+        """Yield row after row, with some of them in memory at a time."""
         step = self._rows_at_once()
         for begin in range(0, len(self), step):
             yield from self.read(begin, min(begin + step, len(self)))
 
     def attribute(self, name: str) -> Scalar | None:
-        """An attribute of the dataset, as of `ForeignFile.attribute`."""
+        """An attribute of the dataset, as in `ForeignFile.attribute`."""
         return _attribute(self._dataset, name, self.place, self._file)
 
     def _rows_at_once(self) -> int:
-        if self.is_ragged:  # how long a row is, only reading it says
+        if self.is_ragged:  # the length of a row is only known after reading it
             return 1
         row = max(1, math.prod(self.shape[1:]) * self.dtype.itemsize)
         chunk = self._dataset.chunks[0] if self._dataset.chunks else 1
@@ -87,13 +87,13 @@ class StoredArray:
 
 
 class ForeignFile(Closing):
-    """An HDF5 file that anyone may have written; a context manager.
+    """An HDF5 file from any writer; a context manager.
 
     Attributes:
-        path: Of it.
+        path: Path of the file.
 
     Raises:
-        Hdf5Error: It is none, cut off or damaged; so do all methods.
+        Hdf5Error: It is not HDF5, truncated or damaged; raised by all methods.
     """
 
     def __init__(self, path: Path) -> None:
@@ -101,23 +101,25 @@ class ForeignFile(Closing):
         with _errors_reported("The HDF5 file cannot be read", path):
             with open_regular(path) as file:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
-                    raise Hdf5Error(f"This is no HDF5 file: {path}")
+                    raise Hdf5Error(f"This is not an HDF5 file: {path}")
             self._root = h5py.File(path, "r", locking=False)
 
     def close(self) -> None:
-        """Close the file; harmless when called twice."""
+        """Close the file; idempotent."""
         self._root.close()
 
     def children(self, place: str) -> dict[str, Kind]:
-        """What a group holds: name -> what it is; links are "other"."""
+        """Entries of a group: name -> kind; links are "other"."""
         group = self._find(place)
         if not isinstance(group, h5py.Group):
-            raise Hdf5Error(f"{_shown(place)} is no group: {self.path}")
+            raise Hdf5Error(f"{_shown(place)} is not a group: {self.path}")
         with _errors_reported(f"{_shown(place)} cannot be read", self.path):
             return {str(name): self._kind(group, str(name)) for name in group}
 
     def datasets(self, place: str) -> Iterator[str]:
-        """The places of all datasets below a group, some levels deep; each group once, which may be in itself."""
+        """Paths of all datasets below a group, up to a maximum depth; each group once, because it may contain
+        itself.
+        """
         waiting, seen = [(place, 0)], {self.address(place)}
         while waiting:
             group, depth = waiting.pop()
@@ -129,7 +131,7 @@ class ForeignFile(Closing):
                     waiting.append((name, depth + 1))
 
     def has(self, place: str) -> bool:
-        """Whether there is a group or dataset of that name; what a link leads to is not there."""
+        """Whether a group or dataset with that name exists; targets of links do not count."""
         try:
             self._find(place)
         except Hdf5Error:
@@ -137,22 +139,21 @@ class ForeignFile(Closing):
         return True
 
     def is_group(self, place: str) -> bool:
-        """Whether there is a group of that name."""
+        """Whether a group with that name exists."""
         try:
             return isinstance(self._find(place), h5py.Group)
         except Hdf5Error:
             return False
 
     def attribute(self, place: str, name: str) -> Scalar | None:
-        """A text, number or boolean that is an attribute of a group or dataset; None when it has none of that name."""
+        """A text, number or boolean attribute of a group or dataset; None if it is missing."""
         return _attribute(self._find(place), name, _shown(place), self.path)
 
     def array(self, place: str, *, may_be_ragged: bool = False) -> StoredArray:
-        """A dataset of rows, with `may_be_ragged` also one of bytes of variable length.
+        """Open a dataset of rows, with `may_be_ragged` also one of variable-length bytes.
 
         Raises:
-            Hdf5Error: There is none, it holds no plain numbers, has no rows, was never written, or leads out of the
-                file.
+            Hdf5Error: It is missing, has no plain numbers or no rows, was never written, or refers to another file.
         """
         found = self._find(place)
         with _errors_reported(f"{place} cannot be read", self.path):
@@ -162,27 +163,27 @@ class ForeignFile(Closing):
         return StoredArray(self.path, place, found)
 
     def names(self, place: str) -> list[str]:
-        """A dataset of texts, as robomimic's masks are.
+        """Read a dataset of texts, such as robomimic's masks.
 
         Raises:
-            Hdf5Error: There is none, or it is no list of texts.
+            Hdf5Error: It is missing, or not a list of texts.
         """
         found = self._find(place)
         with _errors_reported(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
             kind = h5py.check_string_dtype(found.dtype) if is_list else None
             if kind is None or found.external:
-                raise Hdf5Error(f"{place} is no list of texts: {self.path}")
+                raise Hdf5Error(f"{place} is not a list of texts: {self.path}")
             return [str(text) for text in found.asstr(errors="replace")[:]]
 
     def address(self, place: str) -> int:
-        """By which a group or dataset is known, whatever it is called: it may have several names."""
+        """Address that identifies a group or dataset, which may have several names."""
         found = self._find(place)
         with _errors_reported(f"{_shown(place)} cannot be read", self.path):
             return int(h5py.h5o.get_info(found.id).addr)
 
     def _find(self, place: str) -> h5py.Group | h5py.Dataset:
-        """What has a name, by hard links alone: others can lead out of the file, or in circles."""
+        """Find the object with a name, by hard links alone: others can lead out of the file, or in circles."""
         found: h5py.Group | h5py.Dataset = self._root
         walked = ""
         for part in filter(None, place.split("/")):
@@ -190,7 +191,7 @@ class ForeignFile(Closing):
                 names = found if isinstance(found, h5py.Group) else ()
                 if part not in names:
                     near = nearest_match(part, list(names)).rstrip("?")
-                    raise Hdf5Error(f"There is no {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
+                    raise Hdf5Error(f"Missing {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
                 if self._kind(found, part) == "other":
                     raise Hdf5Error(
                         f"{walked}{part} is a link or a type, only groups and datasets within the file are read: "
@@ -201,19 +202,19 @@ class ForeignFile(Closing):
 
     @staticmethod
     def _kind(group: h5py.Group, name: str) -> Kind:
-        key = name.encode(errors="surrogateescape")  # h5py's lower level takes a fraction of the other's time
+        key = name.encode(errors="surrogateescape")  # h5py's low-level API takes a fraction of the time
         if group.id.links.get_info(key).type != h5py.h5l.TYPE_HARD:
             return "other"
         return _KINDS.get(h5py.h5o.get_info(group.id, key).type, "other")
 
 
 def _why_unusable(found: h5py.Group | h5py.Dataset, may_be_ragged: bool) -> str:
-    """Why the numbers of a dataset are not read, in words; "" when they are."""
+    """Reason why the numbers of a dataset cannot be used, in words; "" if they can."""
     if not isinstance(found, h5py.Dataset):
         return "it is a group"
     is_ragged = may_be_ragged and found.ndim == 1 and h5py.check_vlen_dtype(found.dtype) == np.uint8
     if not is_ragged and (found.dtype.kind not in "fiub" or found.dtype.itemsize > 8):
-        return f"it holds {found.dtype.name if found.dtype.kind != 'O' else 'objects'}, no plain numbers"
+        return f"it holds {found.dtype.name if found.dtype.kind != 'O' else 'objects'}, not plain numbers"
     if not found.shape:
         return "it has no rows"
     if found.is_virtual or found.external:
@@ -222,7 +223,7 @@ def _why_unusable(found: h5py.Group | h5py.Dataset, may_be_ragged: bool) -> str:
 
 
 def _is_written(dataset: h5py.Dataset) -> bool:
-    """Whether all rows are in the file; HDF5 invents zeros for those that are not."""
+    """Whether all rows are in the file; HDF5 fills in zeros for missing ones."""
     if dataset.chunks:
         counts = [-(-size // chunk) for size, chunk in zip(dataset.shape, dataset.chunks, strict=True)]
         return bool(dataset.id.get_num_chunks() == math.prod(counts))
@@ -254,7 +255,7 @@ def _shown(place: str) -> str:
 
 @contextmanager
 def _errors_reported(what: str, path: Path) -> Iterator[None]:
-    """Turn what the HDF5 library raises into an error that begins with what it was."""
+    """Turn the HDF5 library's errors into an Hdf5Error that begins with `what`."""
     try:
         yield
     except (OSError, RuntimeError, ValueError, KeyError, TypeError, MemoryError) as error:

@@ -1,7 +1,7 @@
-"""HDF5 files of robomimic's or ALOHA's layout become runs: numbers bit-exact, JPEG files as they are.
+"""Import of HDF5 files in robomimic's or ALOHA's layout to runs: bit-exact numbers, passthrough of JPEG files.
 
-All files are looked through before anything is written; then rows and images pass in pieces. The same command again
-goes on: episodes that are there are not written."""
+All files are checked before anything is written; then rows and images pass in parts. The same command continues:
+existing episodes are not written again."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from demorec.runs.external import differences, open_external_run, planned_episod
 from demorec.runs.find import expect
 
 _LENGTHS = "compress_len"
-"""Where ALOHA's recorders say how long the JPEG file in each row is, without what pads it."""
+"""Dataset of ALOHA's recorders with the length of each row's JPEG file, without padding."""
 
 
 def import_hdf5(
@@ -48,16 +48,16 @@ def import_hdf5(
     *,
     video: VideoConfig | None = None,
 ) -> FramesImport:
-    """Import HDF5 files into a run, by a mapping; datasets of the first episode that it does not name are left out.
+    """Import HDF5 files to a run, by a mapping; datasets of the first episode that it does not name are left out.
 
     Args:
-        paths: Of the files, in the order of their episodes.
-        mapping_path: Of the mapping.
-        out: The run's folder; one that the same files and mapping began is continued.
-        video: How images are encoded that come as pixels.
+        paths: Files, in the order of their episodes.
+        mapping_path: Path of the mapping.
+        out: The run's folder; a run started with the same files and mapping is continued.
+        video: Encoding of images that arrive as pixels.
 
     Raises:
-        ConfigError: The mapping is impossible, the files differ, or the folder holds something else.
+        ConfigError: The mapping is impossible, the files differ, or the folder holds other files.
         Hdf5Error: A file cannot be read, or does not fit the mapping.
         RecordingError: The disk is full or gone.
     """
@@ -89,7 +89,7 @@ def import_hdf5(
 
 
 class _PlannedDemo(NamedTuple):
-    """An episode that is to be imported, by its place in a file."""
+    """An episode to import, with its location in a file."""
 
     path: Path
     place: str
@@ -98,7 +98,7 @@ class _PlannedDemo(NamedTuple):
 
 
 class _Plan(NamedTuple):
-    """Episodes of all files; `cameras` and `left_out` are those of `FramesImport`."""
+    """Episodes of all files; `cameras` and `left_out` as in `FramesImport`."""
 
     episodes: list[_PlannedDemo]
     cameras: dict[str, str]
@@ -106,7 +106,7 @@ class _Plan(NamedTuple):
 
 
 def _planned(paths: Sequence[Path], mapping: SourceMapping, urdf: str | None) -> _Plan:
-    """Look through all files; errors are those of `import_hdf5`."""
+    """Check all files; errors as in `import_hdf5`."""
     episodes: list[_PlannedDemo] = []
     cameras: dict[str, str] = {}
     left_out: dict[str, str] = {}
@@ -127,7 +127,7 @@ def _planned(paths: Sequence[Path], mapping: SourceMapping, urdf: str | None) ->
 
 
 class _Stored:
-    """An episode in an opened file; FieldError when its datasets do not fit the mapping."""
+    """An episode in an open file; FieldError if its datasets do not fit the mapping."""
 
     def __init__(self, file: ForeignFile, place: str, mapping: SourceMapping) -> None:
         self._file, self._place, self._mapping = file, place, mapping
@@ -147,7 +147,7 @@ class _Stored:
         for feature in self.features:
             arrays = others if not feature.name.startswith("observation.") else observed
             arrays += [] if feature.shift else [column.array for column in feature.columns]
-        # Observations may have one row more than actions, what the last action led to.
+        # Observations may have one more row than actions, the result of the last action.
         self.num_rows = num_rows = len((others or observed)[0])
         self.has_last = len(observed[0]) == num_rows + 1
         for arrays, wanted in ((others, num_rows), (observed, num_rows + self.has_last)):
@@ -188,7 +188,7 @@ class _Stored:
         )
 
     def described(self, urdf: str | None, source: SourceFile, episode_index: int) -> EpisodeInfo:
-        """Describe it for its recording; every number is looked at."""
+        """Describe it for its recording; checks every number."""
         file, place, mapping = self._file, self._place, self._mapping
         dtypes = [feature.vectors(self.num_frames).dtype for feature in self.features]
         if attribute := mapping.robot.urdf_attribute:
@@ -211,40 +211,41 @@ class _Stored:
         return info
 
     def _rate(self) -> int:
-        """Rows a second; Hdf5Error when neither the mapping nor the file says it, or no whole number."""
+        """Rows per second; Hdf5Error if neither the mapping nor the file gives an integer."""
         if self._mapping.clock.fps:
             return self._mapping.clock.fps
         found, path = stated_rate(self._file, self._place), self._file.path
         if found is None:
-            raise Hdf5Error(
-                f"Nothing in the file says how many rows a second has: give clock.fps in the mapping: {path}"
-            )
+            raise Hdf5Error(f"The file does not record its rate: give clock.fps in the mapping: {path}")
         if not 1 <= found <= MAX_FPS or found != int(found):
             raise Hdf5Error(
-                f"The file says that it has {found:g} rows a second, allowed are whole numbers from 1 to {MAX_FPS}: "
+                f"The file has {found:g} rows a second, allowed are whole numbers from 1 to {MAX_FPS}: "
                 f"give clock.fps in the mapping: {path}"
             )
         return int(found)
 
     def _task(self) -> str:
-        """What the robot was asked to do; Hdf5Error when the file does not say."""
+        """Instruction of the task; Hdf5Error if the file does not have it."""
         task, path = self._mapping.task, self._file.path
         if task.text:
             return task.text
         if task.file_name:
             if text := task_in_name(path.stem):
                 return text
-            raise Hdf5Error(f"The file's name says no task, which the mapping takes from it: {path}")
+            raise Hdf5Error(f"The mapping takes the task from the file's name, which has none: {path}")
         found = found_attribute(self._file, self._place, task.attribute)
         if not isinstance(found, str) or not found.strip():
-            raise Hdf5Error(f"No attribute {task.attribute!r} says the task of {self._place or 'the episode'}: {path}")
+            raise Hdf5Error(
+                f"Missing attribute {task.attribute!r} with the task of {self._place or 'the episode'}: {path}"
+            )
         return found
 
     def outcome(self) -> Outcome:
-        """How it ended, which is unknown where the mapping does not ask, or other episodes of the file alone say it.
+        """Outcome, which is unknown if the mapping does not name its source, or only other episodes of the file have
+        it.
 
         Raises:
-            Hdf5Error: No episode says it, or this one says something else.
+            Hdf5Error: No episode has it, or this one has an invalid value.
         """
         name = self._mapping.episodes.success.strip("/")
         return Outcome(success=self._success(name) if name else None, num_frames=self.num_frames)
@@ -254,7 +255,7 @@ class _Stored:
         found = file.attribute(place, name)
         if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
             raise Hdf5Error(
-                f"{place or 'The episode'} says {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
+                f"{place or 'The episode'} has {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
                 f"{file.path}"
             )
         if found is not None:
@@ -263,7 +264,7 @@ class _Stored:
             if any(file.attribute(other, name) is not None for other in episode_places(file, self._mapping.episodes)):
                 return None
             near = nearest_match(name, list(file.children(place)))
-            told = f"{place or 'The episode'} has no attribute or dataset {name!r} that says how it ended.{near}"
+            told = f"{place or 'The episode'} has no attribute or dataset {name!r} with its outcome.{near}"
             raise Hdf5Error(f"{told.rstrip('.?')}: {file.path}")
         array = file.array(f"{place}/{name}".lstrip("/"))
         if len(array) != self.num_rows:
@@ -272,7 +273,7 @@ class _Stored:
 
 
 def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str) -> EpisodeInfo:
-    """An episode that shares the first one's model, a long text, in memory; ConfigError when it differs."""
+    """Return an episode that shares the first one's URDF text in memory; ConfigError if it differs."""
     if different := differences(first, info):
         name = f"{place} of {file.path}" if place else str(file.path)
         raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
@@ -280,10 +281,10 @@ def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str)
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:
-    """Datasets that the mapping does not name; groups of which it names none, as one.
+    """Datasets that the mapping does not name; groups without any named ones appear as one.
 
     Raises:
-        Hdf5Error: There are cameras among them, of which it does not say that they shall be left out.
+        Hdf5Error: They include cameras that it does not list in leave_out.
     """
     used = {name.partition("/")[0] for name in mapping.datasets}
     found: dict[str, str] = {}
@@ -295,7 +296,7 @@ def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str,
             shown = name if group in used else group
             found[shown] = ""
             if not mapping.leaves_out(name):
-                with suppress(Hdf5Error):  # what cannot be read is none
+                with suppress(Hdf5Error):  # an unreadable dataset is not a camera
                     cameras |= {shown: None} if is_camera(file.array(dataset, may_be_ragged=True)) else {}
     if cameras:
         raise Hdf5Error(
@@ -308,7 +309,7 @@ def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str,
 
 @contextmanager
 def _named(path: Path) -> Iterator[None]:
-    """Errors about what does not fit name the file."""
+    """Add the file to errors about mismatches."""
     try:
         yield
     except FieldError as error:
@@ -316,14 +317,14 @@ def _named(path: Path) -> Iterator[None]:
 
 
 _RATES = ("fps", "env_args.env_kwargs.fps", "env_args.env_kwargs.control_freq")
-"""Attributes that say how many rows a second has: our own, and robosuite's."""
+"""Attributes with the rows per second: demorec's own, and robosuite's."""
 
 
 def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
-    """The groups of the episodes, demo_2 before demo_10.
+    """Groups of the episodes, demo_2 before demo_10.
 
     Raises:
-        Hdf5Error: There are none, not those of the mask, or one of them twice.
+        Hdf5Error: None exist, some of the mask are missing, or one occurs twice.
     """
     group = episodes.group.strip("/")
     if not episodes.group:
@@ -336,7 +337,7 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
             raise Hdf5Error(f"mask/{episodes.mask} lists {missing[0]!r}, which is not in {group}: {file.path}")
         names = [name for name in names if name in wanted]
     if not names:
-        raise Hdf5Error(f"There are no episodes in {group or 'the root'}: {file.path}")
+        raise Hdf5Error(f"No episodes in {group or 'the root'}: {file.path}")
     if others := [name for name in names if kinds[name] == "other"]:
         raise Hdf5Error(
             f"{_below(group, others[0])} is a link or a type, only groups within the file are episodes: {file.path}"
@@ -346,7 +347,9 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
     for place in places:
         first = seen.setdefault(file.address(place), place)
         if first != place:
-            raise Hdf5Error(f"{place} is the same group as {first}, an episode stands in a file once: {file.path}")
+            raise Hdf5Error(
+                f"{place} is the same group as {first}, an episode may occur only once in a file: {file.path}"
+            )
     return places
 
 
@@ -355,7 +358,7 @@ def _below(group: str, name: str) -> str:
 
 
 def found_attribute(file: ForeignFile, place: str, name: str) -> Scalar | None:
-    """An attribute of an episode, or of a group above it; a name with dots goes on into the JSON of one."""
+    """An attribute of an episode, or of a group above it; a name with dots continues into the JSON of one."""
     groups = place.split("/")
     for level in ("/".join(groups[:depth]) for depth in range(len(groups), -1, -1)):
         if (found := file.attribute(level, name)) is not None:
@@ -379,7 +382,7 @@ def _in_json(text: str, keys: list[str]) -> Scalar | None:
 
 @lru_cache(maxsize=4)
 def _parsed(text: str) -> Any:
-    """Of JSON, which may stand above a thousand episodes; None when it is none."""
+    """Parse JSON, which may apply to a thousand episodes; None if it is invalid."""
     try:
         return json.loads(text)
     except (ValueError, RecursionError):
@@ -387,7 +390,7 @@ def _parsed(text: str) -> Any:
 
 
 def stated_rate(file: ForeignFile, place: str) -> float | None:
-    """What the file's attributes say of the rate; None when they say nothing."""
+    """Rate in the file's attributes; None if they have none."""
     for name in _RATES:
         found = found_attribute(file, place, name)
         if isinstance(found, int | float) and not isinstance(found, bool):

@@ -1,7 +1,7 @@
 """A mapping suggested from the contents of an HDF5 file: every dataset listed, every number placed.
 
-Known are the layouts of robomimic, Isaac Lab (robomimic's, with the simulator's state), ALOHA, and episodes that are
-groups at the root. What neither the file nor the layout specifies is commented out.
+Supports the layouts of robomimic, Isaac Lab (robomimic's, with the simulator's state), ALOHA, and groups at the root
+that are episodes. Settings that neither the file nor the layout specifies are commented out.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ from demorec.runs.find import expect
 
 _ROBOMIMIC = "data"
 _ARTICULATION = re.compile(r"states/articulation/[^/]+/joint_position")
-"""Absolute joint positions of Isaac Lab, whose observation joint_pos is relative to the default pose."""
+"""Absolute joint positions of Isaac Lab; its observation joint_pos is relative to the default pose."""
 _ISAAC_QUATERNION = re.compile(r"(^|_)(quat|orientation)$")
 _ISAAC_POSE = re.compile(r"(^|/)root_pose$")
 _W_FIRST = ("qw", "qx", "qy", "qz")
 _ALOHA_FPS = 50
-"""ALOHA's recorders take a row every `DT = 0.02` seconds; nothing in their files says so."""
+"""ALOHA's recorders take a row every `DT = 0.02` seconds, which their files do not record."""
 _ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 _TASKS = ("instruction", "ep_meta.lang", "problem_info.language_instruction", "language_instruction")
 _NO_STATE = "# No dataset is known to be the robot's state: take one of those above."
@@ -39,14 +39,14 @@ _ROBOTS = ("env_args.env_kwargs.robot", "env_args.env_kwargs.robots", "env_args.
 
 @dataclass(frozen=True, kw_only=True)
 class _Layout:
-    """Where a file holds its episodes and what they name their datasets.
+    """Location of a file's episodes and names of their datasets.
 
     Attributes:
         group: Value of `episodes.group`.
-        actions: Names of datasets that are parts of the action.
-        folder: Prefix of the names of observations; "" where every other dataset is one.
-        states: Names of datasets that are the state, where observations are known by no other name.
-        is_aloha: Whether a file is one episode of ALOHA's recorder.
+        actions: Names of datasets that belong to the action.
+        folder: Prefix of observations; "" if every other dataset is one.
+        states: Names of datasets that are the state, if observations have no distinguishing name.
+        is_aloha: Whether the file is one episode of ALOHA's recorder.
     """
 
     group: str
@@ -78,7 +78,9 @@ def _layout_of(file: ForeignFile) -> _Layout | None:
 
 
 class _Contents:
-    """An episode of a file: its datasets by their names below it, which are cameras, and why others cannot be used."""
+    """An episode of a file: its datasets by relative name, the cameras among them, and reasons why others cannot be
+    used.
+    """
 
     def __init__(self, file: ForeignFile, place: str) -> None:
         self.file, self.place = file, place
@@ -95,7 +97,7 @@ class _Contents:
                 self.unusable.append(without_path(error, file.path))
 
     def text(self, name: str) -> str:
-        """The text of an attribute; "" where it is missing, blank or no text."""
+        """Text of an attribute; "" if it is missing, blank or not text."""
         found = found_attribute(self.file, self.place, name)
         return found if isinstance(found, str) and found.strip() else ""
 
@@ -106,15 +108,15 @@ class _Contents:
 
 
 def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
-    """Return the lines of a mapping for a file, with what is in it as comments.
+    """Return the lines of a mapping for a file, with comments about its content.
 
     Args:
         path: The file.
-        tell: Called with what the user has to decide before the mapping can be used.
+        tell: Called with each decision that the user must make before using the mapping.
 
     Raises:
-        ConfigError: There is no HDF5 file.
-        Hdf5Error: It cannot be read, or is of another layout.
+        ConfigError: The file is missing.
+        Hdf5Error: It cannot be read, or has another layout.
     """
     expect(path, "hdf5")
     with ForeignFile(path) as file:
@@ -161,7 +163,7 @@ def _is_observed(name: str, layout: _Layout) -> bool:
 
 
 def _last_row(contents: _Contents, layout: _Layout) -> Iterator[str]:
-    """Where observations have one row more than actions, what becomes of it."""
+    """Comment on the extra row of observations, if any."""
     action = next((contents.arrays[name] for name in layout.actions if name in contents.arrays), None)
     observed = [len(array) for name, array in contents.arrays.items() if _is_observed(name, layout)]
     if action is not None and observed and min(observed) == len(action) + 1:
@@ -169,7 +171,7 @@ def _last_row(contents: _Contents, layout: _Layout) -> Iterator[str]:
 
 
 def _left_out(contents: _Contents, layout: _Layout) -> Iterator[str]:
-    """The key that leaves out cameras that are no observations, as those of next_obs."""
+    """The key that leaves out cameras that are not observations, such as those of next_obs."""
     others = dict.fromkeys(name.partition("/")[0] for name in contents.cameras if not _is_observed(name, layout))
     if others:
         yield f"leave_out = [{', '.join(map(quoted, others))}]  # has cameras that are not imported"
@@ -193,7 +195,7 @@ def _task(contents: _Contents, path: Path) -> list[str]:
         if found := contents.text(name):
             return [f"attribute = {quoted(name)}  # {quoted(found[:60])}"]
     text = contents.text("env_args.env_name") or task_in_name(path.stem)
-    if text in ("", "episode"):  # episode_0.hdf5, in a folder that is called after the task
+    if text in ("", "episode"):  # episode_0.hdf5, in a folder named after the task
         text = task_in_name(path.absolute().parent.name) or path.stem
     return [f"text = {quoted(text)}  # what the robot was asked to do", "# file_name = true"]
 
@@ -247,7 +249,9 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
 
 
 def _order(name: str) -> tuple[str, int]:
-    """Of the parts of a feature: robot after robot, the arm in front of its gripper, positions before orientations."""
+    """Sort key for the parts of a feature: robot by robot, the arm before its gripper, positions before
+    orientations.
+    """
     last = name.rpartition("/")[2]
     ends = [index for index, end in enumerate(HDF5_PARTS) if last == end or last.endswith(f"_{end}")]
     robot = last.removesuffix(list(HDF5_PARTS)[ends[0]]) if ends else last
@@ -255,7 +259,7 @@ def _order(name: str) -> tuple[str, int]:
 
 
 def _word(name: str) -> str:
-    """A name of a feature or camera: letters, digits and _, a letter in front."""
+    """Convert to the name of a feature or camera: letters, digits and _, beginning with a letter."""
     word = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name).strip("_")
     return word if word[:1].isalpha() else f"x_{word}"
 

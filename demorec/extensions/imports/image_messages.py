@@ -1,7 +1,7 @@
-"""Messages that hold an image, as ROS and Foxglove define them: what is in them, whether they are whole, their pixels.
+"""Image messages of ROS and Foxglove: their format, integrity and pixels.
 
-Reordering of bytes changes no value. Bayer patterns and YUV are computed, in the plainest way that others agree on:
-bilinear interpolation, ITU-R BT.601 with limited range."""
+Reordering of bytes changes no value. Bayer patterns and YUV are converted by the simplest method that other
+implementations agree on: bilinear interpolation, and ITU-R BT.601 with limited range."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ _CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
     "mono8": (1, (0, 0, 0)),
     "8UC1": (1, (0, 0, 0)),
 }
-"""Encoding -> bytes of a pixel, which of them are red, green, blue; OpenCV's own names mean blue first."""
+"""Encoding -> bytes per pixel, and those of red, green and blue; OpenCV's own names mean blue first."""
 _BAYER = {"bayer_rggb8": (0, 0), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0), "bayer_bggr8": (1, 1)}
 """Encoding -> row and column of the first red pixel."""
 _YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2": (0, 1, 3)}
-"""Encoding -> where the first luma, U and V of a pair of pixels are, of its four bytes."""
+"""Encoding -> positions of the first luma, U and V in the four bytes of a pair of pixels."""
 _DEPTH = {"16UC1": "u2", "32FC1": "f4"}
-"""Encoding of distances -> type of one."""
+"""Depth encoding -> type of a value."""
 _PIXEL_BYTES = (
     {encoding: count for encoding, (count, _) in _CHANNELS.items()}
     | dict.fromkeys(_BAYER, 1)
@@ -49,10 +49,10 @@ _PIXEL_BYTES = (
 
 
 def raw_image(values: Values) -> NDArray[Any]:
-    """(H, W, 3) uint8 of a message, or (H, W) distances as they are: uint16 (16UC1) or float32 (32FC1).
+    """(H, W, 3) uint8 of a message, or (H, W) unchanged depth: uint16 (16UC1) or float32 (32FC1).
 
     Raises:
-        FieldError: Its bytes are not those of its size and encoding.
+        FieldError: Its bytes do not match its size and encoding.
     """
     encoding, height = str(values["encoding"]), whole(values, "height")
     rows = _rows(values)
@@ -67,10 +67,10 @@ def raw_image(values: Values) -> NDArray[Any]:
 
 
 def _check_raw(values: Values) -> tuple[int, int]:
-    """Bytes of a row, with and without what pads it; FieldError when a message's are not those of its size."""
+    """Bytes per row, with and without padding; FieldError if a message's bytes do not match its size."""
     encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
     if encoding not in _PIXEL_BYTES or (encoding in _YUV and width % 2):
-        raise FieldError(f"its encoding {encoding[:40]!r} is not read; {', '.join(_PIXEL_BYTES)} are")
+        raise FieldError(f"its encoding {encoding[:40]!r} is not supported; {', '.join(_PIXEL_BYTES)} are")
     used = width * _PIXEL_BYTES[encoding]
     step = whole(values, "step") if values.get("step") and height > 1 else used
     data = values["data"]
@@ -81,7 +81,7 @@ def _check_raw(values: Values) -> tuple[int, int]:
 
 
 def _rows(values: Values) -> NDArray[np.uint8]:
-    """(H, B) bytes, without what pads each row."""
+    """(H, B) bytes, without row padding."""
     step, used = _check_raw(values)
     height, data = whole(values, "height"), np.frombuffer(image_bytes(values), np.uint8)
     if step == used:
@@ -101,7 +101,9 @@ def _from_bayer(pixels: NDArray[np.uint8], red_row: int, red_column: int) -> Rgb
 
 
 def _filled(pixels: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """A colour at every pixel: its own, or the mean of the neighbours that have it, the nearer ones counting double."""
+    """Fill in a colour at every pixel: its own, or the mean of the neighbours with that colour, with double weight for
+    the nearer ones.
+    """
     known, weights = np.pad(np.where(mask, pixels, 0).astype(np.float64), 1), np.pad(mask.astype(np.float64), 1)
 
     def blurred(plane: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -125,24 +127,24 @@ def _from_yuv(pixels: NDArray[np.uint8], luma: int, u: int, v: int) -> Rgb:
 
 VIDEO_FORMATS = tuple(DECODERS)
 KEPT_FORMATS = ("jpeg", *VIDEO_FORMATS)
-"""What stays as it is, byte for byte."""
+"""Formats that pass through, byte for byte."""
 _JPEG, _PNG = b"\xff\xd8\xff", b"\x89PNG\r\n\x1a\n"
 _SEQUENCE_BYTES = 24
-"""Of an AV1 keyframe, within which its sequence header ends."""
+"""Length of an AV1 keyframe's beginning that contains its sequence header."""
 _ALIASES = {"hevc": "h265", "avc": "h264", "jpg": "jpeg"}
 
 _HEAD_BYTES = 12
-"""ConfigHeader: a format and two parameters, which mean something for 32FC1 alone."""
+"""ConfigHeader: a format and two parameters, which apply only to 32FC1."""
 
 
 class ImageHead(NamedTuple):
-    """What is known of an image before it is decoded.
+    """Properties of an image known without decoding it.
 
     Attributes:
         format: raw, jpeg, png, compressedDepth or a codec of `VIDEO_FORMATS`.
-        encoding: Of raw pixels and of distances: "rgb8", "bayer_rggb8", "16UC1"; else "".
+        encoding: Encoding of raw pixels and depth: "rgb8", "bayer_rggb8", "16UC1"; else "".
         width, height: Pixels; 0 in video between keyframes.
-        is_keyframe: Whether it can be decoded without those before it: in video a keyframe with its parameter sets.
+        is_keyframe: Whether it can be decoded independently: in video a keyframe with its parameter sets.
     """
 
     format: str
@@ -153,7 +155,7 @@ class ImageHead(NamedTuple):
 
 
 class ImageHeads:
-    """The heads of a camera's images in order: a bag has a million of them, which are of a few kinds."""
+    """Heads of a camera's images in order; a bag has up to a million of them, of few kinds."""
 
     def __init__(self) -> None:
         self._kinds: list[ImageHead] = []
@@ -161,7 +163,7 @@ class ImageHeads:
         self._of = array("I")
 
     def append(self, head: ImageHead) -> None:
-        """Add the next one."""
+        """Append a head."""
         place = self._places.get(head)
         if place is None:
             place = self._places[head] = len(self._kinds)
@@ -175,19 +177,19 @@ class ImageHeads:
         return self._kinds[self._of[index]]
 
     def kinds(self, among: NDArray[np.int64] | None = None) -> list[ImageHead]:
-        """The different ones, of all or of the images of these numbers."""
+        """Different heads, among all images or those with these numbers."""
         if among is None:
             return list(self._kinds)
         return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
 
     @property
     def are_keyframes(self) -> NDArray[np.bool_]:
-        """(N,) of each whether it can be decoded without those before it."""
+        """(N,) whether each can be decoded independently."""
         return np.array([head.is_keyframe for head in self._kinds], bool)[np.array(self._of, np.intp)]
 
 
 def image_head(values: Values) -> ImageHead:
-    """Of a message; FieldError when it holds no image, a damaged one, or one in a format that is not read."""
+    """Parse a message's head; FieldError if it has no image, a damaged one, or an unsupported format."""
     if "data" not in values:
         raise FieldError("it holds no image")
     if "encoding" in values and "width" in values and "height" in values:
@@ -203,8 +205,8 @@ def image_head(values: Values) -> ImageHead:
         encoding = str(values["format"]).split(";")[0].strip()
         if encoding != "16UC1":
             raise FieldError(
-                f"its compressedDepth is of {encoding[:20]!r}, which does not keep what was measured; 16UC1, and 32FC1 "
-                "that is not compressed, are read"
+                f"its compressedDepth is {encoding[:20]!r}, which loses measured values; 16UC1 and uncompressed 32FC1 "
+                "are supported"
             )
         height, width = _compressed_depth(data).shape
         return _checked(ImageHead("compressedDepth", encoding, width, height, True))
@@ -212,7 +214,7 @@ def image_head(values: Values) -> ImageHead:
         return _file_head(data)
     codec = _ALIASES.get(name, name)
     if codec not in VIDEO_FORMATS:
-        raise FieldError(f"its format {name[:40]!r} is not read; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
+        raise FieldError(f"its format {name[:40]!r} is not supported; jpeg, png, {', '.join(VIDEO_FORMATS)} are")
     if not _starts_by_itself(codec, data):
         return ImageHead(codec, "", 0, 0, False)
     return _checked(ImageHead(codec, "", *_keyframe_size(codec, data), True))
@@ -225,12 +227,12 @@ def _checked(head: ImageHead) -> ImageHead:
 
 def _check_size(width: int, height: int) -> None:
     if width < 1 or height < 1 or width * height > MAX_PIXELS:
-        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are read")
+        raise FieldError(f"its image has {width}x{height} pixels, at most {MAX_PIXELS} are supported")
 
 
 @contextmanager
 def _opened(data: bytes, formats: list[str], problem: str) -> Iterator[Image.Image]:
-    """An image file; FieldError, which begins with the problem, when it is damaged."""
+    """Open an image file; FieldError, which begins with `problem`, if it is damaged."""
     try:
         with Image.open(io.BytesIO(data), formats=formats) as image:
             yield image
@@ -241,11 +243,11 @@ def _opened(data: bytes, formats: list[str], problem: str) -> Iterator[Image.Ima
 
 
 def _file_head(data: bytes) -> ImageHead:
-    """Of a JPEG or PNG file; FieldError when it is none, damaged, or too large."""
+    """Head of a JPEG or PNG file; FieldError if it is another file, damaged, or too large."""
     kind = "jpeg" if data.startswith(_JPEG) else "png"
     with _opened(data, [kind.upper()], "its image is damaged") as image:
         width, height = image.size
-        if kind == "png":  # what stays as it is, is not looked into; what will be decoded must be whole
+        if kind == "png":  # images that pass through are not checked further; those to be decoded must be complete
             _check_mode(image)
             image.verify()
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND\xaeB`\x82"
@@ -256,11 +258,11 @@ def _file_head(data: bytes) -> ImageHead:
 
 def _check_mode(image: Image.Image) -> None:
     if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
-        raise FieldError(f"its pixels are {image.mode!r}, which is no colour of 8 bits")
+        raise FieldError(f"its pixels are {image.mode!r}, which is not 8-bit colour")
 
 
 def decode_image(values: Values) -> NDArray[Any]:
-    """(H, W, 3) RGB of an image that is no video, or its distances (H, W); FieldError when it cannot be decoded."""
+    """Decode (H, W, 3) RGB or depth (H, W) of an image, except video; FieldError if it cannot be decoded."""
     if "encoding" in values:
         return raw_image(values)
     if "compresseddepth" in str(values["format"]).lower():
@@ -280,27 +282,27 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
 
 
 _shapes: dict[tuple[str, bytes], tuple[int, int, str]] = {}
-"""(codec, parameter sets) -> width, height and pixel format of the keyframes, one of which was decoded for it."""
+"""(codec, parameter sets) -> width, height and pixel format of the keyframes, from one decoded keyframe."""
 _DEEP_GRAY = re.compile(r"gray(9|1\d|f32)")
-"""FFmpeg's pixel formats of one value of more than 8 bits: depth or another measurement."""
+"""FFmpeg's single-channel pixel formats over 8 bits: depth or another measurement."""
 
 
 class NoColorError(FieldError):
-    """Encoded images hold a measurement, whose unit nobody states, in place of colours."""
+    """Encoded images hold a measurement with unknown unit instead of colour."""
 
 
 def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
     """Return width and height of a keyframe.
 
     Raises:
-        FieldError: It gives no image.
+        FieldError: It decodes to no image.
         NoColorError: Its pixels are not colours.
     """
     key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
     if key not in _shapes:
         frame = next(_frames(codec, [data]), None)
         if frame is None:
-            raise FieldError(f"its {codec} keyframe gives no image")
+            raise FieldError(f"its {codec} keyframe cannot be decoded")
         _shapes[key] = (frame.width, frame.height, frame.format.name)
     width, height, pixel_format = _shapes[key]
     if _DEEP_GRAY.match(pixel_format):
@@ -312,7 +314,7 @@ def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:
-    """Those in front of a keyframe's image, without what may differ from image to image beside them."""
+    """Parameter sets before a keyframe's image, without adjacent units that may differ between images."""
     units = list(nal_units(codec, data))
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     places = [place for _, place in units[1:]] + [units[-1][1]]
@@ -332,12 +334,12 @@ def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
 
 
 def _compressed_depth(data: bytes) -> NDArray[np.uint16]:
-    """(H, W) millimetres; FieldError when they are too many, or cannot be decoded."""
+    """(H, W) millimetres; FieldError if there are too many pixels, or they cannot be decoded."""
     if data.startswith(_PNG, _HEAD_BYTES):
         with _opened(data[_HEAD_BYTES:], ["PNG"], "its distances cannot be decoded") as image:
             _check_size(*image.size)
             if image.mode not in ("I;16", "I"):
-                raise ValueError(f"its pixels are {image.mode}, not of 16 bits")
+                raise ValueError(f"its pixels are {image.mode}, not 16-bit")
             return np.asarray(image).astype(np.uint16)
     size = data[_HEAD_BYTES : _HEAD_BYTES + 8]
     if len(size) < 8:

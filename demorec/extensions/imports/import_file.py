@@ -1,4 +1,4 @@
-"""import.json: what a run was imported from, by which mapping, and what was found in it; kept for `check`."""
+"""import.json: sources, mapping and findings of an import, stored for `check`."""
 
 from __future__ import annotations
 
@@ -21,17 +21,17 @@ from demorec.runs.run_file import IMPORT_NAME
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeReport:
-    """Report of a part of a bag that is an episode, or none.
+    """Report of a part of a bag that is an episode or was dropped.
 
     Attributes:
         episode_index: Its number in the run; None if it was dropped.
-        begin_s, end_s: Its place in the bag, from the first message on.
+        begin_s, end_s: Its interval in the bag, from the first message.
         num_frames: Number of rows.
-        success: Outcome; None where the bag does not say.
-        pictures: Camera -> what became of its images, in words.
-        reason: Why it was dropped; "" for others.
-        discarded: The marker that left it out, so that nothing is missing; "" for others.
-        follows: The stream whose messages have a row each; "" for rows of a grid.
+        success: Outcome; None if the bag does not record it.
+        pictures: Camera -> treatment of its images, in words.
+        reason: Why it was dropped; "" if it was not.
+        discarded: Marker that discards it, so that it does not count as missing; "" for others.
+        follows: Stream with one row per message; "" for rows on a grid.
     """
 
     episode_index: int | None
@@ -45,7 +45,7 @@ class EpisodeReport:
     follows: str = ""
 
     def lines(self) -> Iterator[str]:
-        """Describe it in words."""
+        """Describe it in lines."""
         place = f"{self.begin_s:.2f} to {self.end_s:.2f} s"
         if self.episode_index is None:
             yield f"no episode from {place}: {self.reason}"
@@ -62,11 +62,11 @@ class BagReport:
     """Report of a bag.
 
     Attributes:
-        name: Name of the file or folder, without its place.
+        name: Name of the file or folder, without its path.
         files: Name and SHA-256 of each of its files.
         num_bytes: Size of its files.
-        streams: Figures of each stream, as `stream_figures` has them.
-        findings, episodes: As described there.
+        streams: Figures of each stream, from `stream_figures`.
+        findings, episodes: See these classes.
     """
 
     name: str
@@ -78,7 +78,7 @@ class BagReport:
 
     @property
     def odd(self) -> tuple[Finding, ...]:
-        """Findings that are no notes."""
+        """Findings except notes."""
         return tuple(finding for finding in self.findings if finding.kind != NOTE)
 
     @property
@@ -87,7 +87,7 @@ class BagReport:
         return tuple(episode for episode in self.episodes if episode.episode_index is not None)
 
     def dropped_lines(self) -> Iterator[str]:
-        """Describe the parts that became no episode, and what was odd."""
+        """Describe dropped parts and findings."""
         for episode in self.episodes:
             if episode.episode_index is None:
                 yield from episode.lines()
@@ -96,10 +96,10 @@ class BagReport:
 
 
 def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str, str]:
-    """Return the figures of a stream by their name in the report's table.
+    """Return the figures of a stream by their column in the report's table.
 
-    The skew is the median of the time of recording minus that of the header, the jitter the deviation of those steps
-    that lack no message, the age that of the oldest message in any row.
+    The skew is the median of log time minus header time, the jitter the deviation of the steps without lost messages,
+    and the age that of the oldest message in any row.
     """
     steps = np.diff(line.times_ns)
     usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
@@ -124,7 +124,7 @@ _MAX_BYTES = 256 << 20
 
 @dataclass(frozen=True, kw_only=True)
 class SkippedBag:
-    """A bag that an import left out: the name of the file or folder, without its place, and why, in words."""
+    """A bag that an import left out: the name of the file or folder, without its path, and the reason."""
 
     name: str
     reason: str
@@ -135,11 +135,11 @@ class ImportFile:
     """The content of import.json.
 
     Attributes:
-        format: Of this file.
-        mapping: Of all bags, as plain data: that of an older release may have other keys.
-        mapping_digest: Of it.
-        bags: Reports of the imported bags in order; those that are not whole yet are missing.
-        skipped: Bags that were left out when they were last given.
+        format: Format version of this file.
+        mapping: Mapping of all bags, as plain data; one from an older release may have other keys.
+        mapping_digest: Its digest.
+        bags: Reports of the imported bags in order, without unfinished ones.
+        skipped: Bags left out when they were last given.
     """
 
     format: int = FORMAT
@@ -150,7 +150,7 @@ class ImportFile:
 
     @property
     def num_episodes(self) -> int:
-        """Number of episodes that were made; the next one has this number."""
+        """Number of imported episodes, which is also the number of the next one."""
         return sum(len(bag.made) for bag in self.bags)
 
 
@@ -173,7 +173,7 @@ def load_import_file(folder: Path) -> ImportFile | None:
 
 
 def save_import_file(content: ImportFile, folder: Path) -> None:
-    """Replace import.json in one step; BagError when it cannot be written."""
+    """Replace import.json atomically; BagError if it cannot be written."""
     path = folder / IMPORT_NAME
     try:
         replace_text(path, to_json(content, indent=2) + "\n")

@@ -1,7 +1,7 @@
-"""Bags become a run: every bag is read, judged as a whole, and only then written, episode by episode.
+"""Import of bags to a run: every bag is read and judged as a whole, and only then written, episode by episode.
 
-The same command again goes on: bags that import.json knows are not read, episodes that are there are not written.
-Several processes may read and write; bags are numbered and taken into the run in their order.
+The same command continues: bags in import.json are not read again, existing episodes are not written again. Several
+processes may read and write; bags are numbered and added to the run in order.
 """
 
 from __future__ import annotations
@@ -41,25 +41,25 @@ def import_bags(
     tell: Callable[[BagReport], None] = lambda report: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> ImportBatch:
-    """Import bags into a run, by a mapping.
+    """Import bags to a run, by a mapping.
 
     Args:
-        paths: Of bags, each of which is an episode, or several as the mapping says; or of folders of bags.
-        mapping_path: Of the mapping.
-        out: The run's folder; one that the same mapping began is continued.
-        video: How images are encoded that come as pixels.
-        workers: Processes that read and write; the recordings are the same for any number of them.
-        skip_bad: Whether bags are left out that cannot be read, or do not fit the mapping or the other bags. Else the
-            first of them ends the import, before anything of it is written.
-        tell: Called with the report of each bag that was read now, in their order.
-        progress: Called with the number of bags that are done, and of all.
+        paths: Bags, each of which is one episode or several by the mapping; or folders of bags.
+        mapping_path: Path of the mapping.
+        out: The run's folder; a run started with the same mapping is continued.
+        video: Encoding of images that arrive as pixels.
+        workers: Number of processes that read and write; the recordings do not depend on it.
+        skip_bad: Whether to leave out bags that cannot be read, or do not fit the mapping or the other bags. Otherwise
+        the first of them ends the import before any of it is written.
+        tell: Called with the report of each newly read bag, in order.
+        progress: Called with the number of finished bags and the total.
 
     Returns:
         The batch, with `reports`, `num_new` and `skipped`.
 
     Raises:
-        ConfigError: The mapping is impossible, or the folder holds something else.
-        BagError: A bag cannot be read, does not fit the mapping, or would give an episode with something missing.
+        ConfigError: The mapping is impossible, or the folder holds other files.
+        BagError: A bag cannot be read, does not fit the mapping, or would yield an incomplete episode.
         RecordingError: The disk is full or gone.
         GenerationError: A process of the import was killed.
     """
@@ -92,7 +92,7 @@ def import_bags(
 def _in_order[Item, Result](
     begin: Callable[[Item], Future[Result]], items: Iterable[Item], ahead: int
 ) -> Iterator[tuple[Item, Future[Result]]]:
-    """Yield each item and what is begun with it, in order; up to `ahead` are under way, which bounds the memory."""
+    """Yield each item and its started work, in order; up to `ahead` are in progress, to limit memory."""
     waiting: deque[tuple[Item, Future[Result]]] = deque()
     for item in items:
         waiting.append((item, begin(item)))
@@ -102,7 +102,7 @@ def _in_order[Item, Result](
 
 
 def _at_once[R](function: Callable[..., R], *args: Any) -> Future[R]:
-    """What an executor's `submit` gives, done in this process; Ctrl-C is not kept for later."""
+    """Run at once in this process, with the interface of an executor's `submit`; Ctrl-C is raised immediately."""
     future: Future[R] = Future()
     try:
         future.set_result(function(*args))
@@ -112,25 +112,25 @@ def _at_once[R](function: Callable[..., R], *args: Any) -> Future[R]:
 
 
 _Written = tuple[BagReport, list[Attempt]]
-"""The report of a bag whose episodes are in the run's folder, and their lines of run.json."""
+"""Report of a bag with written episodes, and their lines of run.json."""
 _MAX_REASON = 1000
-"""Characters: an error may quote what a bag holds."""
+"""Maximum characters: an error may quote a bag's content."""
 
 
 class ImportBatch:
-    """The bags of one call: numbered and taken into the run in their order, whoever reads and writes them when.
+    """Bags of one call, numbered and added to the run in order, independent of which process reads and writes them.
 
-    So what is in the run depends neither on how many processes there are nor on when they were interrupted.
+    The run thus depends neither on the number of processes nor on interruptions.
 
     Attributes:
-        num_new: Bags that were read now; the others were there.
+        num_new: Bags read now; the others existed.
     """
 
     def __init__(
         self, paths: Sequence[Path], known: ImportFile, *, skips: bool, progress: Callable[[int, int], None]
     ) -> None:
         self._paths, self._known, self._skips, self._progress = paths, known, skips, progress
-        self._left = list(paths)  # to be taken into the run, or left out
+        self._left = list(paths)  # to be added to the run, or left out
         self._files: dict[Path, Files] = {}  # of bags that are in the run, or will be
         self._skipped: dict[Path, str] = {}
         self.num_new = self._num_done = 0
@@ -140,13 +140,13 @@ class ImportBatch:
         self._progress(0, len(paths))
 
     def look(self, digest: Callable[[Bag], Future[Files]]) -> list[Bag]:
-        """Open all bags; those that are not in the run yet, by `digest` where sizes and names are known."""
+        """Open all bags; return those not yet in the run, by `digest` if sizes and names are known."""
         bags = []
         for path in self._paths:
             try:
                 bags.append(open_bag(path))
             except DemorecError as error:
-                if not os.path.lexists(path):  # a name that was mistyped is no bad bag
+                if not os.path.lexists(path):  # a mistyped name is not a bad bag
                     raise
                 self._refuse(path, error)
         known = {report.files for report in self._known.bags}
@@ -168,15 +168,15 @@ class ImportBatch:
         ahead: int,
         tell: Callable[[BagReport], None],
     ) -> None:
-        """Take new bags into a run; what a bag raises is raised after all bags before it are there.
+        """Add new bags to a run; an error of a bag is raised after all bags before it were added.
 
         Args:
-            bags: Those that are not there yet.
-            folder: Of the run.
-            read: Begins to read and judge a bag.
-            write: Begins to write its episodes.
-            ahead: Number of bags that are read, and that are written, at a time.
-            tell: Called with the report of each bag that is in the run now.
+            bags: New bags.
+            folder: Folder of the run.
+            read: Starts reading and judging a bag.
+            write: Starts writing its episodes.
+            ahead: Maximum bags being read, and being written, at a time.
+            tell: Called with the report of each added bag.
         """
         self._kind = folder.kind()
         folder.planned = [path.name for path in self._left]
@@ -192,7 +192,7 @@ class ImportBatch:
             save_import_file(replace(self._known, skipped=self.skipped_bags()), folder.path)
 
     def _accepted(self, folder: ExternalFolder, bags: Iterator[tuple[Bag, Future[PlannedBag]]]) -> Iterator[PlannedBag]:
-        """Yield what is to be written of each bag, up to the first one that ends the import."""
+        """Yield the planned episodes of each bag, up to the first bag that ends the import."""
         try:
             for bag, read in bags:
                 planned = self._accept(folder, bag, read)
@@ -202,7 +202,7 @@ class ImportBatch:
             self._failure = error
 
     def _take(self, folder: ExternalFolder, path: Path, report: BagReport, lines: Sequence[Attempt]) -> None:
-        """Add a written bag to the run; run.json, which marks it as done, comes last."""
+        """Add a written bag to the run; run.json, which marks it as done, is written last."""
         self._known = replace(self._known, bags=(*self._known.bags, report), skipped=self.skipped_bags())
         save_import_file(self._known, folder.path)
         self.num_new += 1
@@ -211,7 +211,7 @@ class ImportBatch:
         folder.extend(lines)
 
     def _accept(self, folder: ExternalFolder, bag: Bag, read: Future[PlannedBag]) -> PlannedBag | None:
-        """Return the bag with the numbers of its new episodes; None for one that is left out or was there."""
+        """Return the bag with the numbers of its new episodes; None if it is left out or existed."""
         try:
             planned = read.result()
             if planned.episodes:
@@ -219,7 +219,7 @@ class ImportBatch:
                 self._kind = self._kind or info
                 if different := differences(self._kind, info):
                     raise ConfigError(
-                        f"The run holds episodes of another kind ({'; '.join(different)}): import the bag into another "
+                        f"The run's episodes differ from the bag's ({'; '.join(different)}): import it into another "
                         f"folder: {bag.path}"
                     )
         except Exception as error:
@@ -227,7 +227,7 @@ class ImportBatch:
             return None
         is_there = planned.report.files in self._files.values()
         self._files[bag.path] = planned.report.files
-        if is_there:  # another one with the same bytes
+        if is_there:  # another bag with the same bytes
             self._advance(bag.path)
             return None
         if planned.episodes:
@@ -237,7 +237,7 @@ class ImportBatch:
         return replace(planned, episodes=tuple(one for one in planned.episodes if not folder.has(one.info)))
 
     def _refuse(self, path: Path, error: Exception) -> None:
-        """Leave a bag out, or raise: where that was not asked for, or is the machine's fault."""
+        """Leave a bag out, or raise if that was not requested or the machine is at fault."""
         if (lack := resource_error(error)) is not None:
             raise lack from error
         if not self._skips or isinstance(error, BrokenExecutor):
@@ -254,28 +254,28 @@ class ImportBatch:
         self._progress(self._num_done, len(self._paths))
 
     def skipped_bags(self) -> tuple[SkippedBag, ...]:
-        """Those of this call, in order, behind those of earlier calls that are not given now."""
+        """Skipped bags of this call, in order, after those of earlier calls that are not given now."""
         given = {path.name for path in self._paths}
         before = [bag for bag in self._known.skipped if bag.name not in given]
         return (*before, *(SkippedBag(name=path.name, reason=reason) for path, reason in self.skipped.items()))
 
     @property
     def num_episodes(self) -> int:
-        """Number of episodes that the bags gave."""
+        """Number of episodes from the bags."""
         return sum(len(report.made) for report in self.reports)
 
     def left_out_lines(self) -> Iterator[str]:
-        """Describe what became no episode, and what was odd."""
+        """Describe dropped parts and findings."""
         yield from (f"{report.name}: {line}" for report in self.reports for line in report.dropped_lines())
 
     @property
     def reports(self) -> tuple[BagReport, ...]:
-        """Reports of the bags in the run, in the order in which they were given."""
+        """Reports of the bags in the run, in the given order."""
         reports = {report.files: report for report in self._known.bags}
         files = dict.fromkeys(self._files[path] for path in self._paths if path in self._files)
         return tuple(reports[key] for key in files)
 
     @property
     def skipped(self) -> dict[Path, str]:
-        """Bags that were left out -> why."""
+        """Skipped bag -> reason."""
         return {path: self._skipped[path] for path in self._paths if path in self._skipped}

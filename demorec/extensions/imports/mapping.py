@@ -1,11 +1,9 @@
-"""What of a bag or an HDF5 file becomes what of an episode: the user's own words, from a TOML file (docs/import.md).
+"""Mapping from a bag or an HDF5 file to an episode, which the user writes in TOML (docs/import.md).
 
-[[features."observation.state"]]      a feature is one source or several, one behind the other
-topic = "/joint_states"               of a bag; of an HDF5 file: dataset = "obs/robot0_joint_pos"
-field = "position"
-joints = ["fr3_joint1", "fr3_joint2"]
+[[features."observation.state"]] a feature is one source or several, concatenated topic = "/joint_states" for a bag; for
+an HDF5 file: dataset = "obs/robot0_joint_pos" field = "position" joints = ["fr3_joint1", "fr3_joint2"]
 
-Most keys mean the same for both; those of one kind alone are marked, and refused in a mapping of the other.
+Most keys apply to both; those of one kind are marked, and rejected in a mapping of the other.
 """
 
 from __future__ import annotations
@@ -25,25 +23,25 @@ Sampling = Literal["latest", "nearest", "linear"]
 Stamp = Literal["header", "log"]
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
-"""Of a source: more is an image or a point cloud, not a vector."""
+"""Maximum elements of a source: larger ones are images or point clouds, not vectors."""
 MAX_SECONDS = 1e9
-"""Of any time in a mapping: beyond it nanoseconds are no numbers of 64 bits."""
+"""Maximum of any time in a mapping: larger ones exceed 64-bit nanoseconds."""
 ROWS = ("camera", "grid")
-"""Values of `Clock.rows` that are no topic."""
+"""Values of `Clock.rows` that are not topics."""
 KIND = "kind"
-"""In a field's metadata: the kind of source to which it belongs alone."""
+"""Key in a field's metadata: the only kind of source with this field."""
 
 _BAG, _HDF5 = {KIND: "bag"}, {KIND: "hdf5"}
-"""Metadata of keys that only mappings of that kind have."""
+"""Metadata of keys for only one kind of mapping."""
 
 
 def _bag(default: Any) -> Any:
-    """A key that only mappings of bags have."""
+    """A key for mappings of bags only."""
     return dataclasses.field(default=default, metadata=_BAG)
 
 
 def _hdf5(default: Any) -> Any:
-    """A key that only mappings of HDF5 files have."""
+    """A key for mappings of HDF5 files only."""
     return dataclasses.field(default=default, metadata=_HDF5)
 
 
@@ -52,21 +50,21 @@ class Source:
     """A part of a feature: numbers of one topic, or of one dataset.
 
     Attributes:
-        topic: Of a bag: where they are.
+        topic: Topic of the numbers, for bags.
         field: Path of the numbers in a message: "position", "pose.orientation", "transforms[child_frame_id=hand]".
-        joints: Elements by name, in this order, where the message names them.
-        names_field: Where it names them (auto: "name" or "joint_names" beside the field).
+        joints: Elements by name, in this order, if the message names them.
+        names_field: Field of the names (auto: "name" or "joint_names" next to the field).
         stamp: As `Clock.stamp`, for this source.
         sample: As `Clock.sample`, for this source.
         max_age_s: As `Clock.max_age_s`, for this source.
-        dataset: Of an HDF5 file: where they are, below the episode's group: (T, D) or (T,).
-        elements: By number, in this order (auto: all).
-        names: Of the elements in the feature (auto: as the source calls them).
-        prefix: In front of each name, for two arms with the same names.
-        unit: Of the source.
-        to: Unit of the feature (auto: the source's, so that no bit changes).
-        limits: [lowest, highest] of each element in the unit `to`, which -100..100 ("percent") stands for.
-        next: In place of a source: the feature whose value at the next row this one has.
+        dataset: Dataset of the numbers below the episode's group, for HDF5 files: (T, D) or (T,).
+        elements: Elements by number, in this order (auto: all).
+        names: Names of the elements in the feature (auto: the source's names).
+        prefix: Prefix of each name, for two arms with the same names.
+        unit: Unit of the source.
+        to: Unit of the feature (auto: the source's, which keeps values bit-exact).
+        limits: [lowest, highest] of each element in the unit `to`, as the range of -100..100 ("percent").
+        next: Instead of a source: a feature to take from the next row.
     """
 
     elements: tuple[int, ...] = ()
@@ -87,7 +85,7 @@ class Source:
 
     @property
     def place(self) -> str:
-        """Where its numbers are, for people."""
+        """Location of its numbers, for people."""
         return f"the next {self.next}" if self.next else self.dataset or f"{self.topic} {self.field}"
 
 
@@ -96,16 +94,17 @@ class CameraSource:
     """A camera's images.
 
     Attributes:
-        topic: Of a bag: sensor_msgs Image or CompressedImage, foxglove RawImage, CompressedImage or CompressedVideo.
-        info_topic: Of its calibration (CameraInfo, CameraCalibration).
+        topic: Topic of a bag: sensor_msgs Image or CompressedImage, foxglove RawImage, CompressedImage or
+        CompressedVideo.
+        info_topic: Topic of its calibration (CameraInfo, CameraCalibration).
         stamp: As `Clock.stamp`, for this camera.
-        sample: As `Clock.sample`; images are never mixed.
+        sample: As `Clock.sample`; images are never interpolated.
         max_age_s: As `Clock.max_age_s`, for this camera.
-        dataset: Of an HDF5 file, below the episode's group: (T, H, W, 3) or (T, 3, H, W), uint8 or floats from 0 to 1
-            or to 255; or a JPEG file in each row, (T, N) uint8 padded with zeros or (T,) of variable length; of a depth
-            camera (T, H, W) or (T, H, W, 1), uint16 mm or float32 m.
-        colors: Order of the colours there; in JPEG files it is red first by the format itself, but OpenCV writes them
-            of pixels that it takes to have blue first.
+        dataset: Dataset of an HDF5 file below the episode's group: (T, H, W, 3) or (T, 3, H, W), uint8 or floats from 0
+        to 1 or to 255; or a JPEG file in each row, (T, N) uint8 padded with zeros or (T,) of variable length; for a
+        depth camera (T, H, W) or (T, H, W, 1), uint16 mm or float32 m.
+        colors: Order of the colours; JPEG files are RGB by their format, but recorders may pass RGB pixels to OpenCV,
+        which expects BGR.
     """
 
     topic: str = _bag("")
@@ -119,13 +118,13 @@ class CameraSource:
 
 @dataclass(frozen=True, kw_only=True)
 class Robot:
-    """Which robot it was.
+    """Robot of the recording.
 
     Attributes:
-        name: Free to choose; all datasets that shall be merged need the same.
-        urdf: File of its model, relative to the mapping's.
-        urdf_topic: Where the bag holds its model: "/robot_description".
-        urdf_attribute: Of the HDF5 file's episode, which holds its model.
+        name: Any name; datasets to be merged need the same one.
+        urdf: File of its URDF, relative to the mapping file.
+        urdf_topic: Topic of its URDF in the bag: "/robot_description".
+        urdf_attribute: Attribute of the HDF5 file's episode with its URDF.
     """
 
     name: str
@@ -136,15 +135,15 @@ class Robot:
 
 @dataclass(frozen=True, kw_only=True)
 class TaskText:
-    """What the robot was asked to do; one of text, topic or attribute, and file_name.
+    """Instruction of the task; one of text, topic or attribute, and file_name.
 
     Attributes:
-        text: The same for all episodes.
-        topic: Of texts; the last one before the episode's end holds.
-        field: Of the text in that topic's messages.
-        attribute: Of the HDF5 file's episode, or of a group above it; "ep_meta.lang" is the value `lang` of the JSON in
-            `ep_meta`.
-        file_name: Take the file's name, "stack_the_cups_003" being "stack the cups".
+        text: Instruction of all episodes.
+        topic: Topic of instructions; the last one before the episode's end is used.
+        field: Field of the text in that topic's messages.
+        attribute: Attribute of the HDF5 file's episode, or of a group above it; "ep_meta.lang" is the value `lang` of
+        the JSON in `ep_meta`.
+        file_name: Use the file's name: "stack_the_cups_003" becomes "stack the cups".
     """
 
     text: str = ""
@@ -156,11 +155,11 @@ class TaskText:
 
 @dataclass(frozen=True, kw_only=True)
 class Subtasks:
-    """What the robot does at the moment, in words; each text holds from its message on.
+    """Current subtask of the robot, in words; each text is valid from its message.
 
     Attributes:
-        topic: Of the texts, which may be that of the markers; "" where nobody says it.
-        field: Of the text in that topic's messages.
+        topic: Topic of the texts, possibly the markers' topic; "" for none.
+        field: Field of the text in that topic's messages.
     """
 
     topic: str = ""
@@ -169,17 +168,17 @@ class Subtasks:
 
 @dataclass(frozen=True, kw_only=True)
 class Clock:
-    """When rows are, and which messages they hold.
+    """Times of the rows, and the messages that they take.
 
     Attributes:
-        fps: Rows a second; that of the dataset. A bag needs it; 0 is what an HDF5 file says itself.
-        rows: "camera": a row for each image of the slowest camera of those that give `fps` images a second (where none
-            does, a grid); "grid": evenly spaced; or a topic: a row for each of its messages.
-        stamp: Whether a message's time is that of its header, or when it was recorded.
-        sample: The last message before the row, the nearest one, or the straight line between its neighbours.
-        max_age_s: How far from the row a message may be.
-        when_old: What to do where it is farther, or missing.
-        max_trim_s: How much of the bag's beginning and end may be left out because a stream starts late or ends early.
+        fps: Rows per second, also of the dataset. Required for bags; 0 uses the HDF5 file's own rate.
+        rows: "camera": a row for each image of the slowest camera among those with `fps` images per second (without
+        any, a grid); "grid": evenly spaced; or a topic: a row for each of its messages.
+        stamp: Whether a message's time is its header time or its log time.
+        sample: The last message before the row, the nearest one, or linear interpolation of its neighbours.
+        max_age_s: Maximum distance of a message from the row.
+        when_old: Treatment of messages that are farther away or missing.
+        max_trim_s: Maximum time to leave out at the bag's beginning and end if a stream starts late or ends early.
     """
 
     fps: int = 0
@@ -193,21 +192,20 @@ class Clock:
 
 @dataclass(frozen=True, kw_only=True)
 class Episodes:
-    """Where one episode ends and another begins.
+    """Boundaries of episodes.
 
     Attributes:
-        cut: A bag is an episode; or markers, a gap in the rows' streams, or a list of times cut it.
-        topic: Of the markers.
-        field: Of the text, number or boolean in a marker.
+        cut: Whether a whole bag is one episode, or markers, gaps in the rows' streams, or a list of times split it.
+        topic: Topic of the markers.
+        field: Field of the text, number or boolean in a marker.
         start, stop: Texts of markers that begin and end an episode (text only; a boolean does both).
-        success, failure: Texts of markers that say how it ended. Of an HDF5 file, success is an attribute of the
-            episode that says whether it is one, or a dataset whose last row is above 0 then.
-        discard: Texts of markers that leave out the episode under way, or else the one before.
-        ignore: Texts of markers that mean nothing here; any other text is an error.
-        gap_s: A pause of all streams longer than that ends an episode.
-        group: Of which every group in an HDF5 file is an episode, "/" for those at its root; "" where the file itself
-            is one.
-        mask: Only those that the dataset of that name in `mask` lists.
+        success, failure: Marker texts for the outcome. For HDF5 files, success is a boolean attribute of the episode,
+        or a dataset with a last row above 0 for success.
+        discard: Marker texts that discard the current episode or, between episodes, the previous one.
+        ignore: Marker texts without a meaning; other unknown texts are errors.
+        gap_s: Minimum pause of all streams that ends an episode.
+        group: Group of an HDF5 file in which each group is an episode, "/" for the root; "" if the file itself is one.
+        mask: Use only the episodes listed in this dataset of `mask`.
         times_s: [begin, end] of each episode, seconds from the bag's first message.
     """
 
@@ -230,12 +228,12 @@ class Episodes:
 class SourceMapping:
     """A whole mapping.
 
-    Attributes:
-        kind: Of what.
-        robot, task, subtasks, clock, episodes: As described there.
+    A complete mapping.
+        kind: Kind of its sources.
+        robot, task, subtasks, clock, episodes: See these classes.
         features: Name of a feature -> its sources, in order.
         cameras: Name of a camera -> its images.
-        leave_out: Datasets of an HDF5 file, or groups of them, whose images shall not be imported.
+        leave_out: Datasets of an HDF5 file, or groups of them, with images that are not imported.
     """
 
     kind: SourceKind = "bag"
@@ -250,23 +248,23 @@ class SourceMapping:
 
     @cached_property
     def digest(self) -> str:
-        """16 hex digits of all that it says of its kind of source."""
+        """First 16 hex digits of the digest of all settings for its kind of source."""
         return digest(_said(self, self.kind))
 
     def leaves_out(self, dataset: str) -> bool:
-        """Whether it says that a dataset, or a group that holds it, shall not be imported."""
+        """Whether it excludes a dataset, or a group that contains it."""
         return any(f"{dataset}/".startswith(f"{name.strip('/')}/") for name in self.leave_out)
 
     @property
     def datasets(self) -> frozenset[str]:
-        """All that it names below an episode's group."""
+        """All datasets that it names below an episode's group."""
         parts = {part.dataset for parts in self.features.values() for part in parts}
         named = parts | {camera.dataset for camera in self.cameras.values()} | {self.episodes.success}
         return frozenset(name.strip("/") for name in named)
 
 
 def _said(value: Any, kind: SourceKind) -> Any:
-    """Of a mapping as plain data what is for its kind of source."""
+    """The settings of a mapping for its kind of source, as plain data."""
     if dataclasses.is_dataclass(value):
         own = [one.name for one in dataclasses.fields(value) if one.metadata.get(KIND, kind) == kind]
         return {name: _said(getattr(value, name), kind) for name in own}
@@ -284,4 +282,4 @@ CONVERSIONS: Mapping[tuple[str, str], float] = {
     ("percent", "degree"): math.nan,
     ("percent", "m"): math.nan,
 }
-"""(unit of the source, unit of the feature) -> factor; NaN where each element has its own."""
+"""(unit of the source, unit of the feature) -> factor; NaN if it differs between elements."""

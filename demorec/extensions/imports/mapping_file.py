@@ -1,4 +1,4 @@
-"""The strict reading of a mapping's TOML file: bounded, unknown keys refused with the nearest known one."""
+"""Strict parsing of a mapping's TOML file: size limits, and an error with the closest match for unknown keys."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ _KINDS: dict[SourceKind, str] = {"bag": "bags", "hdf5": "HDF5 files"}
 
 
 def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
-    """A mapping of bags, or of HDF5 files, from its TOML file.
+    """Read a mapping of bags or HDF5 files from its TOML file.
 
     Raises:
-        ConfigError: All keys that are unknown, else all values of a wrong type, else all that is impossible: the former
-            often cause the latter.
+        ConfigError: All unknown keys; without any, all values of a wrong type; without any, all impossible values: the
+        former often cause the latter.
     """
     try:
         data = tomllib.loads(read_text_limited(path, _MAX_FILE_BYTES))
     except FileNotFoundError as error:
-        raise ConfigError(f"There is no mapping (demorec import ... --suggest > FILE writes one): {path}") from error
+        raise ConfigError(f"No mapping (demorec import ... --suggest > FILE writes one): {path}") from error
     except OSError as error:
         raise ConfigError(f"The mapping cannot be read ({error.strerror}): {path}") from error
     except (ValueError, RecursionError) as error:
@@ -52,7 +52,7 @@ def read_mapping(path: Path, kind: SourceKind = "bag") -> SourceMapping:
         raise ConfigError(f"The mapping cannot be used: {'; '.join(problems)}: {path}")
     try:
         if kind == "hdf5" and isinstance(data.get("episodes", {}), dict):
-            # Nobody asks how an episode ended unless the mapping says where that is.
+            # Success is read only if the mapping names its source.
             data["episodes"] = {"success": ""} | data.get("episodes", {})
         mapping = from_plain({**data, KIND: kind}, SourceMapping)
     except ValueError as error:
@@ -82,11 +82,11 @@ def _unknown_keys(value: Any, kind: Any, place: str, of: SourceKind) -> Iterator
 
 
 def _problems(mapping: SourceMapping) -> Iterator[str]:
-    """What is impossible in it, whatever the bag or file."""
+    """Yield the problems of a mapping that do not depend on a bag or file."""
     yield from _feature_problems(mapping)
     if ACTION not in mapping.features:
         what = "topic" if mapping.kind == "bag" else "dataset"
-        yield f"there is no feature 'action': name its {what}, or next = \"observation.state\""
+        yield f"missing feature 'action': name its {what}, or next = \"observation.state\""
     yield from _camera_problems(mapping)
     if not mapping.robot.name.strip():
         yield "robot.name is empty"
@@ -112,7 +112,7 @@ def _feature_problems(mapping: SourceMapping) -> Iterator[str]:
         yield f"there are {len(mapping.features):,} features, allowed are up to {MAX_FEATURES}"
         return
     if STATE not in mapping.features:
-        yield f'there is no feature {STATE!r}: write [[features."{STATE}"]] and what it is taken from'
+        yield f'missing feature {STATE!r}: write [[features."{STATE}"]] with its source'
     for name, sources in mapping.features.items():
         if "/" in name or not name or name.startswith("observation.images"):
             yield f"a feature cannot be called {name!r}"
@@ -133,7 +133,7 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
     if pair not in CONVERSIONS and pair[0] != pair[1]:
         yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
     if "percent" in pair and pair[0] != pair[1] and not source.limits:
-        yield f"{place} needs limits, since -100..100 stands for each joint's own range"
+        yield f"{place} needs limits, because -100..100 means each joint's own range"
     if any(not low < high for low, high in source.limits):
         yield f"{place} has limits that are not [lowest, highest]"
     if source.next:
@@ -151,9 +151,9 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
 def _next_problems(mapping: SourceMapping, name: str, following: str, *, is_bag: bool) -> Iterator[str]:
     place, known = f"the feature {name!r}", [other for other in mapping.features if other != name]
     if len(mapping.features[name]) > 1 and not is_bag:
-        yield f"{place} has other parts beside next"
-    if following not in known and (following in mapping.features or following != STATE):  # whose lack is said already
-        yield f"{place} follows {following!r}, which is no feature.{nearest_match(following, known)}".rstrip(".")
+        yield f"{place} has other parts next to next"
+    if following not in known and (following in mapping.features or following != STATE):  # already reported as missing
+        yield f"{place} follows {following!r}, which is not a feature.{nearest_match(following, known)}".rstrip(".")
     elif any(other.next for other in mapping.features.get(following, ())):
         yield f"{place} follows {following!r}, which follows another feature itself"
 

@@ -1,6 +1,6 @@
-"""A bag is read and judged as a whole: the episodes that shall be recorded of it, and a report of what was found.
+"""Read and judge a bag as a whole: plan the episodes to record, and report all findings.
 
-The mapping says where episodes begin and end, what they are called and how they ended, by what the bag holds.
+The mapping defines the boundaries, tasks and outcomes of episodes by the bag's content.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from demorec.mcap.video import size_problem
 from demorec.runs.external import differences
 
 _SHOWN = 40
-"""Characters of a marker in an error."""
+"""Maximum characters of a marker in an error."""
 _MOST_LISTED = 5
 """Maximum number of markers in an error."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedEpisode:
-    """An episode that shall be written; `subtasks` is row -> what is begun there, in words."""
+    """An episode to write; `subtasks` is row -> subtask that begins there, in words."""
 
     info: EpisodeInfo
     rows: EpisodeRows
@@ -57,7 +57,7 @@ class PlannedBag:
     episodes: tuple[PlannedEpisode, ...]
 
     def numbered(self, first: int) -> PlannedBag:
-        """The same with the numbers of a run."""
+        """Renumber the episodes for a run."""
         reports = (
             replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
             for row in self.report.episodes
@@ -73,13 +73,13 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
     """Read and judge a bag.
 
     Args:
-        bag: To be read.
-        mapping: Of it.
-        urdf: The robot's model, None where the mapping names no file.
-        video: How pixels are to be encoded.
+        bag: Bag to read.
+        mapping: Its mapping.
+        urdf: The robot's URDF, None if the mapping names no file.
+        video: Encoding of pixels.
 
     Raises:
-        BagError: It cannot be read, does not fit the mapping, or would give an episode with something missing.
+        BagError: It cannot be read, does not fit the mapping, or would yield an incomplete episode.
         ConfigError: Its episodes differ.
     """
     files = bag.sha256s()
@@ -103,7 +103,7 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
                     episodes.append(episode)
                 except NoRowsError as error:
                     if mapping.clock.when_old == "error":
-                        raise BagError(f"The bag gives no whole episode: {error}{_reported(findings)}") from error
+                        raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
                     reason = str(error)
             reports.append(_report(window, begin, episode, reason))
         for episode in episodes:
@@ -124,7 +124,7 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
 
 
 def _reported(findings: Sequence[Finding]) -> str:
-    """What else is odd in a bag that gives no whole episode, which may be why."""
+    """Other findings in a bag without a complete episode, as possible causes."""
     kinds = {finding.kind: finding.kind for finding in findings}
     offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
     kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
@@ -157,7 +157,7 @@ def _episode(
 
 
 def windows(lines: Timelines) -> list[Window]:
-    """The episodes of a bag, in order; BagError when there are none, or where a marker has no meaning."""
+    """Episodes of a bag, in order; BagError if it has none, or a marker has no meaning."""
     begin = min(int(line.times_ns[0]) for line in lines.lines.values())
     end = max(int(line.times_ns[-1]) for line in lines.lines.values())
     episodes = lines.mapping.episodes
@@ -193,7 +193,9 @@ def windows(lines: Timelines) -> list[Window]:
 
 
 def _unknown_words(markers: list[Text], mapping: SourceMapping) -> str:
-    """What markers say that the mapping gives no meaning, each once; "" for nothing. Subtasks may share their topic."""
+    """Marker texts without a meaning in the mapping, each once; "" if all have one. Subtasks may share their
+    topic.
+    """
     words = mapping.episodes
     known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
     is_shared = words.topic == mapping.subtasks.topic
@@ -218,7 +220,7 @@ def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
             found.append(Window(begin_ns=begin, end_ns=marker.time_ns, success=success))
             begin = None
         elif begin is None and found and marker.value in (words.success, words.failure):
-            # The verdict may come after the end.
+            # The outcome may follow after the end.
             found[-1] = replace(found[-1], success=marker.value == words.success)
         elif begin is not None and marker.value in words.discard:
             found.append(Window(begin_ns=begin, end_ns=marker.time_ns, discarded=marker.value))
@@ -229,30 +231,30 @@ def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
 
 
 def _task_text(bag_name: str, lines: Timelines, window: Window) -> str:
-    """What the robot was asked to do in an episode; BagError where the bag does not say."""
+    """Instruction of an episode; BagError if the bag does not have it."""
     task = lines.mapping.task
     if task.text:
         return task.text.strip()
     if task.file_name:
         if text := task_in_name(bag_name):
             return text
-        raise BagError("The bag's name says no task, which the mapping takes from it")
+        raise BagError("The mapping takes the task from the bag's name, which has none")
     texts = [text for text in lines.streams.texts[task.topic] if text.time_ns <= window.end_ns]
     if not texts:
         raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown")
     value = max(texts, key=lambda text: text.time_ns).value
     if not isinstance(value, str) or not value.strip():
-        raise BagError(f"The task of {task.topic} is no text")
+        raise BagError(f"The task of {task.topic} is not text")
     return value.strip()
 
 
 def _subtask_rows(lines: Timelines, rows: EpisodeRows) -> dict[int, str]:
-    """Row -> what is begun there: the texts of the mapping's topic that were said within the episode.
+    """Row -> subtask that begins there, from the texts of the mapping's topic within the episode.
 
-    Of several before a row the last one holds from it on; a text that is said again, and an empty one, begins nothing.
+    Among several before a row, the last one is used; a repeated or empty text begins nothing.
 
     Raises:
-        BagError: What was said is no text.
+        BagError: A message is not text.
     """
     words, topic = lines.mapping.episodes, lines.mapping.subtasks.topic
     is_marker = words.cut == "marker" and words.topic == topic
@@ -263,7 +265,7 @@ def _subtask_rows(lines: Timelines, rows: EpisodeRows) -> dict[int, str]:
         if not rows.window.begin_ns <= text.time_ns <= rows.table.time_ns[-1]:
             continue
         if not isinstance(text.value, str):
-            raise BagError(f"The subtask of {topic} is no text")
+            raise BagError(f"The subtask of {topic} is not text")
         if text.value in markers:
             continue
         if said := " ".join(text.value.split()):
@@ -303,28 +305,28 @@ def _camera(name: str, plan: TakenImages, lines: Timelines) -> Camera:
 
 
 def _numbers(values: Mapping[str, Any], *keys: str) -> list[float]:
-    """Those of the first of these fields that is there."""
+    """Numbers in the first of these fields that exists."""
     found = next((values[key] for key in keys if key in values), None)
     return [float(number) for number in found.reshape(-1)] if isinstance(found, np.ndarray) and found.size <= 64 else []
 
 
 def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
-    """What no recording can hold, found before anything of the bag is written."""
+    """Problems that prevent a recording, found before anything of the bag is written."""
     yield from find_problems(episode.info)
     for name, plan in episode.rows.cameras.items():
         if not plan.kept and (problem := size_problem(video, plan.head.width, plan.head.height)):
             yield f"camera {name}: {problem}"
     if any(len(text) > MAX_SUBTASK or not text.isprintable() for text in episode.subtasks.values()):
-        yield f"a subtask is no single line of at most {MAX_SUBTASK} characters"
+        yield f"a subtask is not a single line of at most {MAX_SUBTASK} characters"
     table = episode.rows.table
     for stamps in (table.time_ns, *table.stamps.values(), *table.image_stamps.values()):
         if len(stamps) and not 0 <= stamps.min() <= stamps.max() <= MAX_STAMP_NS:
-            yield f"a message is of the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
+            yield f"a message has the time {stamps.min() / NS:.0f} s, allowed are 0 to {MAX_STAMP_NS // NS} s"
             return
 
 
 def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str) -> EpisodeReport:
-    """Of a window of a bag that begins at `zero_ns`, and the episode that comes of it, or why none does."""
+    """Report a window of a bag that begins at `zero_ns`, with its episode or the reason why it has none."""
     rows = None if episode is None else episode.rows
     begin_ns, end_ns = window.begin_ns, window.end_ns
     if rows:

@@ -1,6 +1,6 @@
-"""A ROS 1 bag without an index, read from its front as far as it goes, by the records that `rosbags` understands.
+"""Scan a ROS 1 bag without an index from its start as far as possible, with `rosbags`' record parsers.
 
-The format: http://wiki.ros.org/Bags/Format/2.0
+Format: http://wiki.ros.org/Bags/Format/2.0
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ _UNCOMPRESSED = "none"
 
 
 def scan_ros1(path: Path, report: Callable[[str], None]) -> Iterator[tuple[Connection, int, bytes]]:
-    """Read the messages of a bag in the order of the file: connection, time of recording and bytes of each.
+    """Read a bag's messages in file order: connection, log time and bytes of each.
 
     Args:
         path: The bag.
-        report: Called with the reason where the bag ends early or is damaged; nothing behind that place is read.
+        report: Called with the reason if the bag is truncated or damaged; nothing after that place is read.
     """
     reader = Reader(path)
     with open_regular(path) as file:
@@ -33,14 +33,14 @@ def scan_ros1(path: Path, report: Callable[[str], None]) -> Iterator[tuple[Conne
             yield from _records(file, reader, {}, report)
         except MemoryError:
             raise
-        except Exception as error:  # decompressors have errors of their own
+        except Exception as error:  # decompressors raise their own errors
             report(f"it is damaged or cut off ({describe_error(error).rstrip('.')})")
 
 
 def _records(
     file: BinaryIO, reader: Reader, connections: dict[int, Connection], report: Callable[[str], None]
 ) -> Iterator[tuple[Connection, int, bytes]]:
-    """Read the records of a file, or of a chunk in memory; ReaderError where one is not whole."""
+    """Read the records of a file, or of a chunk in memory; ReaderError if one is incomplete."""
     while True:
         place = file.tell()
         if not file.read(1):

@@ -1,4 +1,6 @@
-"""The rows of an episode: what each takes from every stream, how old that is, and why there can be no episode."""
+"""Rows of an episode: the data that each takes from every stream, its age, and the reason if there can be no
+episode.
+"""
 
 from __future__ import annotations
 
@@ -27,20 +29,21 @@ from demorec.extensions.imports.mapping import ROWS, SourceMapping
 from demorec.extensions.imports.streams import BagStreams, Key
 
 RATE = 0.05
-"""By which the rate of images that rows follow may differ from fps: as far as the check `rate` takes it for that of the
-episode. Where fps is the rate rounded, half an image a second is more."""
+"""Maximum relative difference between fps and the rate of images that rows follow, the limit of the check `rate`. If
+fps is the rounded rate, half an image per second may be more.
+"""
 _SAME_COUNT = 2
-"""Images that cameras of one rate differ by: one more or less at each end of an episode."""
+"""Maximum difference in image counts between cameras of one rate: one at each end of an episode."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Window:
-    """Where an episode is in its bag.
+    """Interval of an episode in its bag.
 
     Attributes:
-        begin_ns, end_ns: Its first and last moment, by the mapping's clock.
-        success: How it ended; None where the bag does not say.
-        discarded: The marker that says that it is no episode; "" for those that are.
+        begin_ns, end_ns: First and last moment, by the mapping's clock.
+        success: Outcome; None if the bag does not record it.
+        discarded: Marker that discards it; "" for others.
     """
 
     begin_ns: int
@@ -51,13 +54,13 @@ class Window:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TakenImages:
-    """Images that an episode takes of a camera.
+    """Images that an episode takes from a camera.
 
     Attributes:
         topic: Topic of the messages.
         head: Head of the first image.
-        kept: Codec whose packets stay as they are, or encoding of distances; "" for pixels, which are encoded once.
-        taken: (P,) number of each image's message in its topic, in the order of their times.
+        kept: Codec of passthrough packets, or encoding of depth; "" for pixels, which are encoded once.
+        taken: (P,) index of each image's message in its topic, sorted by time.
     """
 
     topic: str
@@ -66,7 +69,7 @@ class TakenImages:
     taken: Int
 
     def described(self, shown: Int) -> str:
-        """Describe in words what becomes of the images, of which the rows show those of (R,) these numbers."""
+        """Describe the treatment of the images, of which rows show those with these numbers (R,)."""
         num_shown = len(np.unique(shown))
         what = f"{len(self.taken)} images {self.head.width}x{self.head.height}, "
         kind = self.head.encoding if self.head.format == "raw" else self.head.format
@@ -82,10 +85,10 @@ class EpisodeRows:
     """An episode before its images are read.
 
     Attributes:
-        window: Where it is in the bag.
-        table: Its rows, by the mapping's clock; a feature is as old as the oldest of its sources.
+        window: Its interval in the bag.
+        table: Its rows, by the mapping's clock; a feature has the age of its oldest source.
         cameras: Name -> its images.
-        follows: Stream whose messages have a row each ("camera front"); "" for a grid.
+        follows: Stream with one row per message ("camera front"); "" for a grid.
     """
 
     window: Window
@@ -95,7 +98,7 @@ class EpisodeRows:
 
 
 class NoRowsError(BagError):
-    """An episode would hold what is missing or too old; `str` says what."""
+    """An episode would have missing or outdated data; `str` is the reason."""
 
 
 class Timelines:
@@ -110,17 +113,19 @@ class Timelines:
         self.streams, self.mapping = streams, mapping
         self.lines = {key: timeline(stream, mapping.clock) for key, stream in streams.all.items()}
         if empty := [line for line in self.lines.values() if not len(line.times_ns)]:
-            raise BagError(f"No message of {empty[0].label} has a time at which it could be used")
+            raise BagError(f"No message of {empty[0].label} has a usable time")
 
     def sources(self, feature: str) -> list[Timeline]:
-        """The timelines of a feature's sources; for a source that is another feature's next row, those of that one."""
+        """Timelines of a feature's sources; for a source that is another feature's next row, the timelines of that
+        feature.
+        """
         found: list[Timeline] = []
         for index, source in enumerate(self.mapping.features[feature]):
             found += self.sources(source.next) if source.next else [self.lines[feature, index]]
         return found
 
     def rows(self, window: Window) -> EpisodeRows:
-        """The rows of an episode; NoRowsError where a stream has nothing fit for them."""
+        """Rows of an episode; NoRowsError if a stream has no usable data for them."""
         begin, end = self._extent(window)
         times, follows = self._times(window, begin, end)
         if len(times) < 2:
@@ -149,10 +154,9 @@ class Timelines:
         )
 
     def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> tuple[Numbers, Int]:
-        """Return the first `count` rows (R, D) of a feature and their stamps.
+        """Return the first `count` rows (R, D) of a feature and their timestamps.
 
-        They are float32 where all sources are, otherwise float64. A source that is a feature's next row is taken one
-        row later.
+        float32 if all sources are, otherwise float64. A source that is a feature's next row is sampled one row later.
         """
         values, ages = [], []
         for index, source in enumerate(self.mapping.features[name]):
@@ -162,12 +166,12 @@ class Timelines:
             keys: list[Key] = [(source.next, number) for number in range(len(followed_sources))] or [(name, index)]
             for key in keys:
                 values.append(self.lines[key].sampled(chosen[key])[part])
-                # The age of a next row counts from the row that has it, and so is below 0.
+                # The age of a next row is relative to the row that contains it, and thus negative.
                 ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
         return np.concatenate(values, axis=1), times[:count] - np.max(np.stack(ages), axis=0)
 
     def _extent(self, window: Window) -> tuple[int, int]:
-        """From where on and until when all streams have something, within a window."""
+        """Interval within a window in which all streams have data."""
         max_trim_s, lines = self.mapping.clock.max_trim_s, list(self.lines.values())
         begins, ends = [_first(line, window) for line in lines], [_last(line, window) for line in lines]
         begin, last = max(begins), max(int(line.times_ns[-1]) for line in lines)
@@ -183,25 +187,25 @@ class Timelines:
         return begin, end
 
     def _times(self, window: Window, begin: int, end: int) -> tuple[Int, str]:
-        """(R,) of the rows, and what they follow."""
+        """(R,) row times, and the stream that they follow."""
         clock = self.mapping.clock
         if clock.rows not in ROWS:
             line = next((line for line in self.lines.values() if line.stream.topic == clock.rows), None)
             if line is None:
-                raise BagError(f"clock.rows is {clock.rows!r}, of which the mapping takes no feature or camera")
+                raise BagError(f"clock.rows is {clock.rows!r}, from which the mapping takes no feature or camera")
             return line.within(begin, end), line.stream.label
         if clock.rows == "camera" and (cameras := self._cameras_at_fps(begin, end)):
             return self._followed(cameras, window, begin, end), f"camera {cameras[0]}"
-        # Of what comes more often than rows some is in none of them, wherever these are. (The median period of a
-        # stream that jitters is off by a few hundredths.)
+        # A stream faster than the rows has skipped messages for any choice of rows. (The median period of a
+        # stream with jitter has an error of a few hundredths.)
         slow = [line for line in self.lines.values() if line.is_regular and line.period_ns * clock.fps > 0.9 * NS]
         return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
-        """Cameras that give an image for each row; the one that rows follow first.
+        """Cameras with an image for each row; the one that rows follow is first.
 
-        That is the one with the fewest images: of those that have about as few, the first of the mapping, so that it is
-        the same in all episodes. A camera of distances is followed only where there is no other.
+        It is the one with the fewest images; among those with nearly as few, the first of the mapping, so that it is
+        the same in all episodes. A depth camera is followed only without others.
         """
         fps = self.mapping.clock.fps
         counts: dict[str, int] = {}
@@ -217,9 +221,9 @@ class Timelines:
         return [lead, *(name for name in counts if name != lead)] if lead else []
 
     def _followed(self, cameras: list[str], window: Window, begin: int, end: int) -> Int:
-        """A row for each image of the first of some cameras, so that those of the others are shown as well."""
+        """One row for each image of the first camera, placed so that the others' images are also shown."""
         line = self.lines[cameras[0]]
-        # The image that was there shortly before another stream began is shown as soon as that has something.
+        # An image from shortly before another stream's start is used as soon as that stream has data.
         first = max(window.begin_ns, begin - line.period_ns // 2)
         lead = np.unique(np.maximum(line.within(first, end), begin))
         are_latest = all(self.lines[name].sample == "latest" for name in cameras)
@@ -228,7 +232,7 @@ class Timelines:
 
 
 def _first(line: Timeline, window: Window) -> int:
-    """From when on a stream has something in a window: at once if what came before is still fit to be used."""
+    """Time from which a stream has data in a window: the window's start if the preceding message is still usable."""
     before = int(np.searchsorted(line.times_ns, window.begin_ns, side="right")) - 1
     if before >= 0 and window.begin_ns - int(line.times_ns[before]) <= line.max_age_ns:
         return window.begin_ns
@@ -236,7 +240,7 @@ def _first(line: Timeline, window: Window) -> int:
 
 
 def _last(line: Timeline, window: Window) -> int:
-    """Until when it has: what its last message says holds until the next would have come."""
+    """Time until which a stream has data: its last message is valid until the next would have arrived."""
     last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
     age = 0 if line.sample == "linear" else line.max_age_ns
     if line.is_regular:
@@ -245,7 +249,7 @@ def _last(line: Timeline, window: Window) -> int:
 
 
 def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
-    """Why what the rows take is missing or too old; "" when it is not."""
+    """Reason why the rows' data is missing or too old; "" if it is not."""
     ages = chosen.reach_ns
     bad = np.flatnonzero((ages > line.max_age_ns) | (chosen.index < 0))
     if not len(bad):
@@ -259,7 +263,7 @@ def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
 
 
 def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
-    """Why what the rows take cannot be recorded; "" when it can."""
+    """Reason why the rows' data cannot be recorded; "" if it can."""
     stream = line.stream
     if stream.names:
         used = stream.values[line.order[chosen.index]]
@@ -269,7 +273,7 @@ def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
         bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
         if len(bad):
             at = (times[bad[0]] - times[0]) / NS
-            return f"{line.label} holds no finite number at {len(bad)} rows, from {at:.2f} s on"
+            return f"{line.label} has numbers that are not finite at {len(bad)} rows, from {at:.2f} s on"
         return ""
     first, last = int(chosen.index.min()), int(chosen.index.max())
     heads = stream.heads.kinds(line.order[first : last + 1])
@@ -281,7 +285,9 @@ def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
 
 
 def _taken(line: Timeline, shown: Int) -> Int:
-    """Return which images of its timeline a camera needs to show these (R,): of video, from the keyframe before on."""
+    """Indices of the images in its timeline that a camera needs to show these (R,): for video, from the preceding
+    keyframe.
+    """
     taken = np.unique(shown)
     if line.stream.heads[int(line.order[shown[0]])].format not in VIDEO_FORMATS:
         return taken
@@ -292,7 +298,7 @@ def _taken(line: Timeline, shown: Int) -> Int:
 
 
 def _camera(line: Timeline, taken: Int) -> TakenImages:
-    """Describe the images of its timeline that an episode takes of a camera."""
+    """Describe the images of a camera that an episode takes from its timeline."""
     head = line.stream.heads[int(line.order[taken[0]])]
     kept = head.encoding if head.encoding in DEPTH_UNITS else head.format if head.format in KEPT_FORMATS else ""
     numbers = np.asarray(line.stream.places)[line.order[taken]]

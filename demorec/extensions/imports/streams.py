@@ -1,7 +1,7 @@
-"""A bag's streams: when each message of the mapping's topics was, and the numbers of those that hold any.
+"""A bag's streams: the times of each message in the mapping's topics, and the numbers in them.
 
-Numbers stay in memory, some hundred bytes a message; of images only what is needed to choose among them does. They
-are read from the bag once more when their rows are written.
+Numbers stay in memory, some hundred bytes per message; for images only the data for choosing among them. The bag is
+read again for the images when the rows are written.
 """
 
 from __future__ import annotations
@@ -46,29 +46,29 @@ _MAX_TEXT = 10_000
 _MAX_URDF = 4 << 20
 _SHOWN_JOINTS = 40
 _INFO_FIELDS = ("width", "height", "k", "K", "d", "D")
-"""Of a camera's calibration that are asked for."""
+"""Fields of a camera's calibration that are read."""
 
 
 @dataclass(kw_only=True, eq=False)
 class Stream:
-    """The messages of one source or camera, in the order in which the bag has them; it grows while they are read.
+    """Messages of one source or camera, in the bag's order; it grows while they are read.
 
     Attributes:
-        label: Which it is: "observation.state" or "camera front".
-        part: What the mapping says of it.
-        type: Of its messages.
-        reader: Of a source's numbers, since its first message.
-        logged, stamped: `log_ns` and `header_ns` as they grow.
-        places: Which of the topic's messages each is, from 0; empty for others than cameras.
-        vectors: Of the source, in its unit, behind each other: an array for each of a million messages takes three
-            times as much memory, and leaves holes.
-        dtype: Of these.
-        heads: (N,) what is known of each image; empty for others.
+        label: Name: "observation.state" or "camera front".
+        part: Its entry in the mapping.
+        type: Type of its messages.
+        reader: Reader of a source's numbers, set by its first message.
+        logged, stamped: Growing `log_ns` and `header_ns`.
+        places: Index of each message within its topic, from 0; empty except for cameras.
+        vectors: Concatenated vectors of the source, in its unit: a separate array per message would take three times as
+        much memory for a million messages, and fragment it.
+        dtype: Type of the vectors.
+        heads: (N,) head of each image; empty except for cameras.
         sums: CRC-32 of each message's bytes.
-        image_sums: CRC-32 of each image's bytes; empty for others.
-        num_malformed: Messages that cannot be read or lack something.
-        first_problem: What is wrong with the first of them.
-        first_refusal: Why the first message was left to another publisher.
+        image_sums: CRC-32 of each image's bytes; empty except for cameras.
+        num_malformed: Number of messages that cannot be read or are incomplete.
+        first_problem: Problem of the first of them.
+        first_refusal: Reason why the first message was left to another publisher.
     """
 
     label: str
@@ -88,7 +88,7 @@ class Stream:
     first_refusal: str = ""
 
     def add(self, number: int, message: ScannedMessage, values: Values, checksum: int) -> None:
-        """Take one message."""
+        """Add one message."""
         self.type = self.type or message.channel.type
         try:
             if isinstance(self.part, Source):
@@ -96,7 +96,7 @@ class Stream:
                 self._add_vector(self.reader.read(values))
             else:
                 head, image_sum = image_head(values), zlib.crc32(image_bytes(values))
-                self.heads.append(head)  # both or neither
+                self.heads.append(head)  # add both or neither
                 self.image_sums.append(image_sum)
                 self.places.append(number)
         except OtherPublisherError as error:
@@ -128,47 +128,47 @@ class Stream:
 
     @property
     def topic(self) -> str:
-        """Of its messages."""
+        """Topic of its messages."""
         return self.part.topic
 
     @property
     def log_ns(self) -> NDArray[np.int64]:
-        """(N,) when each was recorded."""
+        """(N,) log time of each."""
         return np.asarray(self.logged)
 
     @property
     def header_ns(self) -> NDArray[np.int64]:
-        """(N,) the time in each header, or NO_STAMP."""
+        """(N,) header time of each, or NO_STAMP."""
         return np.asarray(self.stamped)
 
     @property
     def names(self) -> tuple[str, ...]:
-        """(D,) of the elements of a source, since its first message; none of cameras."""
+        """(D,) names of a source's elements, set by its first message; empty for cameras."""
         return self.reader.names if self.reader else ()
 
     @property
     def quaternions(self) -> tuple[int, ...]:
-        """First element of each x, y, z, w among them."""
+        """First element of each x, y, z, w group."""
         return self.reader.quaternions if self.reader else ()
 
     @property
     def unit(self) -> Unit:
-        """Of the feature; "" for cameras."""
+        """Unit of the feature; "" for cameras."""
         return (self.part.to or self.part.unit) if isinstance(self.part, Source) else ""
 
     @cached_property
     def values(self) -> NDArray[np.floating[Any]]:
-        """(N, D) in the unit of the feature, of the whole stream of a source."""
+        """(N, D) numbers of a source in the feature's unit."""
         assert isinstance(self.part, Source)
         return converted(self.part, np.frombuffer(self.vectors, self.dtype).reshape(len(self.logged), -1))
 
 
 class Text(NamedTuple):
-    """A text, number or boolean of a topic (task, marker, robot description), and when it was said.
+    """A text, number or boolean of a topic (task, marker, robot description), with its time.
 
     Attributes:
-        time_ns: Of its message, as the mapping's clock takes it.
-        is_header: Whether that is the time of a header.
+        time_ns: Time of its message by the mapping's clock.
+        is_header: Whether that is a header time.
     """
 
     time_ns: int
@@ -177,35 +177,35 @@ class Text(NamedTuple):
 
 
 def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
-    """The name of a feature, and the joints where several of its sources are of one topic."""
+    """Name of a feature, with the joints if several of its sources share a topic."""
     if not source.joints or sum(other.topic == source.topic for other in sources) == 1:
         return feature
     return f"{feature} ({', '.join(source.joints[:2])}{', ...' if len(source.joints) > 2 else ''})"
 
 
 def _unnamed_joints(stream: Stream, reader: SourceReader) -> str:
-    """What to write where a source takes whatever its topic names, and that is not the same in all messages."""
+    """Advice for a source that takes all joints of its topic although they differ between messages."""
     lists = " and one with ".join(
         f"joints = [{', '.join(map(quoted, joints[:_SHOWN_JOINTS]))}{', ...' if len(joints) > _SHOWN_JOINTS else ''}]"
         for joints in (reader.joints, list(reader.others))
     )
     return (
-        f"{stream.label} takes all joints of {stream.topic}, whose messages do not name the same ones, as those of two "
+        f"{stream.label} takes all joints of {stream.topic}, whose messages name different ones, as from two "
         f"publishers: write a source with {lists}, or leave the latter out"
     )
 
 
 class BagStreams:
-    """All that a mapping takes from a bag.
+    """All data that a mapping takes from a bag.
 
     Args:
-        mapping: Of the bag.
+        mapping: Mapping of the bag.
 
     Attributes:
         all: Key -> stream, the sources of features before cameras.
-        infos: Name of a camera -> its first calibration message.
+        infos: Camera name -> its first calibration message.
         texts: Topic -> its texts.
-        problems: Why parts of the bag could not be read.
+        problems: Reasons why parts of the bag could not be read.
     """
 
     def __init__(self, mapping: SourceMapping) -> None:
@@ -238,7 +238,7 @@ class BagStreams:
         self._refused: dict[str, str] = {}
 
     def add(self, message: ScannedMessage) -> None:
-        """Take a message."""
+        """Add a message."""
         topic = message.channel.topic
         number = self._counts.get(topic, 0)
         self._counts[topic] = number + 1
@@ -274,24 +274,24 @@ class BagStreams:
             return
         value = value.item() if isinstance(value, np.generic) else value
         if not isinstance(value, str | bool | int | float):
-            self._refused[topic] = f"the field {self._fields[topic]!r} is no text, number or boolean"
+            self._refused[topic] = f"the field {self._fields[topic]!r} is not a text, number or boolean"
             return
         limit = _MAX_URDF if topic == self._mapping.robot.urdf_topic else _MAX_TEXT
         if isinstance(value, str) and len(value) > limit:
-            self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are read"
+            self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are supported"
             return
         stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
         self.texts[topic].append(Text(message.log_ns if stamp is None else stamp, value, stamp is not None))
 
     def check(self, bag: Bag) -> None:
-        """Raise BagError for all that the mapping names and the bag lacks."""
+        """Raise BagError with everything that the mapping names and the bag lacks."""
         problems = []
         if not self._counts:
             unread = f" ({self.problems[0]})" if self.problems else ""
             raise BagError(f"The bag holds no messages{unread}: {bag.path}")
         for topic in sorted(self._wanted):
             if topic not in self._counts:
-                problems.append(f"there is no message of {topic!r}.{nearest_match(topic, self._counts)}".rstrip("."))
+                problems.append(f"no message of {topic!r}.{nearest_match(topic, self._counts)}".rstrip("."))
             elif topic in self._refused:
                 problems.append(f"{topic} cannot be read, since {self._refused[topic]}")
             elif len(self._types[topic]) > 1:
@@ -323,17 +323,17 @@ class BagStreams:
                 if (feature, label) in seen:
                     yield (
                         f"{feature} gets {label!r} from {seen[feature, label]} and from {stream.topic}: leave one out, "
-                        "or tell them apart by prefix or names"
+                        "or distinguish them by prefix or names"
                     )
                     break
                 seen[feature, label] = stream.topic
 
 
 def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:
-    """Read a bag from its front to its end.
+    """Read a whole bag.
 
     Raises:
-        BagError: The mapping does not fit the bag; one message tells all problems.
+        BagError: The mapping does not fit the bag; the message lists all problems.
     """
     streams = BagStreams(mapping)
     for message in bag.messages(streams.problems):

@@ -1,4 +1,4 @@
-"""A mapping suggested from what is in a bag: every topic is listed with its type, recognised ones are mapped."""
+"""Suggest a mapping from a bag's content: it lists every topic with its type and maps the recognised ones."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
 
 _MAX_DECODED = 64
-"""Messages of a topic that are decoded."""
+"""Maximum messages of a topic that are decoded."""
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
@@ -38,17 +38,17 @@ _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 
 @dataclass(kw_only=True, eq=False)
 class _Topic(TopicSummary):
-    """Contents of a topic.
+    """Content of a topic.
 
     Attributes:
-        first: First message; None where none can be read.
-        head: Head of its first image; None where its messages are no images.
-        candidates: Numbers in it that a feature may take.
-        publishers: Names of joints in its messages, each list once.
+        first: First message; None if none can be read.
+        head: Head of its first image; None if its messages are not images.
+        candidates: Numbers in it that may belong to a feature.
+        publishers: Joint names in its messages, each list once.
         stamps_ns: Header times of the decoded messages.
         has_stamp: Whether headers have a time.
-        skew_ns: By how much the first was recorded after the time of its header.
-        problem: Why no message can be read; "" otherwise.
+        skew_ns: Log time minus header time of the first message.
+        problem: Reason why no message can be read; "" otherwise.
     """
 
     name: str
@@ -67,7 +67,7 @@ class _Topic(TopicSummary):
         return self.first is not None and self.head is None and isinstance(self.first.get("data"), str)
 
     def rate_by(self, stamp: str) -> float:
-        """Rate by the times that rows follow; simulated time is slower, or faster, than that of recording."""
+        """Rate by the times that rows use; simulated time runs slower or faster than log time."""
         if stamp == "log" or not self.has_stamp or len(self.stamps_ns) < 3:
             return self.rate_hz
         steps = np.diff(np.unique(self.stamps_ns))
@@ -76,15 +76,15 @@ class _Topic(TopicSummary):
 
 
 def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
-    """The lines of a mapping for a bag, with what is in it as comments.
+    """Return the lines of a mapping for a bag, with comments about its content.
 
     Args:
-        path: The bag, or a folder of bags, of which the first is looked at.
-        tell: Called with what the user has to decide before the mapping can be used.
+        path: The bag, or a folder of bags, of which the first is used.
+        tell: Called with each decision that the user must make before using the mapping.
 
     Raises:
-        ConfigError: There is no bag.
-        BagError: It cannot be read, or holds no messages.
+        ConfigError: The path holds no bag.
+        BagError: It cannot be read, or has no messages.
     """
     path = bags_in(path)[0]
     bag = open_bag(path)
@@ -113,7 +113,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += _listed(topics)
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
     models = (name for name in topics if name.endswith("robot_description"))
-    model = min(models, key=lambda name: (name.count("/"), name), default="")  # those below may be of objects
+    model = min(models, key=lambda name: (name.count("/"), name), default="")  # nested ones may belong to objects
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
@@ -128,7 +128,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
 
 
 def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
-    """Look through a bag."""
+    """Read the topics of a bag."""
     topics: dict[str, _Topic] = {}
     decoder = BagDecoder()
     for message in bag.messages(problems):
@@ -149,7 +149,7 @@ def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> N
     except (ValueError, RecursionError, OverflowError, TypeError):
         return
     stamp = stamp_of(values)
-    topic.has_stamp = bool(stamp or topic.stamps_ns)  # simulated time begins with 0, which looks like none
+    topic.has_stamp = bool(stamp or topic.stamps_ns)  # simulated time begins with 0, which looks like a missing time
     if stamp and 0 < stamp < 2**63:
         topic.skew_ns = topic.skew_ns or message.log_ns - stamp
         topic.stamps_ns.append(stamp)
@@ -166,7 +166,7 @@ def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> N
 
 
 def _names(candidate: Candidate, values: Values) -> tuple[str, ...]:
-    """Names of the joints in a message; () where it has none, or not one for each number."""
+    """Joint names in a message; () if it has none, or not one per number."""
     steps = candidate.reader.names_steps
     if steps is None:
         return ()
@@ -179,7 +179,7 @@ def _names(candidate: Candidate, values: Values) -> tuple[str, ...]:
 
 
 def _head(values: Values) -> ImageHead | None:
-    """The head of an image; None for a message that holds none, NoColorError for one that is no picture."""
+    """Head of an image; None for a message without one, NoColorError for an image without colour."""
     try:
         return image_head(values)
     except NoColorError:
@@ -189,7 +189,7 @@ def _head(values: Values) -> ImageHead | None:
 
 
 def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """Every topic with its type, rate, count and first values."""
+    """Yield lines for every topic with its type, rate, count and first values."""
     yield "# What is in it:"
     for name, topic in sorted(topics.items()):
         rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
@@ -215,12 +215,12 @@ def _short(value: Any) -> str:
 
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
-    """Name of each camera -> topic: of several topics of the same one, the encoded one."""
+    """Camera name -> topic; among several topics of one camera, the encoded one."""
     heads = {name: head for name, topic in sorted(topics.items()) if (head := topic.head) is not None}
     cameras: dict[str, str] = {}
     for name, head in heads.items():
         if any(other != name and other.startswith(f"{name}/") for other in heads):
-            continue  # image_raw beside image_raw/compressed: the same images
+            continue  # image_raw next to image_raw/compressed: the same images
         is_depth = head.encoding in DEPTH_UNITS
         ignored = _STOP_WORDS | _DEPTH_WORDS if is_depth else _STOP_WORDS
         words = [word for word in _CAMERA_WORD.split(name.lower()) if word and word not in ignored]
@@ -244,7 +244,7 @@ def _task_topics(topics: Mapping[str, _Topic]) -> list[str]:
 
 
 def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """Texts that may say what the robot does."""
+    """Texts that may describe the robot's current subtask."""
     others = {*_task_topics(topics)[:1], *(name for name in topics if name.endswith("robot_description"))}
     for name in (name for name in sorted(topics) if name not in others and topics[name].is_text):
         yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts say what the robot does")
@@ -253,7 +253,7 @@ def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
 def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[Candidate]) -> list[str]:
     mapped = {*cameras.values(), *(part.topic for part in parts)}
     skews = [topics[name].skew_ns for name in mapped if topics[name].has_stamp]
-    # One clock for all where that of the headers is far from that of recording, which some topics have alone.
+    # One clock for all if header times are far from log times and some topics have only the latter.
     is_mixed = 0 < len(skews) < len(mapped) and abs(float(np.median(skews))) > SKEW_S * NS
     stamp = "log" if is_mixed or not skews else "header"
     rates = {topic: topics[topic].rate_by(stamp) for topic in cameras.values() if topics[topic].rate_hz}
@@ -284,7 +284,7 @@ def _features(choice: Choice, topics: Mapping[str, _Topic]) -> Iterator[str]:
 
 
 def _chosen(feature: str, parts: Sequence[Candidate], topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """The sources of a feature; where names clash, with prefixes of the words by which their topics differ."""
+    """Sources of a feature; if names clash, with prefixes from the words that distinguish their topics."""
     for number, part in enumerate(parts, 1):
         rivals = [other for other in parts if other is not part and {*part.labels} & {*other.labels}]
         own = [word for word in part.words if not all(word in rival.words for rival in rivals)]

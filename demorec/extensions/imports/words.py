@@ -1,4 +1,4 @@
-"""Words of mappings: the task that a file's name tells, names that are not taken yet, texts as TOML."""
+"""Words of mappings: the task in a file's name, unique names, and texts in TOML."""
 
 from __future__ import annotations
 
@@ -9,40 +9,40 @@ from typing import Any
 from numpy.typing import NDArray
 
 SHOWN = 4
-"""Of the numbers or fields of a value, in a comment."""
+"""Maximum numbers or fields of a value shown in a comment."""
 
 _NUMBER = re.compile(r"[_\-. \d]*\d$")
-"""Of an episode or a day. Names are foreign: a repetition within another would take exponential time."""
+"""Number of an episode or a day. Names are foreign: nested repetition would take exponential time."""
 
 
 def task_in_name(name: str) -> str:
-    """The task that a file's name tells: "stack the cups" of "stack_the_cups_003"."""
+    """Task in a file's name: "stack the cups" for "stack_the_cups_003"."""
     return _NUMBER.sub("", name).replace("_", " ").replace("-", " ").strip()
 
 
 def in_natural_order(name: str) -> list[tuple[int, str]]:
-    """What names are sorted by, so that run_2 comes before run_10."""
+    """Sort key for natural order, so that run_2 precedes run_10."""
     parts = re.findall(r"[0-9]+|[^0-9]+", name)
     numbers = [(len(digits := part.lstrip("0")), digits) if part[0] in "0123456789" else (-1, part) for part in parts]
     return [*numbers, (-1, name)]
 
 
 def unique_name(name: str, taken: Container[str]) -> str:
-    """The name, or one like it where it is taken."""
+    """Return the name, or a similar one if it is taken."""
     while name in taken:
         name += "_2"
     return name
 
 
 def first_numbers(numbers: NDArray[Any]) -> str:
-    """The first few of (N,), for a comment."""
+    """Format the first few of (N,), for a comment."""
     more = ", ..." if len(numbers) > SHOWN else ""
     return f"[{', '.join(f'{number:.4g}' for number in numbers[:SHOWN].tolist())}{more}]"
 
 
 def quoted(text: str) -> str:
-    """A TOML string that has no character which a terminal obeys, whatever the text; surrogates, which TOML cannot
-    hold, become U+FFFD.
+    """Quote text as a TOML string without characters that a terminal obeys; surrogates, which TOML cannot hold, become
+    U+FFFD.
     """
     return f'"{"".join(map(_in_toml, text))}"'
 
