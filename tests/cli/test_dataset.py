@@ -99,10 +99,10 @@ def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.Capture
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("select", "--where", "success"), "There are: episode_index, num_frames, "),
+        (("select", "--where", "success"), "Allowed: episode_index, num_frames, "),
         (("select", "--where", "num_frames = 8"), "compare by == "),
-        (("select", "--where", 'task == "push it" or "pull it"'), "'pull it' alone is none"),
-        (("select", "--where", "episode_index in 1, 2"), "alone is none"),
+        (("select", "--where", 'task == "push it" or "pull it"'), "'pull it' alone is not one"),
+        (("select", "--where", "episode_index in 1, 2"), "alone is not one"),
         (("select", "more", "--episodes", "1"), "more"),
         (("trim", "--head", "5", "--tail", "3"), "drop them first: 0,1,2,3,4"),
         (("trim", "--idle", "--idle-feature", "state"), "Allowed: observation.state, action."),

@@ -65,7 +65,7 @@ def test_attempts_boxes_and_poses_follow_their_episodes(
     assert "failed attempts" not in capsys.readouterr().out
     edit("select", tmp_path / "r", "--episodes", "0,2", "--out", tmp_path / "s")
     told = capsys.readouterr().out
-    assert "Not taken over: failed attempts: 1 (at episodes that are not in the result)" in told
+    assert "Left out: failed attempts: 1 (at episodes that are not in the result)" in told
     edit("trim", tmp_path / "s", "--head", 3, "--tail", 2, "--out", tmp_path / "t")
     before, origin = boxes(simulated), {0: 2, 1: 1}  # episode of s -> of the first
     assert any(before.values())

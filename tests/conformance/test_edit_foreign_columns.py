@@ -99,7 +99,7 @@ def test_columns_that_may_be_references_are_refused_where_numbers_change(
         episodes.append_column("tasks", pa.array([[TEXTS[::-1][n]] for n in (4, 0, 1, 0)])), second / EPISODES
     )
     assert exit_code("dataset", "merge", first, second, "--out", tmp_path / "new") == 2
-    assert "subtask_id may hold numbers of tasks" in capsys.readouterr().err
+    assert "subtask_id may hold task numbers" in capsys.readouterr().err
     assert not (tmp_path / "new").exists()
 
 
@@ -285,6 +285,6 @@ def test_what_an_edit_leaves_out_is_named(tmp_path: Path, capsys: pytest.Capture
     shutil.copy(source / "data/chunk-000/episode_000001.parquet", source / "data/chunk-000/episode_000009.parquet")
     assert exit_code("dataset", "shuffle", source, "--out", tmp_path / "new") == 0
     printed = capsys.readouterr().out
-    assert "Not taken over: is_pad (meta/info.json does not list this column of the data files)" in printed
+    assert "Left out: is_pad (meta/info.json does not list this column of the data files)" in printed
     assert "data/chunk-000/episode_000009.parquet (no episode of the dataset is in this file)" in printed
-    assert "Copied, but not understood: extra/deep/calibration.bin, meta/notes of ours.txt." in printed
+    assert "Copied, but unknown: extra/deep/calibration.bin, meta/notes of ours.txt." in printed

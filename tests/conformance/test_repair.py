@@ -288,11 +288,11 @@ def three_rates(root: Path) -> None:
 
 REFUSED: dict[str, tuple[Damage, str]] = {
     "rows missing between others": (lost_rows, "comes after"),
-    "no instruction": (no_text, "instruction of episode 0 is not known"),
+    "no instruction": (no_text, "instruction of episode 0 is unknown"),
     "fewer images than rows": (short_video, "25 images for 26 rows"),
     "no info.json": (lambda root: (root / "meta/info.json").write_text("{"), "info.json"),
     "no videos": (lambda root: shutil.rmtree(root / "videos"), "restore its videos"),
-    "a rate that nothing agrees on": (three_rates, "rate is not known"),
+    "a rate that nothing agrees on": (three_rates, "rate is ambiguous"),
 }  # fmt: skip
 
 

@@ -1,1 +1,1 @@
-"""Editing of LeRobot datasets, whoever wrote them: what is to be kept is planned first, then written in one pass."""
+"""Edit LeRobot datasets from any writer: an edit is planned first, then written in one pass."""

@@ -1,7 +1,7 @@
-"""What stands beside the tables of an edited dataset, and what of its sources it will not have.
+"""Files beside an edited dataset's tables, and the data of its sources that it omits.
 
-Beside stand the sidecar's rows, robots, attempts, poses of cameras, boxes and progress. What is left out is known
-before anything is written.
+These are the sidecar's rows, robots, attempts, camera poses, boxes and progress. Omissions are known before anything is
+written.
 """
 
 from __future__ import annotations
@@ -27,19 +27,19 @@ from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISO
 from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
-"""What describes a simulated episode as it was recorded, and no longer holds for one that was cut."""
+"""Columns that describe a simulated episode as recorded, and do not apply to a cut one."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
 _ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
-"""Files that are copied from a single source."""
+"""Files that are copied if there is only one source."""
 _OF_OTHER_TOOLS = (".cache/", ".git/")
-"""Folders that belong to the download of a dataset."""
+"""Folders created by downloading a dataset."""
 MAX_NAMES = 5
-"""Files that are named of one kind."""
+"""Maximum files listed of one kind."""
 
 
 def _moving_cameras(source: LeRobotFolder) -> tuple[str, ...] | None:
-    """Cameras of whose every frame the pose is kept; None where the files do not agree."""
+    """Cameras with a pose for every frame; None if the files contradict each other."""
     names = [open_table(path).schema_arrow.names for path in source.sidecar_tables("camera_poses")]
     if any(each != names[0] for each in names):
         return None
@@ -47,13 +47,13 @@ def _moving_cameras(source: LeRobotFolder) -> tuple[str, ...] | None:
 
 
 def _poses_are_kept(plan: Plan) -> bool:
-    """Whether all sources with moving cameras have the same."""
+    """Whether all sources with moving cameras have the same ones."""
     found = {_moving_cameras(source) for source in plan.sources} - {()}
     return len(found) <= 1 and None not in found
 
 
 def _has_stages(plan: Plan) -> bool:
-    """Whether progress is computed anew, from the stages that demorec wrote."""
+    """Whether progress is recomputed from demorec's stages."""
     needed = {*STAGE_COLUMNS, "num_goals"}
     return all(source.sidecar_tables("episodes") and needed <= set(source.fact_types) for source in plan.sources)
 
@@ -70,7 +70,7 @@ def _progress_is_kept(plan: Plan) -> bool:
 
 
 def write_kept_progress(plan: Plan, folder: Path) -> None:
-    """Write the progress of the new dataset's rows: from stages, else as the sources have it of each frame."""
+    """Write the progress of the new dataset's rows: from stages, otherwise from the sources' frames."""
     if not _progress_is_kept(plan):
         return
     if _has_stages(plan):
@@ -90,7 +90,7 @@ def write_kept_progress(plan: Plan, folder: Path) -> None:
 
 
 def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:
-    """Rows of a cut with their numbers in the new dataset, in which `index` is that of its first frame."""
+    """Rows of a cut with their numbers in the new dataset; `index` is its first frame's."""
     frames = rows.column("frame_index").to_numpy() - cut.first
     counted = {"index": frames + index, "episode_index": np.full(len(frames), episode), "frame_index": frames}
     for name, values in counted.items():
@@ -100,11 +100,11 @@ def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.
 
 
 class SidecarReader:
-    """What stands beside the tables of one source, for the episodes of a plan.
+    """Files beside one source's tables, for the episodes of a plan.
 
     Args:
         plan: The new dataset.
-        number: Number of the source in it.
+        number: Index of the source.
 
     Methods raise ExportError if the files cannot be read.
     """
@@ -137,7 +137,7 @@ class SidecarReader:
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
         attempt = source.attempts.own.get(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
-        if not cut.has_end:  # a part of which nobody said whether it succeeded
+        if not cut.has_end:  # an outcome is unknown for a part of an episode
             row["success"] = None
             attempt = {**attempt, "success": None}
         failed = () if index in self._begun else source.attempts.failed.get(index, ())
@@ -173,13 +173,13 @@ def kept_configs(plan: Plan) -> dict[str, Any] | None:
 
 
 def kept_export(plan: Plan) -> Mapping[str, Any]:
-    """Return how the first source that says it was exported; empty if none does."""
+    """Return the export options recorded by the first source that has any; empty if none has."""
     found = next((s.root for s in plan.sources if (s.root / EXPORT_PATH).exists()), None)
     return dict(read_json(found / EXPORT_PATH)) if found else {}
 
 
 def _reworded(info: str, task: str, root: Path) -> str:
-    """The description of a simulated episode with another instruction."""
+    """Description of a simulated episode with another instruction."""
     try:
         described = parse_json(info)
         described["instruction"] = task
@@ -189,7 +189,7 @@ def _reworded(info: str, task: str, root: Path) -> str:
 
 
 def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any]]:
-    """Phases within a cut, frames counted from its first one."""
+    """Phases within a cut, with frames counted from its first one."""
     length = cut.last - cut.first
     return [
         {"name": phase["name"], "from": max(phase["from"] - cut.first, 0), "to": min(phase["to"] - cut.first, length)}
@@ -199,7 +199,7 @@ def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any
 
 
 def left_out(plan: Plan) -> tuple[str, ...]:
-    """One phrase each, with the reason in brackets; what the user chose to leave out is none."""
+    """One phrase for each omission with its reason in brackets, except the user's choices."""
     found: dict[str, set[str]] = {}
     for number, source in enumerate(plan.sources):
         for name, reason in _files(plan, number, source.root):
@@ -212,7 +212,7 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 
 def copied_files(plan: Plan) -> tuple[str, ...]:
-    """List the files that go along as they are: those about a whole dataset, and those that demorec does not know."""
+    """List the files that are copied unchanged: those about a whole dataset, and unknown ones."""
     if len(plan.sources) > 1:
         return ()
     root = plan.sources[0].root
@@ -221,9 +221,9 @@ def copied_files(plan: Plan) -> tuple[str, ...]:
 
 
 def unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
-    """List the files, links aside, that a dataset does not use and whose names do not say what they are.
+    """List the files, except links, that a dataset does not use and whose purpose is unknown from their names.
 
-    Tables among those of rows and episodes are left out: LeRobot would read a copy as part of the dataset.
+    Unused tables in the folders of rows and episodes are left out: LeRobot would read a copy as part of the dataset.
     """
     root, used = source.root, _used_files(source)
     strange = [name for name in _files_below(root) if not is_dataset_file(name) and root / name not in used]
@@ -235,7 +235,7 @@ def _is_stray_table(name: str) -> bool:
 
 
 def _used_files(source: LeRobotFolder) -> set[Path]:
-    """Find the files of rows and videos."""
+    """Files of rows and videos that are in use."""
     return {place.data for place in source.places} | {
         path for place in source.places for path, _ in place.videos.values()
     }
@@ -260,7 +260,7 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
         if name in copied or path in used:
             continue
         if not is_dataset_file(name):
-            yield name, "of a kind that demorec does not know: copy it if it still holds"
+            yield name, "unknown to demorec: copy it if it still applies"
         elif name.startswith(("data/", "videos/")):
             yield name, "no episode of the dataset is in this file"
         elif name in _ABOUT_THE_WHOLE and len(plan.sources) > 1:
@@ -268,7 +268,7 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
         elif name.startswith("images/"):
             yield name, "no row has it"
         elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
-            yield name, "other cameras move in the other datasets"
+            yield name, "the other datasets have other moving cameras"
         elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
             yield name, "its camera is left out"
         elif name == PROGRESS_PATH and not keeps_progress:
@@ -276,7 +276,7 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
         elif name.startswith("meta/temporal_proportions_") and not (
             name == PROPORTIONS_PATH and keeps_progress and _has_stages(plan)
         ):
-            yield name, "they are those of the source's episodes together"
+            yield name, "they describe all episodes of the source"
 
 
 def _scenes(plan: Plan) -> Iterator[str]:
@@ -287,13 +287,13 @@ def _scenes(plan: Plan) -> Iterator[str]:
         indices = {source.places[cut.episode].episode_index for cut in changed if cut.source == number}
         lost += len(indices & scenes)
     if lost:
-        yield f"scenes of simulated episodes: {lost} (they describe the episode as it was recorded)"
+        yield f"scenes of simulated episodes: {lost} (they describe the original episode)"
 
 
 def _descriptions(plan: Plan) -> Iterator[str]:
     spoken = any(feature.dtype == "language" for feature in plan.info.features.values())
     if spoken and (count := sum(bool(cut.task) for cut in plan.cuts)):
-        yield f"other wordings (task_aug) in episodes: {count} (they are wordings of the old instruction)"
+        yield f"other wordings (task_aug) in episodes: {count} (they reword the old instruction)"
 
 
 def _attempts(plan: Plan) -> Iterator[str]:
@@ -310,4 +310,4 @@ def _attempts(plan: Plan) -> Iterator[str]:
 def _facts(plan: Plan) -> Iterator[str]:
     names = {name for source in plan.sources if not source.info.is_old for name in source.info.other}
     if lost := sorted(names - set(plan.info.other)):
-        yield f"{', '.join(lost)} of info.json (the datasets differ in it)"
+        yield f"{', '.join(lost)} of info.json (the datasets differ)"

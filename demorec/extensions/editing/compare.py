@@ -1,4 +1,4 @@
-"""Two versions of one episode, compared row by row and image by image."""
+"""Row by row and image by image comparison of two versions of one episode."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ LEVELS: tuple[Level, ...] = ("info", "features", "tasks", "episodes", "rows", "i
 Folders = tuple[LeRobotFolder, LeRobotFolder]
 """Datasets A and B."""
 _WORST = 3
-"""Images that are named."""
+"""Maximum images listed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DiffEntry:
-    """One thing in which dataset B differs from dataset A.
+    """A difference between datasets A and B.
 
     Attributes:
-        level: Where it was found.
-        name: Of the field, feature or task.
-        text: What differs, in words.
-        episodes: Its numbers in A and in B, None where the episode is not in that dataset; None for no episode at all.
+        level: Level of the difference.
+        name: Name of the field, feature or task.
+        text: Description of the difference.
+        episodes: Numbers in A and in B, None if the episode is missing there; None if it concerns no episode.
         details: Values for programs.
     """
 
@@ -42,14 +42,14 @@ class DiffEntry:
 
     @property
     def line(self) -> str:
-        """All of it as a line of text."""
+        """The difference as a line of text."""
         if self.episodes is None or None in self.episodes:
             return f"{self.level}: {self.text}"
         a, b = self.episodes
         return f"{self.level}: episode {a}{'' if a == b else f' (in B {b})'}: {self.text}"
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data."""
+        """The difference as plain data."""
         a, b = self.episodes or (None, None)
         return {"level": self.level, "name": self.name, "episode_a": a, "episode_b": b, "text": self.text,
                 **self.details}  # fmt: skip
@@ -62,9 +62,9 @@ class EpisodeComparer:
         self._sources, self._readers, self._shared = sources, readers, shared
 
     def differences(self, a: int, b: int, images_equal: Mapping[str, bool]) -> Iterator[DiffEntry]:
-        """Between episode `a` of A and `b` of B; ExportError when something cannot be read.
+        """Differences between episode `a` of A and `b` of B; ExportError if data cannot be read.
 
-        `images_equal` says of each camera feature whether its encoded images are known to be the same.
+        `images_equal` records for each camera feature whether its encoded images are known to be equal.
         """
         one, other = self._readers[0].columns(a), self._readers[1].columns(b)
         stored = [name for name in self._shared.cameras if name in one and name in other]
@@ -113,12 +113,12 @@ class EpisodeComparer:
         return DiffEntry(level="rows", name=name, text=text, episodes=episodes, details=details)
 
     def _images(self, name: str, episodes: tuple[int, int], starts: tuple[int, int], count: int) -> DiffEntry | None:
-        """Between images, decoded; those of a cut episode are aligned by `starts`."""
+        """Difference between decoded images; those of a cut episode are aligned by `starts`."""
         is_depth = [
             source.info.features[self._shared.own(side, name)].is_depth for side, source in enumerate(self._sources)
         ]
         if is_depth[0] != is_depth[1]:
-            return None  # which the level of features says
+            return None  # reported on the level of features
         one, other = (self._decoded(side, name, episodes[side], starts[side]) for side in (0, 1))
         found: list[tuple[float, int]] = []
         for frame, (a, b) in enumerate(islice(zip(one, other, strict=False), count), start=starts[0]):
@@ -156,7 +156,7 @@ class EpisodeComparer:
 def _lengths(
     a: Mapping[str, NDArray[Any]], b: Mapping[str, NDArray[Any]], lengths: tuple[int, ...]
 ) -> tuple[str, tuple[int, int], int]:
-    """What to say of episodes of several lengths; where the shorter one lies in the longer one, and its length or 0."""
+    """Describe episodes of different lengths; starts of the shorter one in the longer one, and its length or 0."""
     text = f"{lengths[0]} frames, {lengths[1]} in B"
     names = moving_columns(a)
     if not names:
@@ -174,11 +174,11 @@ def _lengths(
 
 
 def _psnr(a: NDArray[Any], b: NDArray[Any], peak: int) -> float:
-    """dB of two images that differ."""
+    """PSNR of two images that differ, dB."""
     error = a.astype(np.float64) - b.astype(np.float64)
     return float(10 * np.log10(peak**2 / np.mean(error * error)))
 
 
 def _plain(value: Any) -> Any:
-    """A number as JSON can hold it."""
+    """Convert a number for JSON."""
     return value if not isinstance(value, float) or np.isfinite(value) else str(value)

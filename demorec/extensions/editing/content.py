@@ -1,7 +1,7 @@
-"""What an episode contains, as digests: by them the episodes of one dataset are found in another.
+"""Content digests of episodes, which identify an episode of one dataset in another.
 
-Positions do not count: `index` and `episode_index` are taken from the episode's first row on, `task_index` as the text
-that it stands for. So an episode is the same wherever it lies, in files of whatever size and format.
+Positions do not count: `index` and `episode_index` are relative to the episode's first row, and `task_index` is
+replaced by its text. An episode thus has the same digests in any position, file size and format.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 
 TASK = "task"
-"""Column of the instructions, in place of `task_index`."""
+"""Column of the instructions, instead of `task_index`."""
 _SKETCH = 16
-"""Rows of each feature that stand for all of them: those of the smallest hashes (Broder 1997), in whatever frame."""
+"""Number of rows per feature in a sketch: those with the smallest hashes (Broder 1997), in any frame."""
 _LEAST_ALIKE = 0.3
-"""Share of the rows that two episodes have in common, so that one is called a changed version of the other."""
+"""Minimum share of common rows for one episode to count as a changed version of another."""
 _IMAGES_ALIKE = 0.5
-"""What equal videos count beside the rows."""
+"""Weight of equal videos relative to the rows."""
 _WORDS = np.random.default_rng(0).integers(1, 2**63, size=4096, dtype=np.uint64) * np.uint64(2) + np.uint64(1)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Shared:
-    """The features that two datasets have in common and that can be compared value by value.
+    """Features that two datasets share and whose values can be compared.
 
     Attributes:
-        columns: Of the data table, less images; feature -> whether both have it in one type.
-        cameras: Feature -> whether both store its images in one way, so that equal bytes are equal images.
-        names: Feature -> what the second one calls it, where that is something else.
+        columns: Columns of the data table, without images; feature -> whether both have the same type.
+        cameras: Feature -> whether both store its images in the same form, so that equal bytes mean equal images.
+        names: Feature -> its name in the second dataset, if different.
     """
 
     columns: Mapping[str, bool]
@@ -46,12 +46,12 @@ class Shared:
     names: Mapping[str, str]
 
     def own(self, side: int, name: str) -> str:
-        """What the first (0) or second (1) dataset calls a feature."""
+        """Name of a feature in the first (0) or second (1) dataset."""
         return self.names.get(name, name) if side else name
 
     @classmethod
     def of(cls, a: LeRobotFolder, b: LeRobotFolder, names: Mapping[str, str]) -> Shared:
-        """Of two datasets."""
+        """Find the shared features of two datasets."""
         pairs = {name: (item, b.info.features[own]) for name, item in a.info.features.items()
                  if (own := names.get(name, name)) in b.info.features}  # fmt: skip
         columns, cameras = {}, {}
@@ -66,13 +66,13 @@ class Shared:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeContent:
-    """Of one episode.
+    """Content of one episode.
 
     Attributes:
-        length: Frames.
+        length: Number of frames.
         rows: Column -> digest of its values.
-        images: Camera feature -> digest of its encoded images; None where only their pixels can be compared.
-        sketch: (N,) hashes of some rows, the same ones in every episode that has these rows.
+        images: Camera feature -> digest of its encoded images; None if only their pixels can be compared.
+        sketch: (N,) hashes of some rows, the same ones in every episode with these rows.
     """
 
     length: int
@@ -81,7 +81,7 @@ class EpisodeContent:
     sketch: NDArray[np.uint64]
 
     def equals(self, other: EpisodeContent) -> bool:
-        """Whether every bit of both is known to be the same."""
+        """Whether every bit of both is known to be equal."""
         return self._key() == other._key() and None not in self.images.values()
 
     def _key(self) -> tuple[Any, ...]:
@@ -89,11 +89,11 @@ class EpisodeContent:
 
 
 class ContentReader:
-    """The columns of a dataset's episodes, and their digests.
+    """Columns of a dataset's episodes, and their digests.
 
     Args:
         source: The dataset.
-        shared: What of it is compared.
+        shared: Shared features to compare.
         side: Whether it is the first (0) or the second (1) dataset.
     """
 
@@ -109,7 +109,7 @@ class ContentReader:
         return len(self._source.places)
 
     def columns(self, number: int) -> dict[str, NDArray[Any]]:
-        """Column -> (T, D) numbers, or (T, 1) texts; of language and stored images digests of each row."""
+        """Column -> (T, D) numbers, or (T, 1) texts; for language and stored images, digests of each row."""
         place = self._source.places[number]
         rows, found = self._rows.numbers(place), {}
         for name in (*self._shared.columns, *self._stored):
@@ -130,7 +130,7 @@ class ContentReader:
         return np.array(texts, dtype=np.str_).reshape(-1, 1)
 
     def read(self, number: int) -> EpisodeContent:
-        """The digests of an episode; ExportError when it cannot be read."""
+        """Digests of an episode; ExportError if it cannot be read."""
         place, columns = self._source.places[number], self.columns(number)
         stored = {name: columns.pop(name) for name in self._stored}
         rows = {}
@@ -149,7 +149,7 @@ class ContentReader:
         try:
             video = self._source.video(self._own[name], place).cut()
             sets = video.parameter_sets()
-        except ExportError:  # packets that cannot be told apart by episode; whether there are any, decoding shows
+        except ExportError:  # packets that cannot be assigned to episodes; decoding shows whether they exist
             return None
         head = (
             f"{video.codec} {video.width} {video.height} {video.lead} {video.tail} {video.sizes.tolist()} {len(sets)}"
@@ -164,7 +164,7 @@ def _digest(values: NDArray[Any]) -> bytes:
 
 
 def row_hashes(values: NDArray[Any]) -> NDArray[np.uint64]:
-    """(T,) a hash of each row of (T, D) numbers; that of equal numbers is equal, whatever their type."""
+    """(T,) hash of each row of (T, D) numbers; equal numbers have equal hashes for any type."""
     words = np.ascontiguousarray(values.astype(np.float64) + 0.0).view(np.uint64)
     found: NDArray[np.uint64] = (words * _WORDS[np.arange(words.shape[1]) % len(_WORDS)]).sum(axis=1, dtype=np.uint64)
     for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):  # splitmix64 (Steele et al. 2014)
@@ -173,7 +173,7 @@ def row_hashes(values: NDArray[Any]) -> NDArray[np.uint64]:
 
 
 def moving_columns(columns: Mapping[str, NDArray[Any]]) -> list[str]:
-    """Names of the columns of numbers that say something about an episode, not about its place."""
+    """Numeric columns with content of an episode rather than its position."""
     return [name for name, values in columns.items() if name not in AUTOMATIC_FEATURES and values.dtype.kind in "fiub"]
 
 
@@ -186,9 +186,10 @@ def _sketch(columns: Mapping[str, NDArray[Any]]) -> NDArray[np.uint64]:
 
 
 def matched(a: Sequence[EpisodeContent], b: Sequence[EpisodeContent]) -> dict[int, int]:
-    """Number of an episode -> number of the same one, or of its changed version, in the other dataset.
+    """Number of an episode -> number of the equal or changed one in the other dataset.
 
-    The same ones are found first; then those with the most in common. Of equals the one at the same place is taken.
+    Equal episodes are matched first, then those with the most in common. Among equals the one at the same position is
+    matched.
     """
     found: dict[int, int] = {}
     equal: dict[tuple[Any, ...], list[int]] = {}
@@ -212,7 +213,7 @@ def matched(a: Sequence[EpisodeContent], b: Sequence[EpisodeContent]) -> dict[in
 def _alike(
     a: Sequence[EpisodeContent], b: Sequence[EpisodeContent], rest_a: Sequence[int], rest_b: Sequence[int]
 ) -> Iterator[tuple[tuple[float, int], int, int]]:
-    """((less for more alike, places apart), episode of a, episode of b)."""
+    """((smaller for more similar, distance in position), episode of a, episode of b)."""
     holders: dict[Any, list[int]] = {}
     for number in rest_b:
         for value in (*b[number].sketch.tolist(), *_image_keys(b[number])):

@@ -1,4 +1,4 @@
-"""Plans that cut episodes into parts: at frames, where the data jump, or around pauses."""
+"""Plans that cut episodes into parts: at frames, at jumps of the data, or around pauses."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
 _NEAR = 5
-"""Steps before and after one that it is compared with; a slow sensor repeats a number for fewer frames."""
+"""Number of steps before and after a step for comparison; a slow sensor repeats a number for fewer frames."""
 Span = tuple[int, int]
-"""First frame of a part, and the one behind its last."""
+"""First frame of a part, and the one after its last."""
 
 
 class WatchedNumbers:
-    """Numbers by which motion is judged, episode after episode.
+    """Numbers that define motion, episode by episode.
 
     Args:
         source: The dataset.
         features: Features to watch; empty for the state without grippers.
 
     Raises:
-        ConfigError: No such feature of numbers, or the state is not known.
+        ConfigError: No such numeric feature, or the state is unknown.
     """
 
     def __init__(self, source: LeRobotFolder, features: Sequence[str] = ()) -> None:
@@ -66,11 +66,13 @@ class WatchedNumbers:
 
 
 def cut_at(source: LeRobotFolder, frames: Mapping[int, Sequence[int]]) -> Plan:
-    """All episodes, some cut before given frames: number of an episode -> frames that begin another part."""
+    """All episodes, some cut before given frames: number of an episode -> first frames of further parts."""
     plan = Plan.whole(source)
     for number, begins in frames.items():
         if not 0 <= number < len(plan.cuts):
-            raise ConfigError(f"There is no episode {number}: the dataset has 0 to {len(plan.cuts) - 1}: {source.root}")
+            raise ConfigError(
+                f"Episode {number} does not exist, the dataset has 0 to {len(plan.cuts) - 1}: {source.root}"
+            )
         length = plan.cuts[number].last
         if wrong := [frame for frame in begins if not 0 < frame < length]:
             raise ConfigError(
@@ -84,9 +86,9 @@ def cut_at_jumps(source: LeRobotFolder, features: Sequence[str], threshold: floa
 
     Args:
         source: The dataset.
-        features: Whose numbers are watched; none for the state without grippers.
-        threshold: A number jumps where its step from one frame to the next exceeds all steps near it by more than this
-            share of its range over the dataset; in motion, steps near each other are similar.
+        features: Features to watch; empty for the state without grippers.
+        threshold: A jump is a step between frames that exceeds all steps near it by more than this ratio of its range
+        over the dataset; in motion, neighbouring steps are similar.
     """
     _check_share("jump_threshold", threshold)
     plan, watched = Plan.whole(source), WatchedNumbers(source, features)
@@ -102,14 +104,14 @@ def cut_at_jumps(source: LeRobotFolder, features: Sequence[str], threshold: floa
 def without_pauses(
     source: LeRobotFolder, features: Sequence[str], *, min_frames: int, threshold: float, margin: int
 ) -> Plan:
-    """All episodes without their pauses; each part between two pauses becomes an episode.
+    """All episodes without pauses; each part between two pauses becomes an episode.
 
     Args:
         source: The dataset.
-        features: Whose numbers are watched; none for the state without grippers.
+        features: Features to watch; empty for the state without grippers.
         min_frames: Minimum length of a pause.
-        threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
-        margin: Still frames that stay at either end of a pause.
+        threshold: Maximum change of each number during a pause, as a ratio of its range over the dataset.
+        margin: Still frames to keep at either end of a pause.
     """
     _check_share("still_threshold", threshold)
     if min_frames < 2:
@@ -125,7 +127,7 @@ def without_pauses(
             kept.append((begin, end))
             begin = max(last - margin, end) if last < cut.last else cut.last
         kept = [span for span in [*kept, (begin, cut.last)] if span[1] > span[0]]
-        parts[number] = kept or [(0, cut.last)]  # nothing moves at all: that is for `drop` to decide
+        parts[number] = kept or [(0, cut.last)]  # no motion at all: that is a decision for `drop`
     return _in_parts(plan, parts)
 
 
@@ -137,7 +139,7 @@ def _largest_near(steps: Array) -> Array:
 
 
 def _pauses(values: Array, least: Array, min_frames: int) -> Iterator[Span]:
-    """Yield the stretches in which all of (T, D) numbers stay within `least` (D,) of those at their beginning."""
+    """Yield the intervals in which all of (T, D) numbers stay within `least` (D,) of their initial values."""
     begin = 0
     while begin + min_frames <= len(values):
         has_left = (np.abs(values[begin + 1 : begin + min_frames] - values[begin]) > least).any(axis=1)
@@ -152,17 +154,17 @@ def _pauses(values: Array, least: Array, min_frames: int) -> Iterator[Span]:
 
 def _check_share(option: str, value: float) -> None:
     if not 0 < value <= 1:
-        raise OptionError(option, f"is {value}, allowed are shares above 0 and up to 1.")
+        raise OptionError(option, f"is {value}, allowed are ratios above 0 and up to 1.")
 
 
 def _between(length: int, begins: Sequence[int]) -> list[Span]:
-    """The parts of an episode that begin at 0 and at some frames."""
+    """Parts of an episode that begin at 0 and at these frames."""
     edges = [0, *sorted(set(begins)), length]
     return list(pairwise(edges))
 
 
 def _in_parts(plan: Plan, parts: Mapping[int, Sequence[Span]]) -> Plan:
-    """Each episode in its parts, of which the last one ends as the episode did; others stay whole."""
+    """Split episodes into parts, of which the last has the episode's end; others stay complete."""
     cuts: list[EpisodeSlice] = []
     for number, cut in enumerate(plan.cuts):
         spans = parts.get(number, [(cut.first, cut.last)])

@@ -1,7 +1,7 @@
-"""In what two LeRobot datasets differ: info, features, tasks, episodes, rows, images, statistics.
+"""Differences between two LeRobot datasets: info, features, tasks, episodes, rows, images, statistics.
 
-Where episodes lie does not count: neither their order nor the files, the format's version or the task numbers. Episodes
-are matched by content (`content.py`), those that are not equal bit for bit are compared (`compare.py`).
+The position of episodes does not count: their order, files, format version and task numbers. Episodes are matched by
+content (`content.py`), and those that are not bit-exact are compared (`compare.py`).
 """
 
 from __future__ import annotations
@@ -23,19 +23,19 @@ from demorec.extensions.editing.statistics import episode_statistics_differences
 _STORAGE = ("version", "chunks_size", "data_files_size_in_mb", "video_files_size_in_mb", "data_path", "video_path")
 _OLD_TOTALS = ("total_chunks", "total_videos")
 _FOLLOWS = frozenset(("episode_index", "num_frames", "length", "task", "tasks"))
-"""Of the columns of episodes, what is compared elsewhere."""
+"""Columns of episodes that are compared elsewhere."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class DatasetDiff:
-    """What was found.
+    """Result of a comparison.
 
     Attributes:
         pairs: Number of an episode in A -> its number in B.
-        num_episodes: Of A and of B.
-        num_same: Pairs of which every row and image is equal.
-        differences: By level.
-        notes: What does not count: order, and how things are stored.
+        num_episodes: Number of episodes in A and in B.
+        num_same: Number of pairs with equal rows and images.
+        differences: Differences sorted by level.
+        notes: Differences that do not count: order, and storage.
     """
 
     pairs: Mapping[int, int]
@@ -51,12 +51,12 @@ class DatasetDiff:
 
     @property
     def is_reordered(self) -> bool:
-        """Whether episodes that both have come in another order."""
+        """Whether episodes in both datasets have another order."""
         others = list(self.pairs.values())
         return others != sorted(others)
 
     def to_json(self) -> dict[str, Any]:
-        """As plain data."""
+        """The result as plain data."""
         return {
             "same": self.is_same,
             "reordered": self.is_reordered,
@@ -70,10 +70,10 @@ class DatasetDiff:
 
 
 def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetDiff:
-    """Compare two datasets of v3.0 or v2.1; memory is that of an episode, and some numbers for each one.
+    """Compare two datasets of v3.0 or v2.1; holds one episode in memory, and some numbers for each.
 
     Raises:
-        ExportError: One is damaged.
+        ExportError: A dataset is damaged.
     """
     sources = (LeRobotFolder(a), LeRobotFolder(b))
     shared = Shared.of(*sources, renamed(*sources))
@@ -138,7 +138,7 @@ def _tasks(
     found: Sequence[DiffEntry],
     unmatched: Sequence[tuple[int | None, int | None]],
 ) -> list[DiffEntry]:
-    """The differences so far, less those that a reworded task explains, and what differs in the tables of tasks."""
+    """Differences so far, except those explained by a reworded task, plus differences in the tables of tasks."""
     tables = tuple(set(source.tasks) for source in sources)
     only = (tables[0] - tables[1], tables[1] - tables[0])
     kept: list[DiffEntry] = []
@@ -173,12 +173,12 @@ def _info(sources: Folders) -> Iterator[DiffEntry]:
     claims = [info.total_tasks for info in (a, b)]
     counts = [len(source.tasks) for source in sources]
     if claims[0] - counts[0] != claims[1] - counts[1]:
-        text = f"total_tasks is {claims[0]} for {counts[0]} that are there, in B {claims[1]} for {counts[1]}"
+        text = f"total_tasks is {claims[0]} for {counts[0]} existing ones, in B {claims[1]} for {counts[1]}"
         yield DiffEntry(level="info", name="total_tasks", text=text, details={"a": claims[0], "b": claims[1]})
 
 
 def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterator[DiffEntry]:
-    """What two objects have under the same names."""
+    """Differences between objects with the same names."""
     a, b = values
     for name in dict.fromkeys((*a, *b)):
         if name in a and name in b and _is_equal(a[name], b[name]):
@@ -214,7 +214,7 @@ def _described(feature: DatasetFeature, with_encoding: bool) -> dict[str, Any]:
 def _facts(
     sources: Folders, pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
 ) -> Iterator[DiffEntry]:
-    """What the tables of episodes and demorec's sidecar state of the same episode."""
+    """Differences between the same episode's entries in the tables of episodes and demorec's sidecar."""
     rows = [
         [{**row, **facts} for row, facts in zip(episode_columns(source), episode_facts(source), strict=True)]
         for source in sources
@@ -238,7 +238,7 @@ def _facts(
 
 
 def _boxes(sources: Folders, shared: Shared, pairs: Mapping[int, int]) -> Iterator[DiffEntry]:
-    """What stands in the files of boxes about episodes of one length."""
+    """Differences between boxes of episodes with equal length."""
     for name in shared.cameras:
         one, other = (source.boxes(shared.own(side, name)) for side, source in enumerate(sources))
         if (one is None) != (other is None):
@@ -268,12 +268,12 @@ def _notes(sources: Folders, result: DatasetDiff, found: Sequence[DiffEntry]) ->
         yield f"The same episodes in another order, A to B: {', '.join(moved[:8])}{more}."
     keys = {key for item in found if item.level == "statistics" for key in item.details.get("of", ("all",))}
     if keys and all(key.startswith("q") for key in keys):
-        yield "Only quantiles differ in the statistics: LeRobot estimates them, demorec takes them from the rows."
+        yield "Only quantiles differ in the statistics: LeRobot estimates them, demorec computes them from the rows."
     tasks = [source.tasks for source in sources]
     if tasks[0] != tasks[1] and set(tasks[0]) == set(tasks[1]):
-        yield "The same tasks under other numbers."
+        yield "The same tasks with other numbers."
     if list(a.features) != list(b.features) and set(a.features) == set(b.features):
         yield "The same features in another order."
     for name in _STORAGE:
         if getattr(a, name) != getattr(b, name):
-            yield f"Stored in another way: {name} is {getattr(a, name)}, in B {getattr(b, name)}."
+            yield f"Stored differently: {name} is {getattr(a, name)}, in B {getattr(b, name)}."

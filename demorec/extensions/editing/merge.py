@@ -1,14 +1,12 @@
-"""Merge datasets into one: features matched by name, all differences reported at once, a mapping (TOML) to solve them.
+"""Merge datasets: features are matched by name, all differences are reported at once, and a mapping (TOML) resolves
+them.
 
-[[dataset]]
-path = "b"                                  # as on the command line
-robot_type = "so100"                        # what its arm is called in the merged dataset
-drop = ["observation.images.side"]
+[[dataset]] path = "b" # as on the command line robot_type = "so100" # name of its arm in the merged dataset drop =
+["observation.images.side"]
 
-[dataset.feature."observation.state"]       # a feature of the merged dataset
-from = "state"                              # its name in this one
-elements = ["shoulder", "gripper"]          # names in this one, in the order of the first dataset
-unit = "degree"                             # here: rad (as it is), degree, or normalised, with low and high in rad
+[dataset.feature."observation.state"] # a feature of the merged dataset from = "state" # its name in this one elements =
+["shoulder", "gripper"] # names in this one, in the order of the first dataset unit = "degree" # here: rad (unchanged),
+degree, or normalised, with low and high in rad
 """
 
 from __future__ import annotations
@@ -38,11 +36,12 @@ _FEATURE_KEYS = ("from", "elements", "unit", "low", "high")
 
 
 class DatasetsDifferError(ConfigError):
-    """Datasets that cannot be joined as they are.
+    """Datasets that cannot be merged unchanged.
 
     Args:
         sentence: All differences.
-        mapping: Lines of a mapping under which those of one rate fit, as far as any does.
+        mapping: Lines of a mapping that resolves the differences between datasets with the same rate, as far as
+        possible.
     """
 
     def __init__(self, sentence: str, mapping: Sequence[str]) -> None:
@@ -54,10 +53,10 @@ class DatasetsDifferError(ConfigError):
 
 
 def merge(sources: Sequence[LeRobotFolder], mapping: Path | None = None) -> Plan:
-    """All episodes of all datasets, one after the other.
+    """All episodes of all datasets, in sequence.
 
     Raises:
-        DatasetsDifferError: They differ; with all differences, and a mapping that would solve what one can.
+        DatasetsDifferError: They differ; it has all differences, and a mapping that resolves them as far as possible.
         ConfigError: The mapping cannot be used.
     """
     if len(sources) < 2:
@@ -80,22 +79,24 @@ def _read(path: Path, roots: Sequence[Path]) -> dict[Path, dict[str, Any]]:
         found = data.get("dataset", [])
         entries = {Path(entry["path"]).resolve(): dict(entry) for entry in found}
         if set(data) - {"dataset"}:
-            raise ValueError(f"it has {sorted(set(data) - {'dataset'})[0]!r} beside the datasets")
+            raise ValueError(f"it has the unknown key {sorted(set(data) - {'dataset'})[0]!r}")
     except (OSError, ValueError, KeyError, TypeError, RecursionError) as error:
         raise ConfigError(f"The mapping cannot be used ({describe_error(error)}): {path}") from error
     if strange := [entry for entry in entries if entry not in [root.resolve() for root in roots]]:
-        raise ConfigError(f"The mapping is about a dataset that is not merged, {strange[0]}: {path}")
+        raise ConfigError(f"The mapping names a dataset that is not merged, {strange[0]}: {path}")
     return entries
 
 
 def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path | None) -> Plan:
-    """A dataset as its entry in the mapping wants it."""
+    """Plan a dataset by its entry in the mapping."""
     for key in entry:
         check_choice("key of a mapping", key, _KEYS)
     features, mappings = dict(plan.info.features), dict(plan.mappings[0])
     for name in entry.get("drop", ()):
         if name not in mappings:
-            raise ConfigError(f"The mapping drops {name!r}, which is not there.{nearest_match(name, mappings)}: {path}")
+            raise ConfigError(
+                f"The mapping drops {name!r}, which does not exist.{nearest_match(name, mappings)}: {path}"
+            )
         del features[name], mappings[name]
     wanted = entry.get("feature", {})
     used = {item.get("from", name) for name, item in wanted.items()}
@@ -118,7 +119,7 @@ def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path
 def _converted(
     there: Mapping[str, DatasetFeature], name: str, item: Mapping[str, Any], model: DatasetFeature | None
 ) -> tuple[DatasetFeature, FeatureMapping]:
-    """A feature of the merged dataset and its mapping, by an entry and the first dataset's feature of that name."""
+    """A feature of the merged dataset and its mapping, from an entry and the first dataset's feature of that name."""
     origin = item.get("from", name)
     if origin not in there:
         raise ValueError(f"there is no feature {origin!r}")
@@ -135,13 +136,13 @@ def _converted(
             target = replace(own, shape=(len(elements),), names=tuple(item["elements"]), written_names=None)
     width = own.shape[0] if elements is None else len(elements)
     if width != target.shape[0]:
-        raise ValueError(f"it gives another number of elements than {target.shape[0]}")
+        raise ValueError(f"it has a different number of elements than {target.shape[0]}")
     scale, offset = _unit(item, width)
     return target, FeatureMapping(feature=origin, elements=elements, scale=scale, offset=offset)
 
 
 def _unit(item: Mapping[str, Any], width: int) -> tuple[Any, Any]:
-    """(D,) factor and summand that convert an entry's unit to rad; None for rad."""
+    """(D,) factor and offset that convert an entry's unit to rad; None for rad."""
     unit = check_choice("unit", str(item.get("unit", "rad")), _UNITS)
     if unit == "rad":
         return None, None
@@ -155,7 +156,7 @@ def _unit(item: Mapping[str, Any], width: int) -> tuple[Any, Any]:
 def _differences(a: Plan, b: Plan) -> Iterator[str]:
     root = b.sources[0].root
     if a.info.fps != b.info.fps:
-        yield f"{root} has {b.info.fps} frames a second, not {a.info.fps}, which no mapping solves"
+        yield f"{root} has {b.info.fps} frames a second, not {a.info.fps}, which no mapping resolves"
     if a.info.robot_type != b.info.robot_type:
         yield f"{root} has the robot {b.info.robot_type}, not {a.info.robot_type}"
     for name in a.info.features:
@@ -164,14 +165,14 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
     for name, feature in b.info.features.items():
         there = a.info.features.get(name)
         if there is None:
-            yield f"{root} has {name}, which the first one has not"
+            yield f"{root} has {name}, which the first one lacks"
             continue
         for what, value, first in feature.differences(there):
             yield f"{name} of {root} has {what} {value}, not {first}"
 
 
 def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
-    """Lines of a mapping: features that not all datasets can give are dropped, elements put into one order."""
+    """Lines of a mapping: features that some datasets cannot provide are dropped, elements are put in one order."""
     plans = [plan for plan in plans if plan.info.fps == plans[0].info.fps]
     if len(plans) < 2:
         return
@@ -194,23 +195,23 @@ def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
 
 
 def _can_give(own: DatasetFeature | None, first: DatasetFeature) -> bool:
-    """Whether a feature equals that of the first dataset, or has all of its elements."""
+    """Whether a feature equals the first dataset's, or has all of its elements."""
     if own is None or own.dtype != first.dtype:
         return False
     return _fits(own, first) or (_is_vector(own, first) and set(first.elements) <= set(own.elements))
 
 
 def _other_names(first: Plan, plan: Plan) -> Iterator[str]:
-    """Comments: which features may be one under two names, which nobody but the user knows."""
+    """Comments on features that may be renamed, which only the user can decide."""
     there, here = first.info.features, plan.info.features
     for name in [name for name in there if name not in here]:
         for own in [own for own in here if own not in there and _fits(here[own], there[name])]:
-            yield f"# If {_quoted(own)} is what the first one calls {_quoted(name)}, drop neither, and add:"
+            yield f"# If {_quoted(own)} is {_quoted(name)} of the first one, drop neither, and add:"
             yield from (f"# [dataset.feature.{_quoted(name)}]", f"# from = {_quoted(own)}")
 
 
 def _quoted(value: object) -> str:
-    """As TOML has it, which knows no surrogates."""
+    """Quote for TOML, which has no surrogates."""
     return json.dumps(value, ensure_ascii=False)
 
 

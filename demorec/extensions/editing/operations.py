@@ -1,4 +1,4 @@
-"""Each operation makes a plan of a dataset: nothing is written here."""
+"""Operations that make a plan from a dataset; none writes anything."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ _COMPARED: dict[type[ast.cmpop], Callable[[Any, Any], Any]] = {
 }
 _EQUALITIES = (ast.Eq, ast.NotEq)
 _Value = Callable[[Mapping[str, Any]], Any]
-"""Value of a part of a condition, by an episode's columns."""
+"""Value of a part of a condition, from an episode's columns."""
 
 Rows = Sequence[Mapping[str, Any]]
-"""Values of each episode in order, as `episode_columns` reads them."""
+"""Values of each episode in order, from `episode_columns`."""
 
 
 def chosen(source: LeRobotFolder, rows: Rows, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:
-    """Numbers of the episodes for which a condition holds, and that are among some; ConfigError for impossible ones."""
+    """Numbers of the listed episodes that fulfil a condition; ConfigError for impossible ones."""
     if episodes is not None and (wrong := [number for number in episodes if not 0 <= number < len(rows)]):
-        raise ConfigError(f"There is no episode {wrong[0]}: the dataset has 0 to {len(rows) - 1}: {source.root}")
+        raise ConfigError(f"Episode {wrong[0]} does not exist, the dataset has 0 to {len(rows) - 1}: {source.root}")
     found = list(range(len(rows))) if episodes is None else list(dict.fromkeys(episodes))
     if where:
         condition = Condition(where, _names(rows))
@@ -56,11 +56,11 @@ def _names(rows: Rows) -> list[str]:
 
 def _no_column(name: str, names: Sequence[str]) -> ConfigError:
     listed = ", ".join(names[:_MOST_LISTED]) + (", ..." if len(names) > _MOST_LISTED else "")
-    return ConfigError(f"There is no column {name!r}.{nearest_match(name, names)} There are: {listed}.")
+    return ConfigError(f"Unknown column {name!r}.{nearest_match(name, names)} Allowed: {listed}.")
 
 
 def select(source: LeRobotFolder, numbers: Sequence[int], *, drop: bool = False) -> Plan:
-    """Those episodes, in the dataset's order, or all others."""
+    """These episodes, in the dataset's order, or all others."""
     plan = Plan.whole(source)
     wanted = set(numbers)
     return plan.with_cuts([cut for cut in plan.cuts if (cut.episode in wanted) != drop])
@@ -69,7 +69,7 @@ def select(source: LeRobotFolder, numbers: Sequence[int], *, drop: bool = False)
 def reorder(
     source: LeRobotFolder, rows: Rows = (), by: str = "", order: Sequence[int] = (), *, descending: bool = False
 ) -> Plan:
-    """All episodes, sorted by a column, those without a value last, or in a given order."""
+    """All episodes, sorted by a column with missing values last, or in a given order."""
     plan = Plan.whole(source)
     if bool(by) == bool(order):
         raise ConfigError("Give either --by or --order.")
@@ -89,7 +89,7 @@ def reorder(
 
 
 def shuffle(source: LeRobotFolder, seed: int) -> Plan:
-    """All episodes in an order that the seed decides."""
+    """All episodes in a random order by seed."""
     check_seed("seed", seed)
     plan = Plan.whole(source)
     order = np.random.default_rng(seed).permutation(len(plan.cuts)).tolist()
@@ -99,37 +99,37 @@ def shuffle(source: LeRobotFolder, seed: int) -> Plan:
 def trim(source: LeRobotFolder, head: int, tail: int) -> Plan:
     """Every episode without its first and last frames."""
     if min(head, tail) < 0:
-        raise ConfigError("A number of frames is cut off, at least 0.")
+        raise ConfigError("The number of frames to cut off must be at least 0.")
     plan = Plan.whole(source)
     if short := [str(cut.episode) for cut in plan.cuts if cut.last <= head + tail]:
         listed = ",".join(short[:_MOST_LISTED]) + (",..." if len(short) > _MOST_LISTED else "")
-        raise ConfigError(f"Nothing would be left of these episodes, drop them first: {listed}")
+        raise ConfigError(f"These episodes would be empty, drop them first: {listed}")
     return plan.with_cuts([replace(cut, first=head, last=cut.last - tail) for cut in plan.cuts])
 
 
 def trim_idle(source: LeRobotFolder, features: Sequence[str], threshold: float, margin: int) -> Plan:
-    """Every episode without the frames in which nothing moves at its beginning and end.
+    """Every episode without the still frames at its beginning and end.
 
     Args:
         source: The dataset.
-        features: Whose numbers are looked at.
-        threshold: Nothing moves where no number changes by more than this share of its range over the dataset.
-        margin: Frames that stay at either end.
+        features: Features to watch.
+        threshold: Maximum change of each number in still frames, as a ratio of its range over the dataset.
+        margin: Still frames to keep at either end.
     """
     watched = WatchedNumbers(source, features)
     if not 0 < threshold <= 1:
-        raise OptionError("idle_threshold", f"is {threshold}, allowed are shares above 0 and up to 1.")
+        raise OptionError("idle_threshold", f"is {threshold}, allowed are ratios above 0 and up to 1.")
     check_option("idle_margin", margin, 0, 2**63 - 1, "frames")
     plan = Plan.whole(source)
     least = threshold * watched.ranges()
     cuts = []
     for cut in plan.cuts:
         values = watched.episode(cut.episode)
-        # Where it came to, against where it began and ends: slow motion counts as well.
+        # Compared with the initial and final values, so that slow motion counts as well.
         away_from_start = np.flatnonzero((np.abs(values - values[0]) > least).any(axis=1))
         away_from_end = np.flatnonzero((np.abs(values - values[-1]) > least).any(axis=1))
         if not len(away_from_start):
-            cuts.append(cut)  # nothing moves at all: that is for `drop` to decide
+            cuts.append(cut)  # no motion at all: that is a decision for `drop`
             continue
         first = max(0, int(away_from_start[0]) - 1 - margin)
         last = min(cut.last, int(away_from_end[-1]) + 2 + margin)
@@ -140,7 +140,8 @@ def trim_idle(source: LeRobotFolder, features: Sequence[str], threshold: float, 
 def split(
     source: LeRobotFolder, rows: Rows, shares: Mapping[str, float], seed: int, *, by: str = ""
 ) -> dict[str, Plan]:
-    """Name -> part of the dataset; each value of the column `by` is shared out alike, and every part has episodes.
+    """Name -> part of the dataset; each value of the column `by` is divided in the same proportions, and no part is
+    empty.
 
     Episodes stay in the dataset's order. Raises ConfigError for impossible shares.
     """
@@ -165,7 +166,7 @@ def split(
         for name, begin, end in zip(shares, begins, begins[1:], strict=False):
             found[name] |= set(order[begin:end].tolist())
     if empty := [name for name, numbers in found.items() if not numbers]:
-        raise ConfigError(f"No episode would be in {empty[0]}: the dataset has {len(rows)}.")
+        raise ConfigError(f"The part {empty[0]} would be empty: the dataset has {len(rows)}.")
     return {name: plan.with_cuts([plan.cuts[number] for number in sorted(numbers)]) for name, numbers in found.items()}
 
 
@@ -174,14 +175,14 @@ def set_task(source: LeRobotFolder, task: str, numbers: Sequence[int]) -> Plan:
     if not task.strip() or not task.isprintable():
         raise ConfigError("An instruction is a line of text, such as --task 'pick up the cup'.")
     if not numbers:
-        raise ConfigError("No episode is chosen, so that none would get the new instruction.")
+        raise ConfigError("No episode is selected for the new instruction.")
     plan = Plan.whole(source)
     wanted = set(numbers)
     return plan.with_cuts([replace(cut, task=task) if cut.episode in wanted else cut for cut in plan.cuts])
 
 
 def rename(source: LeRobotFolder, names: Mapping[str, str]) -> Plan:
-    """All episodes with features under other names; ConfigError for names that are not there, fixed or taken."""
+    """All episodes with renamed features; ConfigError for names that are unknown, fixed or taken."""
     plan = Plan.whole(source)
     _check_features(source, names)
     kept = [names.get(name, name) for name in plan.info.features]
@@ -214,12 +215,12 @@ def _check_features(source: LeRobotFolder, names: Mapping[str, str] | Sequence[s
 
 
 def _own(source: LeRobotFolder) -> list[str]:
-    """Its features but for those that each dataset has."""
+    """Names of its features except the automatic ones."""
     return [name for name in source.info.features if name not in AUTOMATIC_FEATURES]
 
 
 def joined(plans: Sequence[Plan]) -> Plan:
-    """Plans of one source each, with the same features, one after the other."""
+    """Concatenate plans of one source each with the same features."""
     sources = tuple(source for plan in plans for source in plan.sources)
     cuts = [replace(cut, source=number) for number, plan in enumerate(plans) for cut in plan.cuts]
     mappings: tuple[Mapping[str, FeatureMapping], ...] = tuple(mapping for plan in plans for mapping in plan.mappings)
@@ -238,7 +239,7 @@ class Condition:
         "cube" in task and drawn/speed >= 0.9
         episode_index in (3, 7)
 
-    Nothing is evaluated as Python: the parsed text is translated, and anything beyond this grammar is refused.
+    Nothing is evaluated as Python: the parsed text is translated, and everything beyond this grammar is refused.
 
     Raises:
         ConfigError: Not a condition, or an unknown column.
@@ -252,13 +253,13 @@ class Condition:
             tree = ast.parse(text.strip(), mode="eval").body
         except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise ConfigError(
-                "This is no condition: compare by == != < <= > >= in, join by and, or, not, and put text in quotes, "
+                "This is not a condition: compare by == != < <= > >= in, join by and, or, not, and put text in quotes, "
                 f'such as num_frames < 300 and "cube" in task: {text}'
             ) from error
         self._holds = self._truth(tree)
 
     def holds(self, row: Mapping[str, Any]) -> bool:
-        """Whether it is true of an episode; a comparison with an unknown value is false."""
+        """Whether it is true for an episode; a comparison with an unknown value is false."""
         return bool(self._holds(row))
 
     def _value(self, node: ast.expr) -> _Value:
@@ -283,11 +284,13 @@ class Condition:
                 return self._column(node)
 
     def _truth(self, node: ast.expr) -> _Value:
-        """Value of an operand of and, or, not; a value alone, as "b" in `task == "a" or "b"`, would always hold."""
+        """Value of an operand of and, or, not; a value alone, such as "b" in `task == "a" or "b"`, would always be
+        true.
+        """
         if isinstance(node, ast.Tuple | ast.List) or (
             isinstance(node, ast.Constant) and not isinstance(node.value, bool)
         ):
-            raise ConfigError(f"A condition joins comparisons, and {ast.unparse(node)} alone is none: {self._text}")
+            raise ConfigError(f"A condition joins comparisons, and {ast.unparse(node)} alone is not one: {self._text}")
         return self._value(node)
 
     def _comparison(self, kinds: Sequence[ast.cmpop], values: Sequence[_Value]) -> _Value:
@@ -321,7 +324,7 @@ class Condition:
 
 
 def names_in(text: str) -> set[str]:
-    """Words of a condition that may be columns; none of what is no condition."""
+    """Words of a condition that may be columns; empty for an invalid condition."""
     try:
         return {node.id for node in ast.walk(ast.parse(text.strip(), mode="eval")) if isinstance(node, ast.Name)}
     except (SyntaxError, ValueError, RecursionError, MemoryError):
@@ -329,7 +332,7 @@ def names_in(text: str) -> set[str]:
 
 
 def _name(node: ast.expr) -> str | None:
-    """A column's name, which may have slashes and dots in it."""
+    """Name of a column, which may contain slashes and dots."""
     match node:
         case ast.Name(id=name):
             return name

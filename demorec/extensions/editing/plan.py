@@ -1,4 +1,4 @@
-"""What an edit makes: which frames of which episodes of which datasets, and which features they have."""
+"""Plan of an edit: the frames, episodes and features of the new dataset, with their sources."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ from demorec.datasets.lerobot.layout import (
 from demorec.episode.features import ACTION, STATE
 
 _NUMPY_NAMES = {"float": "float32", "double": "float64"}
-"""Arrow's names of types -> NumPy's."""
+"""Arrow's type names -> NumPy's."""
 
 
 def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
-    """Find the features of numbers that the data files hold in another type than info.json says -> that type.
+    """Find numeric features whose type in the data files differs from info.json -> the files' type.
 
-    Where files differ, it is the type that holds the numbers of all of them.
+    If files differ, it is the type that holds all their numbers.
     """
     numeric = {name: feature for name, feature in source.info.features.items() if feature.is_numeric}
     stored: dict[str, set[str]] = {}
@@ -52,7 +52,7 @@ def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
 
 
 def _number_type(column: pa.DataType) -> pa.DataType:
-    """Type of the numbers in a column of numbers, lists or arrays."""
+    """Number type in a column of numbers, lists or arrays."""
     if isinstance(column, pa.BaseExtensionType):
         column = column.storage_type
     while pa.types.is_list(column) or pa.types.is_fixed_size_list(column) or pa.types.is_large_list(column):
@@ -62,12 +62,12 @@ def _number_type(column: pa.DataType) -> pa.DataType:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class FeatureMapping:
-    """How a feature of the new dataset comes from one of a source.
+    """Mapping of a feature in the new dataset from one of a source.
 
     Attributes:
         feature: Its name in the source.
-        elements: For each element the number of the source's element; None: all in their order.
-        scale, offset: (D,) factor and summand of numbers; None: unchanged.
+        elements: Index of the source's element for each element; None: all in order.
+        scale, offset: (D,) factor and summand; None: unchanged.
     """
 
     feature: str
@@ -77,7 +77,7 @@ class FeatureMapping:
 
     @property
     def is_copy(self) -> bool:
-        """Whether every bit stays."""
+        """Whether it is bit-exact."""
         return self.elements is None and self.scale is None
 
     def apply(self, values: NDArray[Any], dtype: str) -> NDArray[Any]:
@@ -90,13 +90,13 @@ class FeatureMapping:
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeSlice:
-    """The frames from `first` to before `last` of an episode.
+    """Frames `first` to `last` - 1 of an episode.
 
     Attributes:
-        source: Number of the dataset.
+        source: Index of the dataset.
         episode: Number of the episode in it.
-        task: Instruction instead of its own; "" for its own.
-        has_end: Whether it ends as the episode did; other parts of the episode do not.
+        task: New instruction; "" to keep its own.
+        has_end: Whether it includes the episode's end.
     """
 
     source: int
@@ -109,13 +109,13 @@ class EpisodeSlice:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Plan:
-    """A dataset to be written.
+    """Plan of a dataset to write.
 
     Attributes:
-        sources: What it is made from.
+        sources: Source datasets.
         cuts: Its episodes in order.
-        info: Of the new dataset: features, rate, robot, sizes of files.
-        mappings: For each source: feature of the new dataset -> where it comes from, less the automatic ones.
+        info: Info of the new dataset: features, rate, robot, file sizes.
+        mappings: For each source: feature of the new dataset -> its mapping, without the automatic ones.
     """
 
     sources: tuple[LeRobotFolder, ...]
@@ -125,7 +125,7 @@ class Plan:
 
     @classmethod
     def whole(cls, source: LeRobotFolder) -> Plan:
-        """All of a dataset as it is."""
+        """Plan of a whole dataset, unchanged."""
         own = {name: feature for name, feature in source.info.features.items() if name not in AUTOMATIC_FEATURES}
         types = mistyped_features(source)
         own |= {name: replace(own[name], dtype=types[name]) for name in types if name in own}
@@ -148,7 +148,7 @@ class Plan:
         return cls(sources=(source,), cuts=cuts, info=info, mappings=(mappings,))
 
     def keeps_scene(self, cut: EpisodeSlice) -> bool:
-        """Whether an episode is still what its scene describes: all its frames, with its own states and actions."""
+        """Whether an episode still matches its scene: all its frames, with its own states and actions."""
         source = self.sources[cut.source]
         if (cut.first, cut.last) != (0, source.places[cut.episode].length):
             return False
@@ -160,17 +160,17 @@ class Plan:
         return True
 
     def takes_all_of(self, number: int) -> bool:
-        """Whether all episodes of a source go along."""
+        """Whether all episodes of a source are included."""
         return {cut.episode for cut in self.cuts if cut.source == number} == set(
             range(len(self.sources[number].places))
         )
 
     def with_cuts(self, cuts: Sequence[EpisodeSlice]) -> Plan:
-        """Other episodes; ConfigError when none is left."""
+        """Replace the episodes; ConfigError if none is left."""
         if not cuts:
             raise ConfigError("No episode would be left: choose others.")
         return replace(self, cuts=tuple(cuts))
 
     def with_features(self, features: Mapping[str, DatasetFeature], mappings: Mapping[str, FeatureMapping]) -> Plan:
-        """Other features of a plan of one source."""
+        """Replace the features of a plan with one source."""
         return replace(self, info=replace(self.info, features=dict(features)), mappings=(mappings,))

@@ -1,4 +1,5 @@
-"""A damaged dataset as its rows have it. Nothing is invented: what neither rows nor tables say is refused.
+"""Reconstruction of a damaged dataset from its rows. Nothing is invented: data that neither rows nor tables have cannot
+be repaired.
 
 Written like any other edit, the result has tables, counters and statistics that fit its rows.
 """
@@ -42,17 +43,17 @@ _Images = list[tuple[Path, int] | None]
 
 
 class RepairedDataset(LeRobotFolder):
-    """An open dataset, with what its tables and info.json should say.
+    """An open dataset with corrected tables and info.json.
 
     Args:
-        root: Its folder.
+        root: The dataset's folder.
 
     Attributes:
         changes: A sentence for each difference from tables and info.json.
-        instructions: Number of an episode -> its instruction, if its rows do not name it.
+        instructions: Number of an episode -> its instruction, if its rows do not refer to one.
 
     Raises:
-        ExportError: Something would have to be invented.
+        ExportError: Data would have to be invented.
     """
 
     def __init__(self, root: Path) -> None:
@@ -89,19 +90,19 @@ class RepairedDataset(LeRobotFolder):
         return tuple(self.changes)
 
     def plan(self) -> Plan:
-        """All episodes, each with its instruction."""
+        """All episodes with their instructions."""
         plan = Plan.whole(self)
         return plan.with_cuts(
             [replace(cut, task=self.instructions.get(number, "")) for number, cut in enumerate(plan.cuts)]
         )
 
     def rows(self, names: Sequence[str]) -> DataRows:
-        """Read some columns of the data files, of those that they have."""
+        """Read some columns of the data files, if they exist."""
         there = set(open_table(self.data_tables[0]).schema_arrow.names)
         return super().rows([name for name in names if name in there])
 
     def change(self, sentence: str) -> None:
-        """Note a difference, once."""
+        """Note a change, once."""
         if sentence not in self.changes:
             self.changes.append(sentence)
 
@@ -117,7 +118,7 @@ class RepairedDataset(LeRobotFolder):
         return True
 
     def _stored(self) -> dict[int, EpisodePlace]:
-        """Episode index -> where the table says that the episode is; empty where that cannot be used."""
+        """Episode index -> location in the table of episodes; empty if the table is unusable."""
         if not has_episode_table(self.root, self.info):
             self.change("The table of episodes is missing: it is written from the rows.")
             return {}
@@ -128,7 +129,7 @@ class RepairedDataset(LeRobotFolder):
             return {}
 
     def _ordered_runs(self) -> list[EpisodeRun]:
-        """Find the episodes by the rows of the files that can be read, in the order of their numbers."""
+        """Find the episodes by the rows of readable files, sorted by number."""
         runs: list[EpisodeRun] = []
         problems: dict[Path, ExportError] = {}
         for path in self.data_tables:
@@ -147,14 +148,14 @@ class RepairedDataset(LeRobotFolder):
         return runs
 
     def _check_frames(self, run: EpisodeRun) -> None:
-        """Note a `frame_index` that does not begin at 0. Raises ExportError if rows are missing between others."""
+        """Note a `frame_index` that does not begin at 0. Raises ExportError if rows in the middle are missing."""
         frames = run.counters.get("frame_index", np.arange(run.length))
         steps = np.flatnonzero(np.diff(frames) != 1)
         if len(steps):
             first = int(steps[0])
             raise ExportError(
                 f"Rows of episode {run.episode_index} are missing or exchanged (frame_index {frames[first + 1]} comes "
-                f"after {frames[first]}), and nothing says which: drop it first (demorec dataset drop --episodes "
+                f"after {frames[first]}), and it is unknown which: drop it first (demorec dataset drop --episodes "
                 f"{run.episode_index}): {run.data}"
             )
         if frames[0] != 0:
@@ -164,7 +165,7 @@ class RepairedDataset(LeRobotFolder):
     def _with_images(
         self, runs: Sequence[EpisodeRun], stored: Mapping[int, EpisodePlace]
     ) -> tuple[list[EpisodeRun], dict[str, list[tuple[Path, int]]]]:
-        """Find the images of the episodes; leave episodes out if their images cannot be read."""
+        """Find the images of the episodes; leave out episodes with unreadable images."""
         found = {key: self._images(key, runs, stored) for key in self.info.video_keys}
         missing = {n: key for key, images in found.items() for n, image in enumerate(images) if image is None}
         for number, key in missing.items():
@@ -179,7 +180,7 @@ class RepairedDataset(LeRobotFolder):
         return [run for number, run in enumerate(runs) if number not in missing], kept
 
     def _images(self, key: str, runs: Sequence[EpisodeRun], stored: Mapping[int, EpisodePlace]) -> _Images:
-        """Find the images of a camera by the table if all that it says is possible, else by their number."""
+        """Find the images of a camera by the table if all its entries are possible, otherwise by counting."""
         if self.info.is_old or any(run.episode_index not in stored for run in runs):
             places = images_by_rows(self.root, self.info, key, runs)
         else:
@@ -199,20 +200,20 @@ class RepairedDataset(LeRobotFolder):
         return found
 
     def _count(self, runs: Sequence[EpisodeRun]) -> None:
-        """Note counters that are missing or wrong."""
+        """Note missing and wrong counters."""
         numbers = [run.episode_index for run in runs]
         if numbers != list(range(len(runs))):
-            self.change(f"The episodes are numbered from 0 on; they were {_listed(numbers)}.")
+            self.change(f"The episodes are numbered from 0; they were {_listed(numbers)}.")
         begin, wrong = 0, 0
         for run in runs:
             rows = np.arange(begin, begin + run.length)
             wrong += not np.array_equal(run.counters.get("index", rows), rows)
             begin += run.length
         if wrong:
-            self.change(f"index counts on over the whole dataset: it was wrong in {wrong} of {len(runs)} episodes.")
+            self.change(f"index counts over the whole dataset: it was wrong in {wrong} of {len(runs)} episodes.")
 
     def _set_tasks(self, runs: Sequence[EpisodeRun], stored: Mapping[int, EpisodePlace]) -> None:
-        """Take the instructions from the rows, else from the table of episodes; ExportError where neither has one."""
+        """Get the instructions from the rows, otherwise from the table of episodes; ExportError if neither has one."""
         try:
             known = {number: task for number, task in enumerate(read_tasks(self.root)) if task}
         except ExportError as error:
@@ -231,14 +232,14 @@ class RepairedDataset(LeRobotFolder):
             if not own:
                 named = f"its rows name the task {indices[0]}, which no table has" if indices else "its rows name none"
                 raise ExportError(
-                    f"The instruction of episode {run.episode_index} is not known ({named}): give it one first "
+                    f"The instruction of episode {run.episode_index} is unknown ({named}): set one first "
                     f"(demorec dataset set-task --episodes {run.episode_index}): {self.root}"
                 )
             self.instructions[number] = own[0]
             self.change(f"Episode {run.episode_index} has the instruction {own[0]!r} of the table of episodes.")
 
     def _check_timestamps(self) -> None:
-        """Replace timestamps by multiples of 1/fps if they are not finite or LeRobot finds no images by them."""
+        """Replace timestamps by multiples of 1/fps if they are not finite or LeRobot finds no images with them."""
         if "timestamp" not in open_table(self.data_tables[0]).schema_arrow.names:
             self.keeps_timestamps = False
             return

@@ -1,4 +1,4 @@
-"""Features, rate and cameras in info.json, corrected by the columns of the rows and by the videos."""
+"""Correct features, rate and cameras in info.json by the columns of the rows and by the videos."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _COUNTS: dict[str, int] = {
     "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1000, "data_files_size_in_mb": 100,
     "video_files_size_in_mb": 200,
 }  # fmt: skip
-"""Counts of info.json, and the values used where one is impossible."""
+"""Counts in info.json, and replacements for impossible values."""
 _MAX_COUNT = 1e9
 _TYPES = {"double": "float64", "float": "float32", "large_string": "string"}
-"""Arrow's name of a type -> LeRobot's, where they differ."""
+"""Arrow's type name -> LeRobot's, if different."""
 _DTYPES = frozenset(
     ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool", "string")
 )
 _MAX_RATE_ERROR = 0.1
-"""Share by which the step of timestamps may differ from 1/fps; jitter of measured ones leaves the median within it."""
+"""Maximum relative difference between the timestamp step and 1/fps; measured jitter leaves the median within it."""
 _MAX_VIDEO_ERROR = 0.01
 _CODING = ("video.codec", "video.pix_fmt", "video.height", "video.width", "video.fps")
 
@@ -46,12 +46,12 @@ def stated_info(root: Path) -> Mapping[str, Any]:
     except (OSError, ValueError):
         found = None
     if not isinstance(found, dict):
-        raise ExportError(f"{INFO_PATH} cannot be read, without which rate and names are not known: {root}")
+        raise ExportError(f"{INFO_PATH} cannot be read, so rate and names are unknown: {root}")
     return found
 
 
 def usable_info(stated: Mapping[str, Any], root: Path) -> DatasetInfo:
-    """Take info.json apart, with impossible counts and splits left out; ExportError if more of it is damaged."""
+    """Parse info.json without impossible counts and splits; ExportError if more of it is damaged."""
     data = dict(stated)
     for name, default in _COUNTS.items():
         if not _is_possible(name, data.get(name)):
@@ -60,7 +60,7 @@ def usable_info(stated: Mapping[str, Any], root: Path) -> DatasetInfo:
 
 
 def _is_possible(name: str, value: object) -> bool:
-    """Whether a count of info.json can be true; sizes of files may be parts of a MB."""
+    """Whether a count in info.json is possible; file sizes may be fractions of a MB."""
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _MAX_COUNT:
         return False
     if name.endswith("_in_mb"):
@@ -69,7 +69,7 @@ def _is_possible(name: str, value: object) -> bool:
 
 
 def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequence[Path]) -> Repaired:
-    """Let the features be those of columns and videos. Raises ExportError if data files differ in a feature's type."""
+    """Correct the features by columns and videos. Raises ExportError if data files differ in a feature's type."""
     schemas = [open_table(path).schema_arrow for path in tables]
     features = dict(info.features)
     changes: list[str] = []
@@ -78,7 +78,7 @@ def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequenc
         if (feature := features.get(name)) is not None and (not feature.is_numeric and feature.dtype != "string"):
             continue
         if found is None:
-            changes.append(f"The column {name} is left out: {schemas[0].field(name).type}, which no feature describes.")
+            changes.append(f"The column {name} is left out: {schemas[0].field(name).type} is not a feature type.")
             continue
         if name in AUTOMATIC_FEATURES:
             if found.dtype != AUTOMATIC_FEATURES[name].dtype and not _is_precise(name, found):
@@ -99,13 +99,13 @@ def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequenc
     shown = {path.parent.name for path in videos} | {path.parent.parent.name for path in videos}
     for name, feature in list(features.items()):
         if feature.is_video and name not in shown and shown & set(info.video_keys):
-            changes.append(f"{name} is left out: the dataset has no video of it.")
+            changes.append(f"{name} is left out: the dataset has no video for it.")
             del features[name]
         elif name not in AUTOMATIC_FEATURES and not feature.is_video and any(name not in s.names for s in schemas):
             changes.append(f"{name} is left out: no row has it.")
             del features[name]
         elif feature.names is None and feature.written_names:
-            changes.append(f"The names of {name} are left out: they are not those of {feature.shape[0]} elements.")
+            changes.append(f"The names of {name} are left out: they do not match its {feature.shape[0]} elements.")
             features[name] = replace(feature, written_names=None)
     for name, fixed in AUTOMATIC_FEATURES.items():
         own, there = features.get(name), all(name in schema.names for schema in schemas)
@@ -117,12 +117,12 @@ def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequenc
 
 
 def _is_precise(name: str, feature: DatasetFeature) -> bool:
-    """Whether a feature holds timestamps as float64, which LeRobot reads and edits keep."""
+    """Whether a feature has float64 timestamps, which LeRobot reads and edits keep."""
     return name == "timestamp" and feature.dtype == "float64"
 
 
 def _described(tables: Sequence[Path], schemas: Sequence[pa.Schema], name: str) -> DatasetFeature | None:
-    """Describe a column as a feature; None if it holds neither numbers nor text."""
+    """Describe a column as a feature; None if it has neither numbers nor text."""
     kinds = set()
     for schema in schemas:
         if name in schema.names:
@@ -145,7 +145,7 @@ def _described(tables: Sequence[Path], schemas: Sequence[pa.Schema], name: str) 
 
 
 def repaired_rate(info: DatasetInfo, table: Path, videos: Sequence[Path]) -> Repaired:
-    """Let fps be the rate of timestamps and videos, if these agree; ExportError if all three differ."""
+    """Set fps to the rate of timestamps and videos if these agree; ExportError if all three differ."""
     if "timestamp" not in open_table(table).schema_arrow.names:
         return info, []
     seconds = np.concatenate([column_numbers(batch.column(0))[:, 0] for batch in table_batches(table, ["timestamp"])])
@@ -160,14 +160,14 @@ def repaired_rate(info: DatasetInfo, table: Path, videos: Sequence[Path]) -> Rep
         return info, []  # then the timestamps are wrong
     if shown is not None and abs(shown * step - 1) > _MAX_RATE_ERROR:
         raise ExportError(
-            f"The rate is not known: info.json says {info.fps} frames per second, the timestamps {1 / step:.4g}, the "
+            f"The rate is ambiguous: info.json says {info.fps} frames per second, the timestamps {1 / step:.4g}, the "
             f"videos {shown:.4g}. Correct fps in meta/info.json: {table}"
         )
-    return replace(info, fps=rate), [f"fps is {rate}, as the timestamps have it; info.json says {info.fps}."]
+    return replace(info, fps=rate), [f"fps is {rate}, by the timestamps; info.json says {info.fps}."]
 
 
 def _video_rate(videos: Sequence[Path]) -> float | None:
-    """Images per second of the first video that can be read; None without any."""
+    """Images per second of the first readable video; None if there is none."""
     for path in videos:
         with suppress(ExportError):
             times = np.sort(mp4_index(path)[3])
@@ -177,7 +177,7 @@ def _video_rate(videos: Sequence[Path]) -> float | None:
 
 
 def repaired_cameras(folder: LeRobotFolder, images: Mapping[str, Sequence[tuple[Path, int]]]) -> Repaired:
-    """Let size and encoding of each camera be those of its first video."""
+    """Set size and encoding of each camera by its first video."""
     features = dict(folder.info.features)
     changes: list[str] = []
     for key in folder.info.video_keys:
@@ -188,7 +188,7 @@ def repaired_cameras(folder: LeRobotFolder, images: Mapping[str, Sequence[tuple[
             shape = (*size, 1 if feature.is_depth else 3)
             changes.append(f"{key} has images of {size[1]}x{size[0]} pixels; info.json says the shape {feature.shape}.")
         info = dict(feature.info or {})
-        with suppress(ExportError):  # of a codec that recordings do not hold, nothing more is known
+        with suppress(ExportError):  # for a codec that recordings do not support, nothing more is known
             told = file.stream_info()
             wrong = [name for name in _CODING if info.get(name) not in (None, told[name])]
             for name in wrong:

@@ -1,4 +1,4 @@
-"""Differences of tables, counts and statistics from the rows of a dataset."""
+"""Differences between a dataset's tables, counts and statistics and its rows."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASK
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES, Statistics, data_statistics
 
 _MAX_ERROR = 0.05
-"""Standard deviations by which a stored statistic may be off, as `demorec check` allows."""
+"""Maximum error of a stored statistic in standard deviations, the same as in `demorec check`."""
 _MIN_DEVIATION = 1e-4
 
 
@@ -27,9 +27,9 @@ def table_changes(
     """Yield a sentence for each kind of difference.
 
     Args:
-        folder: The dataset as it should be.
+        folder: The corrected dataset.
         stated: Its info.json, before the repair.
-        stored: Episode index -> where the table of episodes says that it is; empty if it is written from the rows.
+        stored: Episode index -> location in the table of episodes; empty if it is rewritten from the rows.
     """
     if stored:
         yield from _places(folder, stored)
@@ -65,7 +65,7 @@ def _places(folder: LeRobotFolder, stored: Mapping[int, EpisodePlace]) -> Iterat
 
 
 def _ends(folder: LeRobotFolder) -> Iterator[str]:
-    """Compare the ends of rows and images in the table of episodes with their beginnings and the lengths."""
+    """Compare the ends of rows and images in the table of episodes with their starts and the lengths."""
     wrong: dict[str, int] = {}
     for path in folder.episode_tables:
         there = open_table(path).schema_arrow.names
@@ -85,13 +85,13 @@ def _ends(folder: LeRobotFolder) -> Iterator[str]:
 
 
 def _paths(folder: LeRobotFolder) -> Iterator[str]:
-    """Find paths of info.json that lead to no file; before v3.0, since others have the usual ones afterwards."""
+    """Find path templates of info.json without files; before v3.0, because the repair writes the usual ones."""
     last, info = folder.listed[-1], folder.info
     position = FilePosition(chunk=last.episode_index // int(info.chunks_size), file=last.episode_index)
     paths = {folder.root / position.path(info.data_path): last.data}
     paths |= {folder.root / position.path(info.video_path or "", key): path for key, (path, _) in last.videos.items()}
     if info.is_old and any(path != found for path, found in paths.items()):
-        yield "info.json names files that are not there: the paths are those of v3.0."
+        yield "info.json names missing files: the paths are now those of v3.0."
 
 
 def _tasks(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
@@ -101,9 +101,9 @@ def _tasks(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
         if not folder.info.is_old:
             numbers = read_table(folder.root / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
     except ExportError:
-        return  # a change already
+        return  # already a change
     if numbers != list(range(len(numbers))):
-        yield "The table of tasks is numbered from 0 on, in order."
+        yield "The table of tasks is numbered from 0, in order."
     elif not folder.info.is_old:
         pandas = (open_table(folder.root / TASKS_PATH).schema_arrow.metadata or {}).get(b"pandas", b"{}")
         if not json.loads(pandas).get("index_columns"):
@@ -130,7 +130,7 @@ def _totals(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
 
 
 def has_possible_splits(splits: Any, episodes: int) -> bool:
-    """Whether splits are ranges of the episodes that do not overlap."""
+    """Whether splits are disjoint ranges of the episodes."""
     if not isinstance(splits, dict) or not splits:
         return False
     try:
@@ -148,7 +148,7 @@ def _strays(folder: LeRobotFolder) -> Iterator[str]:
 
 
 def _statistics(folder: LeRobotFolder) -> Iterator[str]:
-    """Compare the statistics with those of the rows."""
+    """Compare the statistics with the rows."""
     try:
         stored = folder.statistics
     except ExportError as error:
@@ -166,7 +166,7 @@ def _statistics(folder: LeRobotFolder) -> Iterator[str]:
 
 
 def _is_close(stored: Mapping[str, Any] | None, found: Statistics) -> bool:
-    """Whether stored statistics are those of the rows; LeRobot's estimated quantiles lie between the extremes."""
+    """Whether stored statistics match the rows; LeRobot's estimated quantiles are between the extremes."""
     try:
         told = Statistics.from_json(stored or {})
     except (ValueError, TypeError):
@@ -184,7 +184,7 @@ def _is_close(stored: Mapping[str, Any] | None, found: Statistics) -> bool:
 
 
 def stated_splits(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Mapping[str, str] | None:
-    """The splits that info.json says, if they are possible and the episodes keep their numbers."""
+    """The splits in info.json, if they are possible and the episodes keep their numbers."""
     splits = stated.get("splits")
     is_kept = [place.episode_index for place in folder.listed] == list(range(len(folder.listed)))
     return splits if is_kept and has_possible_splits(splits, len(folder.listed)) else None

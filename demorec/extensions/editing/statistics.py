@@ -1,4 +1,4 @@
-"""In what the statistics of two datasets differ: of the whole, of each episode; what is one feature under two names."""
+"""Differences between the statistics of two datasets, overall and by episode, and renamed features."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from demorec.extensions.editing.content import TASK, Shared
 
 _PLACES = ("index", "episode_index", "task_index")
 _SAME = ("min", "max", "mean", "count")
-"""By which a feature is known under another name."""
+"""Statistics that identify a renamed feature."""
 _TOLERANCE = 1e-6
-"""Relative to the larger value or the feature's range: some writers sum in float32, and in the order of episodes."""
+"""Relative to the larger value or the feature's range: some writers sum in float32, and in episode order."""
 
 
 def renamed(a: LeRobotFolder, b: LeRobotFolder) -> dict[str, str]:
-    """Features of A that B has under another name: of the same type, shape and elements, with the same statistics."""
+    """Features of A with another name in B: the same type, shape, elements and statistics."""
     gone = [name for name in a.info.features if name not in b.info.features]
     new = [name for name in b.info.features if name not in a.info.features]
     if not gone or not new:
@@ -45,10 +45,10 @@ def renamed(a: LeRobotFolder, b: LeRobotFolder) -> dict[str, str]:
 def statistics_differences(
     sources: Folders, shared: Shared, found: Sequence[DiffEntry], *, is_reordered: bool
 ) -> Iterator[DiffEntry]:
-    """Of features whose rows and images are all the same: else statistics differ as they should."""
+    """Differences for features with equal rows and images; for others, different statistics are expected."""
     tables = [_stats(source) for source in sources]
     if any(not table and source.info.is_old for table, source in zip(tables, sources, strict=True)):
-        return  # v2.1 has those of each episode only
+        return  # v2.1 has statistics for each episode only
     episodes = [item for item in found if item.level in ("episodes", "rows", "images") and item.episodes is not None]
     if any(item.name in ("missing", "extra", "length") and item.level == "episodes" for item in episodes):
         return
@@ -74,7 +74,7 @@ def statistics_differences(
 def episode_statistics_differences(
     sources: Folders, shared: Shared, found: Sequence[DiffEntry], pairs: Mapping[int, int]
 ) -> Iterator[DiffEntry]:
-    """Of each episode, as the table of episodes has them, where the rows or images of the feature are the same."""
+    """Differences for each episode in the table of episodes, for features with equal rows or images."""
     if any(source.info.is_old for source in sources):
         return
     differing = {(item.name, item.episodes) for item in found if item.level in ("rows", "images")}
@@ -104,7 +104,7 @@ def episode_statistics_differences(
 
 
 def _of_episodes(source: LeRobotFolder, name: str) -> list[Mapping[str, Any]]:
-    """The statistics of a feature by episode in order; empty unless each episode has all ten."""
+    """Statistics of a feature by episode in order; empty unless each episode has all ten."""
     found = [entry for _, _, entry in episode_statistics(source, [name])]
     return found if len(found) == len(source.places) else []
 
@@ -125,7 +125,7 @@ def _is_close(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> bool:
 
 
 def _worst(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> str:
-    """A number in words, of the element that differs most."""
+    """The statistic of the element that differs most, in words."""
     try:
         x, y = (np.asarray(entry[key], dtype=np.float64).ravel() for entry in (a, b))
         place = int(np.nan_to_num(np.abs(x - y), nan=np.inf).argmax())

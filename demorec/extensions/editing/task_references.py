@@ -1,4 +1,4 @@
-"""Columns of rows that refer to the table of tasks by number, as GR00T's `annotation.*` do."""
+"""Row columns that refer to the table of tasks by number, such as GR00T's `annotation.*`."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
 from demorec.extensions.editing.plan import Plan
 
 _KNOWN = "annotation."
-"""Beginning of the names of GR00T's columns, whose values are numbers of tasks."""
+"""Prefix of GR00T's columns with task numbers."""
 _TASK_WORD = re.compile(r"(^|[._])(annotations?|tasks?|subtasks?)([._]|$)")
 
 
 def reference_columns(info: DatasetInfo) -> tuple[str, ...]:
-    """Find the columns of whole numbers whose names say that they may be numbers of tasks."""
+    """Find the integer columns whose names suggest task numbers."""
     return tuple(
         name
         for name, feature in info.features.items()
@@ -29,17 +29,17 @@ def reference_columns(info: DatasetInfo) -> tuple[str, ...]:
 
 
 def kept_tasks(plan: Plan) -> tuple[str, ...]:
-    """Return the tasks that the new dataset begins with; none where no column refers to them."""
+    """Return the first tasks of the new dataset; empty if no column refers to them."""
     if not any(reference_columns(source.info) for source in plan.sources):
         return ()
     return tuple(dict.fromkeys(task for source in plan.sources for task in source.tasks))
 
 
 def new_task_numbers(plan: Plan, number: int) -> NDArray[np.int64]:
-    """Map the numbers of a source's tasks to those of `kept_tasks`, (N,).
+    """Map a source's task numbers to those of `kept_tasks`, (N,).
 
     Raises:
-        ConfigError: Numbers change, and a column that may refer to them is of an unknown kind.
+        ConfigError: Numbers change, and a column of unknown kind may refer to them.
     """
     source, places = plan.sources[number], {task: place for place, task in enumerate(kept_tasks(plan))}
     numbers = np.array([places[task] for task in source.tasks], dtype=np.int64)
@@ -47,14 +47,14 @@ def new_task_numbers(plan: Plan, number: int) -> NDArray[np.int64]:
     taken = {mapping.feature for mapping in plan.mappings[number].values()}
     if (numbers != np.arange(len(numbers))).any() and (lost := [name for name in unknown if name in taken]):
         raise ConfigError(
-            f"The column {lost[0]} may hold numbers of tasks, which this renumbers: leave it out first (demorec "
+            f"The column {lost[0]} may hold task numbers, which would change: leave it out first (demorec "
             f"dataset drop-features), or give the datasets the same tasks: {source.root}"
         )
     return numbers
 
 
 def renumbered(values: NDArray[np.int64], numbers: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Replace numbers of tasks by the new ones; values that are not numbers of tasks stay."""
+    """Replace task numbers; other values stay."""
     is_task = (values >= 0) & (values < len(numbers))
     found = values.copy()
     found[is_task] = numbers[values[is_task]]

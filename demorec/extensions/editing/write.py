@@ -1,4 +1,4 @@
-"""Writes a planned dataset in one pass: rows and packets pass through, counters and statistics are made anew."""
+"""Write a planned dataset in one pass: rows and packets pass through, counters and statistics are recomputed."""
 
 from __future__ import annotations
 
@@ -55,39 +55,39 @@ _OF_THE_END = ("next.done", "next.success", "next.reward")
 def new_datasets(
     outs: Sequence[Path], sources: Sequence[LeRobotFolder], *, overwrite: bool
 ) -> AbstractContextManager[Sequence[Path]]:
-    """Give a folder for each new dataset; all appear together when the block ends without an error.
+    """Yield a folder for each new dataset; all appear together when the block ends without an error.
 
     Args:
-        outs: Where the datasets go.
-        sources: What they are made from, which is never replaced.
-        overwrite: Whether existing datasets are replaced.
+        outs: Paths of the datasets.
+        sources: Source datasets, which are never replaced.
+        overwrite: Whether existing datasets may be replaced.
 
     Raises:
-        ConfigError: Something is in the way.
-        ExportError: They cannot be written; what was there before is still there.
+        ConfigError: A path exists and may not be replaced.
+        ExportError: They cannot be written; existing datasets are unchanged.
     """
     return atomic_write_all(outs, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
 
 
 def check_target(out: Path, sources: Sequence[LeRobotFolder], *, overwrite: bool) -> None:
-    """Raise ConfigError if `new_datasets` would, since something is in the way at `out`."""
+    """Raise ConfigError if `new_datasets` would, because `out` exists."""
     check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
 
 
 def write_plan(
     plan: Plan, folder: Path, *, decode: bool = False, progress: ProgressCallback | None = None
 ) -> tuple[int, int]:
-    """Write a dataset into an empty folder; its sources are not touched.
+    """Write a dataset to an empty folder; its sources are not changed.
 
     Args:
         plan: Episodes and features of the dataset.
         folder: Its folder.
-        decode: Decode all images for their statistics, also of episodes whose own are known.
+        decode: Whether to decode all images for their statistics, even if an episode's are known.
         progress: Called after every episode.
 
     Returns:
-        How many episodes' images were decoded for their statistics; how many images beside cuts stay in the videos,
-        since others are decoded from them.
+        Number of episodes whose images were decoded for their statistics, and number of images beside cuts that stay in
+        the videos because others are decoded from them.
 
     Raises:
         ExportError: A source is damaged.
@@ -116,7 +116,7 @@ def write_plan(
 
 
 def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
-    """Columns of facts of all sources; of two types for one name the first one's."""
+    """Fact columns of all sources; for conflicting types the first source's."""
     found: dict[str, pa.DataType] = {}
     for source in plan.sources:
         found = {**source.fact_types, **found}
@@ -124,7 +124,7 @@ def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
 
 
 class _Reader:
-    """The episodes of one source as the plan wants them."""
+    """Reader of one source's episodes for the plan."""
 
     def __init__(self, plan: Plan, number: int, *, decode: bool) -> None:
         self.source = plan.sources[number]
@@ -195,10 +195,10 @@ class _Reader:
         )
 
     def _timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[Any] | None:
-        """(T,) timestamps of a cut, (T,); None for the multiples of 1/fps.
+        """(T,) timestamps of a cut; None for multiples of 1/fps.
 
-        Those of a cut that begins with its episode stay to the bit. Of a later one, whose timestamps were measured, the
-        first is subtracted in float64, and the result is rounded once.
+        A cut that begins with its episode has bit-exact timestamps. For a later one with measured timestamps, the first
+        is subtracted in float64 and the result rounded once.
         """
         if not self.source.keeps_timestamps:
             return None
@@ -212,14 +212,14 @@ class _Reader:
         return measured
 
     def _kept(self, place: EpisodePlace, key: str) -> Statistics | None:
-        """The statistics that the source keeps of an episode, weighted by its frames; None where it has none."""
+        """The source's statistics of an episode, weighted by its frames; None if it has none."""
         if (found := self._known.get((place.episode_index, key))) is None:
             return None
         values = dict(zip(_NUMBERS, found[1], strict=True))
         return Statistics(values=values, count=min(found[0], place.length), is_camera=True)
 
     def _counted(self, key: str, cut: EpisodeSlice, rows: pa.Table) -> PixelHistogram:
-        """Every pixel of a camera in a cut, whose rows have been read."""
+        """Histogram of a camera's pixels in a cut, from its rows."""
         place, feature = self.source.places[cut.episode], self.source.info.features[key]
         if feature.is_video:
             return _video_histogram(self.source.video(key, place), feature, cut.first, cut.last)
@@ -230,7 +230,7 @@ class _Reader:
         array = array if isinstance(array, pa.Array) else pa.concat_arrays(array.chunks)
         if not mapping.is_copy:
             return mapping.apply(column_numbers(array), feature.dtype)
-        if feature.dtype == "image" and not pa.types.is_struct(array.type):  # plain bytes, as LeRobot reads them too
+        if feature.dtype == "image" and not pa.types.is_struct(array.type):  # plain bytes, which LeRobot also reads
             array = pa.StructArray.from_arrays(
                 [array.cast(pa.binary()), pa.nulls(len(array), pa.string())], names=["bytes", "path"]
             )
@@ -250,13 +250,13 @@ class _Reader:
         return [first] if (found == found[0]).all() else [tasks[index] for index in found.tolist()]
 
     def _language(self, rows: pa.Table, cut: EpisodeSlice) -> EpisodeLanguage:
-        """What is said in these rows, times counted from the first of them."""
+        """Language of these rows, with times counted from the first of them."""
         spoken = spoken_of(rows.select(COLUMNS).to_batches(), self.source.root)
         latest: dict[str, dict[str, Any]] = {}
         kept = []
         for row in spoken.persistent:
             if cut.task and row.get("style") == "task_aug":
-                continue  # wordings of the old instruction, which LeRobot would say in place of the new one
+                continue  # wordings of the old instruction, which LeRobot would use instead of the new one
             time = row.get("timestamp")
             frame = None if time is None else round(time * self._fps) - cut.first
             if frame is None or not cut.first:
@@ -283,14 +283,14 @@ class _Reader:
 
 
 def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
-    """A cut column in whose last row stands what only the last row of the whole episode states: how it ended."""
+    """A cut column with the values of the episode's last row in its last row, such as the outcome."""
     if column_numbers(column)[:-1].any():
         return kept
     return pa.concat_arrays([kept[:-1], column[-1:]])
 
 
 def _clipped_stages(facts: Mapping[str, Any], cut: EpisodeSlice) -> dict[str, Any]:
-    """The stages of an episode within a cut, frames counted from its first one."""
+    """The stages of an episode within a cut, with frames counted from its first one."""
     names, starts, ends = facts.get(STAGE_NAMES), facts.get(STAGE_STARTS), facts.get(STAGE_ENDS)
     if not names or not starts or not ends:
         return {}
@@ -304,7 +304,7 @@ def _clipped_stages(facts: Mapping[str, Any], cut: EpisodeSlice) -> dict[str, An
 
 
 def _kept_statistics(source: LeRobotFolder) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:
-    """(episode_index, camera) -> count and (9, C) numbers of the statistics that a dataset keeps of each episode."""
+    """(episode_index, camera) -> count and (9, C) statistics of each episode in the dataset."""
     keys = [name for name, feature in source.info.features.items() if feature.is_camera]
     found: dict[tuple[int, str], tuple[int, NDArray[np.float64]]] = {}
     for number, key, entry in episode_statistics(source, keys):
@@ -319,7 +319,7 @@ def _kept_statistics(source: LeRobotFolder) -> dict[tuple[int, str], tuple[int, 
 
 
 def _video_histogram(video: EpisodeVideo, feature: DatasetFeature, first: int, last: int) -> PixelHistogram:
-    """Of the images of some frames of a video, decoded, every pixel counted."""
+    """Histogram of some frames of a video, decoded."""
     if not feature.is_depth:
         return _histogram(islice(video.images(first), last - first))
     levels = video.depth_scale.values() * (1000 if (feature.info or {}).get("depth_unit") == "mm" else 1)

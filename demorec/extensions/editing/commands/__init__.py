@@ -1,4 +1,4 @@
-"""`demorec dataset`: the commands that edit and compare LeRobot datasets, whoever wrote them."""
+"""`demorec dataset`: commands that edit and compare LeRobot datasets from any writer."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from demorec.core.registry import Registry
 
 
 class DatasetCommand:
-    """Edit LeRobot datasets: no image is encoded again, the sources stay as they are.
+    """Edit LeRobot datasets without re-encoding images or changing the sources.
 
-    Any LeRobot dataset (v3.0, v2.1) is read; a run stands for its own dataset. The result appears whole or not at all.
+    Reads any LeRobot dataset (v3.0, v2.1); a run means its own dataset. The result appears complete or not at all.
     """
 
     commands: Registry[Any] = Registry(kind="command of demorec dataset", rows=ExtensionRows("operations"))

@@ -1,4 +1,4 @@
-"""`demorec dataset repair` and `demorec dataset cut`: wrong tables, and episodes that should be several."""
+"""`demorec dataset repair` and `demorec dataset cut`: fix wrong tables, and split episodes."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 class Repair(EditOne):
     """Rebuild tables, counts, indices, types and statistics from the rows and videos, and list each change.
 
-    Rows, images and texts are never invented: what only those could mend is refused, or its episodes are left out.
-    A dataset without faults is not written again.
+    Rows, images and texts are never invented: faults that would need it are refused, or their episodes are left out. A
+    dataset without faults is not rewritten.
 
     Examples:
       demorec dataset repair cups --dry-run
@@ -28,19 +28,19 @@ class Repair(EditOne):
     """
 
     def sources(self) -> Sequence[LeRobotFolder]:
-        """The dataset as its rows have it."""
+        """The dataset, reconstructed from its rows."""
         from demorec.extensions.editing.repair import RepairedDataset
 
         return [RepairedDataset(dataset_at(self.dataset))]
 
     def has_work(self, sources: Sequence[LeRobotFolder]) -> bool:
-        """Whether anything is to be repaired."""
+        """Whether there is anything to repair."""
         if not sources[0].notes:
             say(f"Nothing to repair, so nothing is written: {self.dataset}")
         return bool(sources[0].notes)
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """All episodes whose rows and images can be read."""
+        """All episodes with readable rows and images."""
         from demorec.extensions.editing.repair import RepairedDataset
 
         assert isinstance(sources[0], RepairedDataset)
@@ -49,10 +49,10 @@ class Repair(EditOne):
 
 @dataclass(frozen=True, kw_only=True)
 class Cut(EditOne):
-    """Cut episodes into parts: before given frames, where the data jump, or around pauses, which are taken out.
+    """Cut episodes into parts: before given frames, at jumps of the data, or around pauses, which are removed.
 
-    Each part becomes an episode. Packets pass through; images that a part needs from before its first frame stay
-    in the video, and are counted.
+    Each part becomes an episode. Packets pass through; images that a part needs from before its first frame stay in the
+    video and are counted.
 
     Examples:
       demorec dataset cut cups --at 0=120,260 3=45 --out parts
@@ -61,17 +61,17 @@ class Cut(EditOne):
     """
 
     at: tuple[str, ...] = ()
-    """Episodes and the frames that begin another part, 0=120,260 3=45."""
+    """Episodes and the first frames of further parts, 0=120,260 3=45."""
     jumps: bool = False
-    """Cut where the state jumps, as where rollouts were recorded as one episode."""
+    """Cut where the state jumps, e.g. if several rollouts were recorded as one episode."""
     pauses: float | None = None
-    """Take out each pause of at least this many seconds."""
+    """Remove each pause of at least this many seconds."""
     feature: tuple[str, ...] = ()
     """With --jumps or --pauses: features to watch (auto: the state without grippers)."""
     jump_threshold: float = 0.05
-    """With --jumps: a jump is a step that exceeds those near it by more than this share of the range."""
+    """With --jumps: minimum excess of a jump over neighbouring steps, as a ratio of the range."""
     still_threshold: float = 0.01
-    """With --pauses: motion is a change by more than this share of the range."""
+    """With --pauses: minimum change that counts as motion, as a ratio of the range."""
     margin: int = 3
     """With --pauses: still frames to keep at either end of a pause."""
 
@@ -81,7 +81,7 @@ class Cut(EditOne):
 
         (source,) = sources
         if [bool(self.at), self.jumps, self.pauses is not None].count(True) != 1:
-            raise ConfigError("Say where to cut: --at EPISODE=FRAMES, --jumps or --pauses SECONDS.")
+            raise ConfigError("Name the cuts: --at EPISODE=FRAMES, --jumps or --pauses SECONDS.")
         if self.at:
             return cut.cut_at(source, self._frames())
         if self.pauses is None:

@@ -15,7 +15,7 @@ from demorec.extensions.editing.commands.edit import MAX_SHOWN, dataset_at
 
 @dataclass(frozen=True, kw_only=True)
 class Diff:
-    """Name every difference between two datasets, whatever the order of their episodes.
+    """Report every difference between two datasets, in any order of their episodes.
 
     Exit code 0: none, 1: some, 2: unreadable.
 
@@ -40,7 +40,7 @@ class Diff:
         try:
             with ProgressBar("reading") as bar:
                 found = diff(a, b, progress=bar.set)
-        except ExportError as error:  # whose exit code would mean that the datasets differ
+        except ExportError as error:  # its exit code would mean that the datasets differ
             raise ConfigError(str(error)) from error
         if self.json:
             say_json(found.to_json())

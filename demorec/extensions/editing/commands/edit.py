@@ -1,4 +1,4 @@
-"""What the editing commands have in common: the new dataset, what is printed about it, words that name episodes."""
+"""Shared parts of the editing commands: the new dataset, its printed summary, and episode lists."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
 MAX_SHOWN = 20
-"""Ranges of episodes, or differences of one level, that are printed."""
+"""Maximum ranges of episodes, or differences of one level, that are printed."""
 DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
 CONDITION_HELP = (
     "Condition on columns of the table of episodes or of demorec's sidecar, and on episode_index, num_frames, "
@@ -35,40 +35,42 @@ class Edit:
     out: OptionalTarget = None
     """Folder of the new dataset."""
     decode: bool = False
-    """Decode all images, so that their statistics are exact to the pixel; else those of whole episodes are merged."""
+    """Decode all images, so that their statistics are exact to the pixel; otherwise those of whole episodes
+    are merged.
+    """
     overwrite: bool = False
     """Replace an existing dataset."""
     dry_run: bool = False
-    """Print what would come out, and write nothing."""
+    """Print a summary of the result without writing it."""
 
     def sources(self) -> Sequence[LeRobotFolder]:
         """The datasets to read."""
         raise NotImplementedError
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """The new dataset."""
+        """Plan of the new dataset."""
         raise NotImplementedError
 
     def has_work(self, sources: Sequence[LeRobotFolder]) -> bool:
-        """Whether there is anything to write; says so otherwise."""
+        """Whether there is anything to write; prints a line if not."""
         return True
 
     def part_names(self) -> Sequence[str]:
-        """Names of the new datasets within --out; "" for --out itself."""
+        """Names of the new datasets in --out; "" for --out itself."""
         return [""]
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
-        """Name within --out -> new dataset."""
+        """Name in --out -> plan of the new dataset."""
         return {"": self.plan(sources)}
 
     def run(self) -> int:
-        """Plan, write, and print what came out."""
+        """Plan, write, and print a summary."""
         from demorec.datasets.lerobot.files import leave_pandas_out
         from demorec.extensions.editing.write import check_target
 
         leave_pandas_out()
         if self.out is None and not self.dry_run:
-            raise ConfigError("Name the folder of the new dataset (--out NEW), or ask what it would be (--dry-run).")
+            raise ConfigError("Name the folder of the new dataset (--out NEW), or preview it (--dry-run).")
         sources = self.sources()
         say(*(note for source in sources for note in source.notes))
         if not self.has_work(sources):
@@ -82,11 +84,11 @@ class Edit:
             check_target(out, sources, overwrite=self.overwrite)
         for name, plan in self.plans(sources).items():
             say(*_changes(plan))
-            self._print_result("Would be ", name, plan, "Would not be taken over")
+            self._print_result("Would be ", name, plan, "Would be left out")
         return 0
 
     def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
-        """Write the new datasets, which appear together, and print what came out."""
+        """Write the new datasets, which appear together, and print a summary."""
         from demorec.extensions.editing.write import new_datasets, write_plan
 
         results: list[tuple[int, int]] = []
@@ -97,9 +99,9 @@ class Edit:
                     results.append(write_plan(plan, folder, decode=self.decode, progress=bar.set))
         for (name, plan), (decoded, around) in zip(plans.items(), results, strict=True):
             say(*_changes(plan))
-            self._print_result("", name, plan, "Not taken over")
+            self._print_result("", name, plan, "Left out")
             if around:
-                say(f"{counted(around, 'image')} beside cuts stay in the videos, since others need them.")
+                say(f"{counted(around, 'image')} beside cuts stay in the videos, because others need them.")
             if decoded:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
@@ -120,12 +122,12 @@ class Edit:
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
         if unknown := unknown_files(plan.sources[0]) if len(plan.sources) == 1 else ():
             more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
-            say(f"Copied, but not understood: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still hold.")
+            say(f"Copied, but unknown: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still apply.")
 
 
 @dataclass(frozen=True, kw_only=True)
 class EditOne(Edit):
-    """Flags of every command that makes one dataset of another."""
+    """Flags of every command that makes one dataset from another."""
 
     dataset: DatasetPath
 
@@ -137,7 +139,7 @@ class EditOne(Edit):
 
 
 def _changes(plan: Plan) -> list[str]:
-    """Lines about what is done to episodes."""
+    """Lines about the changes of episodes."""
     from demorec.extensions.editing.plan import mistyped_features
 
     lines = []
@@ -164,19 +166,19 @@ def _changes(plan: Plan) -> list[str]:
 
 
 def dataset_at(path: Path) -> Path:
-    """The named dataset, or that of a run; ConfigError for anything else."""
+    """The named dataset, or a run's dataset; ConfigError for anything else."""
     from demorec.runs.find import expect
     from demorec.runs.run_file import DATASET
 
     if expect(path, "dataset", "run").kind == "dataset":
         return path
     if not is_dataset(path / DATASET):
-        raise ConfigError(f"This run has no dataset in {DATASET}/, make one (demorec export lerobot): {path}")
+        raise ConfigError(f"This run has no dataset in {DATASET}/, create one (demorec export lerobot): {path}")
     return path / DATASET
 
 
 def episode_numbers(texts: Sequence[str]) -> list[int]:
-    """Numbers of episodes from 0,3,5:9 or 0 3 5:9; a range excludes its end."""
+    """Parse episode numbers such as 0,3,5:9 or 0 3 5:9; a range excludes its end."""
     found: list[int] = []
     try:
         for part in " ".join(texts).replace(",", " ").split():
@@ -190,7 +192,7 @@ def episode_numbers(texts: Sequence[str]) -> list[int]:
 
 
 def _listed(numbers: Sequence[int]) -> str:
-    """Some of the numbers, as `episode_numbers` reads them."""
+    """Format some episode numbers in the form of `episode_numbers`."""
     parts: list[tuple[int, int]] = []
     for number in numbers:
         if parts and parts[-1][1] == number:
@@ -202,7 +204,7 @@ def _listed(numbers: Sequence[int]) -> str:
 
 
 def pairs(words: Sequence[str], example: str) -> dict[str, str]:
-    """NAME=VALUE of each word; ConfigError for anything else."""
+    """Parse NAME=VALUE in each word; ConfigError for anything else."""
     found = dict(word.partition("=")[::2] for word in words)
     if not words or any("=" not in word for word in words) or len(found) != len(words):
         given = f", not {' '.join(words)!r}" if words else ""

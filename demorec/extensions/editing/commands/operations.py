@@ -1,4 +1,4 @@
-"""The commands that make a dataset of others: which episodes, in which order, with which names, features and texts."""
+"""Commands that make a new dataset: selection, order, names, features and texts."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class Chosen(EditOne):
-    """Flags that choose episodes."""
+    """Flags that select episodes."""
 
     where: Annotated[str, arg(help=CONDITION_HELP)] = ""
     episodes: tuple[str, ...] = ()
     """Numbers of episodes, 0,3,5:9."""
 
     def chosen(self, source: LeRobotFolder) -> list[int]:
-        """Numbers of the chosen episodes."""
+        """Numbers of the selected episodes."""
         from demorec.extensions.editing.columns import columns_of
         from demorec.extensions.editing.operations import chosen, names_in
 
@@ -36,7 +36,7 @@ class Chosen(EditOne):
 
 @dataclass(frozen=True, kw_only=True)
 class Select(Chosen):
-    """Keep the episodes that are named or for which a condition holds.
+    """Keep episodes by number or condition.
 
     Examples:
       demorec dataset select cups --where 'success and num_frames < 300' --out good
@@ -45,7 +45,7 @@ class Select(Chosen):
     """
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """The chosen episodes."""
+        """The selected episodes."""
         return self._select(sources[0], drop=False)
 
     def _select(self, source: LeRobotFolder, *, drop: bool) -> Plan:
@@ -58,7 +58,7 @@ class Select(Chosen):
 
 @dataclass(frozen=True, kw_only=True)
 class Drop(Select):
-    """Leave out the episodes that are named or for which a condition holds.
+    """Leave out episodes by number or condition.
 
     Examples:
       demorec dataset drop cups --episodes 3,7,20:25 --out rest
@@ -66,13 +66,13 @@ class Drop(Select):
     """
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """All episodes but the chosen ones."""
+        """All episodes except the selected ones."""
         return self._select(sources[0], drop=True)
 
 
 @dataclass(frozen=True, kw_only=True)
 class SetTask(Chosen):
-    """Give all episodes, or the chosen ones, another instruction.
+    """Give all episodes, or the selected ones, another instruction.
 
     Examples:
       demorec dataset set-task cups --task 'pick up the cup' --out relabelled
@@ -83,7 +83,7 @@ class SetTask(Chosen):
     """The new instruction."""
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """All episodes, the chosen ones with the new instruction."""
+        """All episodes, with the new instruction for the selected ones."""
         from demorec.extensions.editing.operations import set_task
 
         return set_task(sources[0], self.task, self.chosen(sources[0]))
@@ -107,7 +107,7 @@ class Trim(EditOne):
     idle_feature: str | None = None
     """With --idle: feature whose changes count as motion (auto: the state)."""
     idle_threshold: float = 0.01
-    """With --idle: motion is a change by more than this share of the feature's range."""
+    """With --idle: minimum change that counts as motion, as a ratio of the feature's range."""
     idle_margin: int = 3
     """With --idle: still frames to keep at either end."""
 
@@ -123,7 +123,7 @@ class Trim(EditOne):
         return operations.trim(sources[0], self.head, self.tail)
 
     def _state(self, source: LeRobotFolder) -> tuple[str, ...]:
-        """The features that are the state; ConfigError if none is found."""
+        """Features of the state; ConfigError if none is found."""
         found = source.roles.state
         if not found:
             raise ConfigError(f"No state was found: name a feature by --idle-feature: {source.root}")
@@ -132,7 +132,7 @@ class Trim(EditOne):
 
 @dataclass(frozen=True, kw_only=True)
 class Split(EditOne):
-    """Split a dataset into parts, each a dataset in a folder of its name within --out; all appear together.
+    """Split a dataset into parts, each in a folder with its name in --out; all appear together.
 
     Examples:
       demorec dataset split cups --shares train=0.8 val=0.2 --out parts
@@ -151,7 +151,7 @@ class Split(EditOne):
         return list(self._shares())
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
-        """Name of each part -> its episodes."""
+        """Name of each part -> its plan."""
         from demorec.extensions.editing.columns import columns_of
         from demorec.extensions.editing.operations import split
 
@@ -166,7 +166,7 @@ class Split(EditOne):
         except ValueError as error:
             raise ConfigError(f"A share is a number: {example}.") from error
         if wrong := [name for name in shares if Path(name).name != name or name in ("", ".", "..")]:
-            raise ConfigError(f"A part cannot be called {wrong[0]!r}: its name is that of its folder.")
+            raise ConfigError(f"A part cannot be called {wrong[0]!r}: its name is also its folder.")
         return shares
 
 
@@ -174,8 +174,7 @@ class Split(EditOne):
 class Merge(Edit):
     """Merge datasets; features are matched by name, and all differences are reported at once.
 
-    Where datasets differ, a mapping is printed that joins what can be joined: check its lines, save them, and give
-    them with --mapping.
+    If datasets differ, prints a mapping that merges as much as possible: check its lines, save them, and use --mapping.
 
     Examples:
       demorec dataset merge monday tuesday --out both
@@ -190,7 +189,7 @@ class Merge(Edit):
     """Mapping file (TOML) for datasets that differ."""
 
     def sources(self) -> Sequence[LeRobotFolder]:
-        """The datasets in their order."""
+        """The datasets in the given order."""
         from demorec.datasets.lerobot.folder import LeRobotFolder
 
         return [LeRobotFolder(dataset_at(path)) for path in self.datasets]
@@ -206,7 +205,7 @@ class Merge(Edit):
                 raise
             say(*error.mapping)
             raise ConfigError(
-                f"{error} A mapping could be the lines above: look at each, save them (> FILE) and give --mapping FILE."
+                f"{error} The lines above are a possible mapping: check each, save them (> FILE), use --mapping FILE."
             ) from error
 
 
@@ -222,7 +221,7 @@ class Rename(EditOne):
     names: Annotated[Positional[tuple[str, ...]], arg(metavar="OLD=NEW", help="Old and new name of each feature.")]
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """All episodes with features under other names."""
+        """All episodes with renamed features."""
         from demorec.extensions.editing.operations import rename
 
         return rename(sources[0], pairs(self.names, "rename DATASET OLD=NEW"))
@@ -282,7 +281,7 @@ class Shuffle(EditOne):
     """Seed of the order."""
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """All episodes in an order that the seed decides."""
+        """All episodes in a random order by seed."""
         from demorec.extensions.editing.operations import shuffle
 
         return shuffle(sources[0], self.seed)
