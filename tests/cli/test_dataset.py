@@ -112,7 +112,7 @@ def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.Capture
         (("rename", "actoin=act"), "Did you mean 'action'?"),
         (("drop-features",), "Name the features to leave out"),
         (("set-task",), "--task 'pick up the cup'"),
-        (("set-task", "--task", "pull it", "--where", "num_frames > 8"), "No episode is chosen"),
+        (("set-task", "--task", "pull it", "--where", "num_frames > 8"), "No episode is selected"),
     ],
 )
 def test_a_mistake_is_named_with_what_to_do(

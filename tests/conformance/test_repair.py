@@ -131,7 +131,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         column("meta/episodes", f"{VIDEO}/from_timestamp", lambda v: [x + 0.7 for x in v]), f"images of {TOP}"),
     "index from 0 in each file": (column("data", "index", lambda v: [x + 7 for x in v]), "index counts on"),
     "episodes from 3 on": (column("data", "episode_index", lambda v: [x + 3 for x in v]), "they were 3, 4, 5, 6"),
-    "files joined by hand": (same_numbers, "numbered from 0 on"),
+    "files joined by hand": (same_numbers, "numbered from 0;"),
     "no counters (lerobot#3068)": (without("frame_index", "index"), "frame_index is int64"),
     "no episode_index": (without("episode_index"), "episode_index is int64"),
     "no timestamps": (without("timestamp"), "timestamp is float32"),
