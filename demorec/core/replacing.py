@@ -115,9 +115,9 @@ def use_as_source(target: Path, sources: Iterable[Path]) -> str:
     for source in sources:
         resolved = source.resolve()
         if resolved == target:
-            return "this command reads it"
+            return "it is an input of this command"
         if resolved.is_relative_to(target):
-            return f"this command reads something in it ({source})"
+            return f"an input of this command is inside it ({source})"
         if target.is_relative_to(resolved):
             return f"it is inside an input of this command ({source})"
     return ""

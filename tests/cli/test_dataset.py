@@ -91,7 +91,7 @@ def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.Capture
     assert exit_code("dataset", "drop", "cups", "--episodes", "1", "--dry-run") == 0
     assert capsys.readouterr().out.startswith("episodes 0,2:5\n")
     assert exit_code(*words, "--out", "cups", "--overwrite") == 2
-    assert "This is never replaced, since this command reads it" in capsys.readouterr().err
+    assert "This is never replaced, since it is an input of this command" in capsys.readouterr().err
     assert exit_code(*words[:-1]) == 2
     assert "--dry-run" in capsys.readouterr().err
 

@@ -75,12 +75,12 @@ def place(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 TARGETS = {
-    "runs/run": "of this command something in it",
+    "runs/run": "an input of this command is inside it",
     "runs/run/episodes": "of this command",
-    "runs": "of this command something in it",
-    "link_to_runs": "of this command something in it",
-    ".": "of this command something in it",
-    "..": "of this command something in it",
+    "runs": "an input of this command is inside it",
+    "link_to_runs": "an input of this command is inside it",
+    ".": "an input of this command is inside it",
+    "..": "an input of this command is inside it",
     "work": "it is the current folder",
     "repository": "it is a repository",
     "thesis": "it is not a LeRobot dataset",
@@ -114,7 +114,11 @@ def test_nothing_but_a_dataset_is_replaced_by_one(
 def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files_of(place.parent)
     elsewhere = write_episode(place.parent / "other.mcap", num_frames=3, cameras=())
-    for target, word in ((place, "home folder"), (place.parent, "reads something in it"), (Path("/"), "reads")):
+    for target, word in (
+        (place, "home folder"),
+        (place.parent, "an input of this command is inside it"),
+        (Path("/"), "input"),
+    ):
         assert exit_code("export", "lerobot", elsewhere, "--out", target, "--overwrite", "--no-verify") == 2
         assert word in capsys.readouterr().err
     assert before.items() <= files_of(place.parent).items()
@@ -392,20 +396,20 @@ KEPT: dict[str, dict[str, str]] = {
     "view alone.mcap --save": {
         "alone.rrd": "it is not a Rerun file",  # a recording under another name
         "thesis.rrd": "it is not a Rerun file",
-        "link.rrd": "of this command it",
+        "link.rrd": "it is an input of this command",
         "folder.rrd": "it is a folder",
         "dangling.rrd": "a link whose target is missing",
         "lock.rrd": "lock.rrd",
     },
     "view alone.mcap --screenshot": {
         "thesis.png": "it is not an image",
-        "link.png": "of this command it",
+        "link.png": "it is an input of this command",
         "lock.png": "lock.png",
     },
     "view dataset --screenshot": {FRAME: "it is inside an input of this command"},
     "report alone.mcap --out": {
         "thesis.html": "it is not a report",
-        "link.html": "of this command it",
+        "link.html": "it is an input of this command",
         "lock.html": "lock.html",
     },
     "report dataset --out": {"dataset/report.html": "A new file inside a dataset would prevent"},

@@ -111,8 +111,8 @@ def test_only_the_last_part_ends_as_the_episode_did(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        ((), "Say where to cut"),
-        (("--jumps", "--pauses", "1"), "Say where to cut"),
+        ((), "Name the cuts"),
+        (("--jumps", "--pauses", "1"), "Name the cuts"),
         (("--at", "7=3"), "no episode 7"),
         (("--at", "0=8"), "give 1 to 7"),
         (("--at", "0=a"), "are numbers"),

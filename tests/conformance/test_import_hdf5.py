@@ -310,7 +310,7 @@ def _attribute(place: str, name: str, value: object) -> Callable[[h5py.File], No
 
 FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "no such key": (lambda file: file["data/demo_1/obs"].move("object", "objekt"), "Did you mean 'objekt'"),
-    "no episodes": (lambda file: [file.__delitem__(f"data/{name}") for name in DEMOS], "no episodes in data"),
+    "no episodes": (lambda file: [file.__delitem__(f"data/{name}") for name in DEMOS], "No episodes in data"),
     "other lengths": (
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((3, 7)))),
         "demo_1/obs/agentview_image has 5 rows, other datasets of the episode have 3",

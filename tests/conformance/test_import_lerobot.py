@@ -227,7 +227,7 @@ def test_the_command(imported: tuple[str, Path, Path], tmp_path: Path, capsys: p
         (["lerobot", dataset], 2, "--out"),
         (["--suggest", dataset], 2, f"demorec import lerobot {dataset}"),
         (["lerobot", dataset, "--out", tmp_path / "x", "--mapping", "a.toml"], 2, "leave --mapping"),
-        (["lerobot", tmp_path / "nothing", "--out", tmp_path / "x"], 2, "no such file"),
+        (["lerobot", tmp_path / "nothing", "--out", tmp_path / "x"], 2, "No such file"),
         (["lerobot", run, "--out", tmp_path / "x"], 2, "found a run"),
     ):
         assert exit_code("import", *args) == code

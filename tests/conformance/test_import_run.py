@@ -286,7 +286,7 @@ def test_a_run_whose_recording_was_exchanged_is_refused(tmp_path: Path) -> None:
     import_bags([other], mapping, tmp_path / "other_run")
     (run / "import.json").unlink()
     shutil.copy(tmp_path / "other_run/episodes/episode_000000.mcap", run / "episodes/episode_000000.mcap")
-    with pytest.raises(ConfigError, match="Another recording is there"):
+    with pytest.raises(ConfigError, match="Another recording exists already"):
         import_bags([bag], mapping, run)
 
 

@@ -129,7 +129,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         column("meta/episodes", "length", lambda v: [v[0], 0, *v[2:]]), "length of 1 of 4"),
     "images at wrong places (axol#158)": (
         column("meta/episodes", f"{VIDEO}/from_timestamp", lambda v: [x + 0.7 for x in v]), f"images of {TOP}"),
-    "index from 0 in each file": (column("data", "index", lambda v: [x + 7 for x in v]), "index counts on"),
+    "index from 0 in each file": (column("data", "index", lambda v: [x + 7 for x in v]), "index counts over"),
     "episodes from 3 on": (column("data", "episode_index", lambda v: [x + 3 for x in v]), "they were 3, 4, 5, 6"),
     "files joined by hand": (same_numbers, "numbered from 0;"),
     "no counters (lerobot#3068)": (without("frame_index", "index"), "frame_index is int64"),
@@ -154,7 +154,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         "of action"),
     "no tasks": (lambda root: (root / "meta/tasks.parquet").unlink(), "table of tasks is written again"),
     "tasks whose text is no index": (tasks_as_column, "text as its index"),
-    "tasks numbered otherwise": (other_task_numbers, "numbered from 0"),
+    "tasks numbered otherwise": (other_task_numbers, "numbered from 0, in order"),
     "a copy beside the files": (stray, "file-000 (copy).parquet is left out"),
 }  # fmt: skip
 """Fault, with a public report of it -> what makes it, and words of the sentence about it."""

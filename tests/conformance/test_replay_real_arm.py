@@ -133,7 +133,7 @@ def test_what_does_not_fit_is_refused_in_one_sentence(
 def test_other_robots_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     panda = simulate(tmp_path / "panda.mcap", seed=11)
     assert exit_code("replay", "--robot", "so101", panda) == 2
-    assert "leave --robot out" in capsys.readouterr().err
+    assert "leave out --robot" in capsys.readouterr().err
     assert exit_code("export", "lerobot", panda, "--no-verify", "--out", tmp_path / "d") == 0
     assert exit_code("replay", *DEGREES, tmp_path / "d") == 2
     assert "of so101: they belong to another robot" in " ".join(capsys.readouterr().err.split())

@@ -324,7 +324,7 @@ def test_what_cannot_be_compared_is_an_error(
 ) -> None:
     root = Path(shutil.copytree(bases["video"], tmp_path / "d"))
     (root / VIDEO).write_bytes((root / VIDEO).read_bytes()[:900])
-    for other, told in {root: "video", tmp_path / "none": "no such file or folder"}.items():
+    for other, told in {root: "video", tmp_path / "none": "No such file or folder"}.items():
         assert run("diff", bases["video"], other) == 2
         assert told in capsys.readouterr().err
     assert run("diff", root) == 2

@@ -78,7 +78,7 @@ def run(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
         site, *words, "--num-episodes", 1, "--workers", 1, "--no-export", "--out", out, program="generate_dataset_main"
     )
     assert "none failed" in told
-    assert "1 episode made again and compared" in told
+    assert "1 episode generated again and compared" in told
     return out
 
 

@@ -178,11 +178,11 @@ MAPPINGS: dict[str, tuple[str, str]] = {
     "lists in lists": ("x = " + "[" * 100_000 + "]" * 100_000 + "\n", "nested too deeply"),
     "20,000 unknown keys": (_NO_CAMERA + "[cloak]\n" + "".join(f"keyy{k} = 1\n" for k in range(20_000)), "unknown key"),
     "a trim of 1e300 s": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = 1e300"), "max_trim_s is 1e+300"),
-    "a number of 5,000 digits": (_NO_CAMERA.replace("fps = 30", f"fps = {'9' * 5000}"), "no valid TOML"),
+    "a number of 5,000 digits": (_NO_CAMERA.replace("fps = 30", f"fps = {'9' * 5000}"), "not valid TOML"),
     "an infinity": (_NO_CAMERA.replace("fps = 30", "fps = 30\nmax_trim_s = inf"), "is not a finite number"),
     "NUL in urdf": (_NO_CAMERA.replace('name = "r"', 'name = "r"\nurdf = "a\\u0000b"'), "The URDF cannot be read"),
     "NUL in a topic": (_NO_CAMERA.replace('"/joints"', '"/jo\\u0000nts"'), r"no message of '/jo\x00nts'"),
-    "a date": (_NO_CAMERA.replace("fps = 30", "fps = 2001-99-99"), "no valid TOML"),
+    "a date": (_NO_CAMERA.replace("fps = 30", "fps = 2001-99-99"), "not valid TOML"),
 }  # fmt: skip
 
 
