@@ -4,10 +4,10 @@ Facts are columns of the table that LeRobot filters episodes by (`episode_filter
 columns exist, because all files of the table must share them; an episode without a value has null. Progress and stages
 are:
 
-- `sarm_progress.parquet`: `progress_dense` for every row of the dataset, by which `lerobot-train
---sample_weighting.type=rabc --sample_weighting.head_mode=dense` weights samples;
+- `sarm_progress.parquet`: `progress_dense` for every row of the dataset, by which
+  `lerobot-train --sample_weighting.type=rabc --sample_weighting.head_mode=dense` weights samples;
 - columns `dense_subtask_names`, `dense_subtask_start_frames` and `dense_subtask_end_frames` in the table of episodes,
-for training SARM;
+  for training SARM;
 - `meta/temporal_proportions_dense.json`: the stages' mean shares of the time.
 """
 

@@ -1,8 +1,8 @@
 """The sidecar: data without a place in LeRobot's format, in the folder `demorec/` of the dataset.
 
 - `episodes/`: one row per episode: its source (run's episode number, attempt, seed, config digest), its outcome (every
-check with value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and `episode_info`:
-the complete description of scene and robot as JSON, from which `demorec` can rebuild the world.
+  check with value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and
+  `episode_info`: the complete description of scene and robot as JSON, from which `demorec` can rebuild the world.
 - `camera_poses/`: one row per frame, for cameras that move.
 - `attempts/`: one row per attempt, including failed ones, for success rates. A failed attempt precedes the attempt that
   became an episode.

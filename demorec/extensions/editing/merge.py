@@ -1,12 +1,14 @@
-"""Merge datasets: features are matched by name, all differences are reported at once, and a mapping (TOML) resolves
-them.
+"""Merge datasets: match features by name, report all differences at once, and resolve them by a mapping (TOML).
 
-[[dataset]] path = "b" # as on the command line robot_type = "so100" # name of its arm in the merged dataset drop =
-["observation.images.side"]
+[[dataset]]
+path = "b"                                  # as on the command line
+robot_type = "so100"                        # name of its arm in the merged dataset
+drop = ["observation.images.side"]
 
-[dataset.feature."observation.state"] # a feature of the merged dataset from = "state" # its name in this one elements =
-["shoulder", "gripper"] # names in this one, in the order of the first dataset unit = "degree" # here: rad (unchanged),
-degree, or normalised, with low and high in rad
+[dataset.feature."observation.state"]       # a feature of the merged dataset
+from = "state"                              # its name in this one
+elements = ["shoulder", "gripper"]          # names in this one, in the order of the first dataset
+unit = "degree"                             # here: rad (unchanged), degree, or normalised, with low and high in rad
 """
 
 from __future__ import annotations

@@ -1,7 +1,9 @@
 """Mapping from a bag or an HDF5 file to an episode, which the user writes in TOML (docs/import.md).
 
-[[features."observation.state"]] a feature is one source or several, concatenated topic = "/joint_states" for a bag; for
-an HDF5 file: dataset = "obs/robot0_joint_pos" field = "position" joints = ["fr3_joint1", "fr3_joint2"]
+[[features."observation.state"]]      a feature is one source or several, concatenated
+topic = "/joint_states"               for a bag; for an HDF5 file: dataset = "obs/robot0_joint_pos"
+field = "position"
+joints = ["fr3_joint1", "fr3_joint2"]
 
 Most keys apply to both; those of one kind are marked, and rejected in a mapping of the other.
 """
