@@ -113,7 +113,7 @@ def test_only_the_last_part_ends_as_the_episode_did(tmp_path: Path) -> None:
     [
         ((), "Name the cuts"),
         (("--jumps", "--pauses", "1"), "Name the cuts"),
-        (("--at", "7=3"), "no episode 7"),
+        (("--at", "7=3"), "Episode 7 does not exist"),
         (("--at", "0=8"), "give 1 to 7"),
         (("--at", "0=a"), "are numbers"),
         (("--pauses", "0.1"), "two frames"),

@@ -224,7 +224,7 @@ def test_all_differences_are_named_and_a_mapping_solves_them(
 
 @pytest.mark.parametrize(
     ("condition", "told"),
-    [("num_framse < 3", "num_frames"), ("__import__('os')", "nothing else"), ("length <", "no condition"),
+    [("num_framse < 3", "num_frames"), ("__import__('os')", "nothing else"), ("length <", "not a condition"),
      ("task < 3", "cannot be compared"), ("[x for x in tasks]", "nothing else")],
 )  # fmt: skip
 def test_conditions_are_parsed_and_never_run(

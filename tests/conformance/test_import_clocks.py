@@ -235,7 +235,7 @@ def test_numbers_that_are_in_no_row_are_told(imports: Imports) -> None:
     mapping += '[[features.action]]\nnext = "observation.state"\n'
     _, told, _ = imports(notes, mapping)
     assert "% of its messages are in no row, since it comes 25.0 times a second and rows 10 times" in told
-    assert "No findings" not in told
+    assert "No findings." not in told
 
 
 def test_a_robot_that_moves_a_little_is_not_still(imports: Imports) -> None:

@@ -389,7 +389,7 @@ def test_an_outcome_is_a_boolean_or_a_number(
     with h5py.File(file, "r+") as opened:
         for name in DEMOS:
             opened[f"data/{name}"].attrs["outcome"] = value
-    _refused(file, mapping, f"says outcome = {shown}, allowed are booleans and numbers", capsys)
+    _refused(file, mapping, f"has outcome = {shown}, allowed are booleans and numbers", capsys)
 
 
 def test_a_mask_leaves_links_out(tmp_path: Path) -> None:

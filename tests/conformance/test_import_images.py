@@ -144,7 +144,7 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
     path = WRITERS["rosbags"](bag(cameras), tmp_path)
     told, shown = imported(path, MAPPING.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
     assert "No findings; 1 note above" in told
-    assert "No findings" not in told
+    assert "No findings." not in told
     times = cameras[FRONT if fps == 30 else SIDE]
     followed = shown["front" if fps == 30 else "side"]
     assert followed == [time for time in times if time >= followed[0]]

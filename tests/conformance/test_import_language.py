@@ -186,13 +186,13 @@ def test_where_nobody_says_anything_none_is_invented(tmp_path: Path, capsys: pyt
 
 FAULTS: dict[str, tuple[bags.Notes, str, int, str]] = {
     "no topic": ([], SUBTASKS, 1, "no message of '/subtask'"),
-    "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is not text"),
+    "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is not a text"),
     "no field": (texts("/subtask", SAID), SUBTASKS + 'field = "dta"\n', 1, "Did you mean 'data'?"),
     "another field": (
         texts("/subtask", SAID),
         SUBTASKS + 'field = "data"\n[episodes]\ncut = "marker"\ntopic = "/subtask"\nfield = "x"\n', 2, "subtasks.field",
     ),
-    "a control character": (texts("/subtask", [(1.0, "a\x1b[2J")]), SUBTASKS, 1, "no single line"),
+    "a control character": (texts("/subtask", [(1.0, "a\x1b[2J")]), SUBTASKS, 1, "not a single line"),
 }  # fmt: skip
 
 

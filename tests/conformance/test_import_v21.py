@@ -144,7 +144,7 @@ def test_an_export_that_would_append_names_the_command_that_converts_it(
     root = write_v21(tmp_path / "my cups")
     assert exit_code("export", "lerobot", SAMPLE, "--out", root, "--append", "--no-verify") == 1
     told = capsys.readouterr().err.strip()
-    assert "format v2.1, and only v3.0 is appended to" in told
+    assert "format v2.1, and only v3.0 can be appended to" in told
     _, *arguments = shlex.split(told[told.index("demorec dataset select") :])
     assert exit_code(*arguments[:-1], tmp_path / "new") == 0
     assert json.loads((tmp_path / "new/meta/info.json").read_text())["codebase_version"] == "v3.0"

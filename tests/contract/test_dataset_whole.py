@@ -98,8 +98,8 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "an episode less in the table": (short_table, ("is incomplete", "total_episodes is 4, found 3")),
     "an episode less in table and info": (short_table_and_info, ("has 32 rows",)),
     "an episode that is longer": (longer_episode, ("is incomplete", "total_frames is 32, found 33")),
-    "rows exchanged between episodes": (exchanged_rows, ("another one's",)),
-    "rows exchanged in an episode": (rows_of_one_episode_exchanged, ("another one's",)),
+    "rows exchanged between episodes": (exchanged_rows, ("belong to another",)),
+    "rows exchanged in an episode": (rows_of_one_episode_exchanged, ("belong to another",)),
 }
 """Fault -> what makes it, and the words of which one names it."""
 
@@ -211,7 +211,7 @@ def test_a_dataset_that_is_not_whole_is_not_appended_to(
     before = content_of(root)
     assert exit_code("export", "lerobot", recordings(run)[0], "--out", root, "--append", "--no-verify") == 1
     told = capsys.readouterr().err
-    assert "is incomplete" in told or "another one's" in told
+    assert "is incomplete" in told or "belong to another" in told
     assert content_of(root) == before
 
 

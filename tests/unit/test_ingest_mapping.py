@@ -86,7 +86,7 @@ def test_paths_of_fields() -> None:
     assert follow(values, parse_path("transforms.transform.translation.x")).tolist() == [1.0, 2.0]
     with pytest.raises(FieldError, match="no element 1"):
         follow(values, parse_path("points[1].positions"))
-    with pytest.raises(FieldError, match="no path"):
+    with pytest.raises(FieldError, match="not a field path"):
         parse_path("a[")
 
 

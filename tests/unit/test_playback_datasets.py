@@ -137,5 +137,5 @@ def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
         assert episode.info.simulation is not None
         with pytest.raises(ExportError, match=f"it has {width}x{height} pixels, and meta/info.json lists 9x8"):
             list(episode.distances("front"))
-        with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json says av1"):
+        with pytest.raises(ExportError, match=r"its codec is h264, and meta/info\.json lists av1"):
             list(episode.packets("front"))

@@ -63,7 +63,7 @@ class DepthScale:
             raise ValueError(f"its scale of depth is {reprlib.repr([*numbers, use_log])}")
         nearest, farthest, shift = (float(number) for number in numbers if number is not None)
         if not nearest < farthest or (use_log and not nearest + shift > 0):
-            raise ValueError(f"its depth range is {nearest} to {farthest} m, shifted by {shift}")
+            raise ValueError(f"its scale of depth is {nearest} to {farthest} m, shifted by {shift}")
         return cls(nearest=nearest, farthest=farthest, shift=shift, use_log=use_log)
 
     def values(self) -> Array:

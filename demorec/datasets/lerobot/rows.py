@@ -160,7 +160,7 @@ def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequ
             found = column_values(batch.column(name))[:, 0]
         if len(wrong := np.flatnonzero(found != numbers)):
             raise ExportError(
-                f"The rows of episode {place.episode_index} are another one's: frame {begin + int(wrong[0])} has the "
+                f"The rows of episode {place.episode_index} belong to another: frame {begin + int(wrong[0])} has the "
                 f"{name} {found[wrong[0]]}. Restore the file, or drop the episode: {place.data}"
             )
 
