@@ -47,10 +47,10 @@ _HOME = re.compile(r"^(--[\w-]+=|)~(?=/|$)")
 _NARROWEST = 40
 """Minimum columns; a narrower terminal wraps lines itself, like tyro's table of flags."""
 _UNWRITABLE = ("Cc", "Cs", "Zl", "Zp")
-"""Unicode's categories of control characters, of bytes that are not UTF-8, and of ends of lines and paragraphs."""
+"""Unicode categories of control characters, bytes that are not UTF-8, and line and paragraph separators."""
 _HELP_ALL = "--help-all"
 _left_out: dict[str, bool] = {}
-"""Field that the help of the command that is being parsed leaves out -> whether the command has it."""
+"""Field that the current command's help leaves out -> whether the command has it."""
 _HINTED = object()
 """Marks a type that tyro's own rule handles."""
 
