@@ -234,6 +234,6 @@ def test_a_recording_takes_the_name_of_no_other_file(tmp_path: Path, there: str)
         assert target.read_bytes() == new
         assert not made.exists()
         return
-    with pytest.raises(ConfigError, match=f"stays as it is .*{target.name}.* is kept as .*{made.name}"):
+    with pytest.raises(ConfigError, match=f"left unchanged .*{target.name}.* is kept as .*{made.name}"):
         place_recording(made, target)
     assert (target.read_bytes(), made.read_bytes()) == (mine, new)

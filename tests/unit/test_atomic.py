@@ -65,7 +65,7 @@ def test_what_appears_meanwhile_stays_and_the_result_is_kept(
                 target.mkdir(exist_ok=True)
             fill(target, kind, "mine, and longer")
 
-    with pytest.raises(ConfigError, match=rf"stays as it is \(.*x\.txt.*kept as {kept}"):
+    with pytest.raises(ConfigError, match=rf"left unchanged \(.*x\.txt.*kept as {kept}"):
         write_and_disturb()
     assert text_of(target) == "mine, and longer"
     assert text_of(kept) == "result"
@@ -87,7 +87,7 @@ def test_several_appear_together_or_none(tmp_path: Path, kind: ReplaceableKind) 
                 fill(part, kind, "new")
             fill(targets[1], kind, "mine, and longer")
 
-    with pytest.raises(ConfigError, match=r"stays as it is \(.*b"):
+    with pytest.raises(ConfigError, match=r"left unchanged \(.*b"):
         write_and_disturb()
     mine = {name: b"mine, and longer" for name in before if name.startswith("b")}
     kept = {f"{name[0]}.1{name[1:]}": b"new" for name in before}
