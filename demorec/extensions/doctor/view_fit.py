@@ -21,7 +21,7 @@ MAX_LAG_S = 1.0
 MAX_UNRELATED_RATIO = 0.25
 """Maximum explained variance, relative to the usual one, at which the states of other episodes are tried."""
 MAX_COMPARED = 5
-"""Maximum number of episodes that are compared with all others."""
+"""Maximum number of suspicious episodes, and of usual ones, that are compared with all others."""
 _COMPONENTS = 8
 _MAX_PAIRED = 8
 """Maximum number of state elements for which products of two are features too."""
@@ -35,13 +35,12 @@ class ViewFit:
     Attributes:
         lags: (L,) delays of the images after the state, frames.
         explained: (L,) ratio of the images' variance explained by the state at each lag.
-        by_another: Maximum ratio explained by another episode's state; 0 if not computed, because its own state
-            explains enough.
+        by_another: Maximum ratio explained by another episode's state; None if not computed.
     """
 
     lags: NDArray[np.intp]
     explained: Array
-    by_another: float = 0.0
+    by_another: float | None = None
 
     @property
     def best(self) -> float:
@@ -79,8 +78,7 @@ def _fits(evidence: Evidence, images: CameraThumbnails) -> Mapping[int, ViewFit]
         return ViewFit(lags=lags, explained=_explained(predicted[:length], outputs[shown][:length], lags))
 
     found = {number: fit(number, number) for number in states}
-    unexplained = _unexplained(found)
-    for number in unexplained:
+    for number in [*_unexplained(found), *_references(found)]:
         by_another = max(fit(number, other).best for other in states if other != number)
         found[number] = replace(found[number], by_another=by_another)
     return found
@@ -91,6 +89,13 @@ def _unexplained(fits: Mapping[int, ViewFit]) -> list[int]:
     limit = MAX_UNRELATED_RATIO * float(np.median([fit.best for fit in fits.values()]))
     found = [number for number, fit in fits.items() if fit.best < limit]
     return sorted(found, key=lambda number: fits[number].best)[:MAX_COMPARED]
+
+
+def _references(fits: Mapping[int, ViewFit]) -> list[int]:
+    """Select a few episodes whose own state explains the images as usual, spread over the set."""
+    usual = float(np.median([fit.best for fit in fits.values()]))
+    found = sorted(number for number, fit in fits.items() if fit.best >= MAX_UNRELATED_RATIO * usual)
+    return found[:: max(1, len(found) // MAX_COMPARED)][:MAX_COMPARED]
 
 
 def _weights(states: Mapping[int, Array], outputs: Mapping[int, Array]) -> dict[int, Array]:

@@ -14,7 +14,7 @@ from demorec.extensions.doctor.base import DROP, Fault, check
 from demorec.extensions.doctor.errors import NotMeasuredError
 from demorec.extensions.doctor.evidence import Evidence
 from demorec.extensions.doctor.robust import usual
-from demorec.extensions.doctor.view_fit import MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
+from demorec.extensions.doctor.view_fit import MAX_UNRELATED_RATIO, MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
 
 MIN_EXPLAINED = 0.35
 """Minimum usual ratio of the images' variance explained by the state, for a camera to be judged."""
@@ -28,7 +28,8 @@ MIN_GAIN = 1.4
 MIN_OTHER_RATIO = 0.5
 """Minimum ratio, of the variance usually explained by the state, that another episode's state must explain."""
 MIN_OTHER_GAIN = 2.0
-"""Minimum factor by which the state of another episode reduces the unexplained variance."""
+"""Minimum factor by which the state of another episode reduces the unexplained variance, relative to the largest such
+factor of episodes whose own state explains the images as usual."""
 
 
 @check(
@@ -78,20 +79,29 @@ def _gain(fit: ViewFit, usual_lag: float) -> float:
 def image_take(evidence: Evidence) -> Iterator[Fault]:
     """Find episodes with images that the state of another episode explains far better than their own, at any lag.
 
-    Images that no state explains are not evidence: the robot may be where no other episode was.
+    Images that no state explains are not evidence: the robot may be where no other episode was. The gain must be an
+    outlier among those of usual episodes, since the states of similar episodes explain each other's images.
     """
     for camera, fits in _judged(evidence):
         usual_best = float(np.median([fit.best for fit in fits.values()]))
-        for number, fit in fits.items():
-            gain = (1 - fit.best) / max(1 - fit.by_another, 1e-3)
-            if fit.by_another > MIN_OTHER_RATIO * usual_best and gain > MIN_OTHER_GAIN:
+        gains = {number: _other_gain(fit) for number, fit in fits.items() if fit.by_another is not None}
+        usual_gain = max((gains[n] for n in gains if fits[n].best >= MAX_UNRELATED_RATIO * usual_best), default=1.0)
+        for number, gain in gains.items():
+            fit = fits[number]
+            explained = fit.by_another or 0.0
+            if explained > MIN_OTHER_RATIO * usual_best and gain > MIN_OTHER_GAIN * max(usual_gain, 1.0):
                 yield Fault(
                     severity="broken",
                     episode=number,
                     value=f"{max(fit.best, 0):.0%}",
                     message=f"{camera} does not show the motion of this episode: its state explains "
-                    f"{max(fit.best, 0):.0%} of the changes, that of another episode {fit.by_another:.0%}",
+                    f"{max(fit.best, 0):.0%} of the changes, that of another episode {explained:.0%}",
                 )
+
+
+def _other_gain(fit: ViewFit) -> float:
+    """Compute the factor by which the state of another episode reduces the unexplained variance."""
+    return (1 - fit.best) / max(1 - (fit.by_another or 0.0), 1e-3)
 
 
 def _judged(evidence: Evidence) -> Iterator[tuple[str, Mapping[int, ViewFit]]]:
