@@ -30,6 +30,8 @@ MAX_SIZE_RATIO = 2.0
 MIN_FRAMES = 30
 MAX_FITTED_EPISODES = 20
 MAX_FITTED_FRAMES = 60
+MAX_FIT_STEPS = 100
+"""Maximum number of evaluations of one fit: joints in another unit fit nowhere, and would take thousands."""
 LEVER_M = 0.1
 """Lever, metres, that converts a rotation to a distance."""
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
@@ -147,7 +149,7 @@ def _fit(links: Array, poses: Array) -> Array:
         base = np.array([0.0, 0.0, yaw, 0.0, 0.0, 0.0])
         tool = np.linalg.inv(_transform(base) @ links[0]) @ poses[0]
         start = np.concatenate([base, Rotation.from_matrix(tool[:3, :3]).as_rotvec(), tool[:3, 3], [0.0]])
-        found = least_squares(residual, start)
+        found = least_squares(residual, start, max_nfev=MAX_FIT_STEPS)
         best = found if best is None or found.cost < best.cost else best
         if best.cost < 1e-3 * LEVER_M * len(links):
             break
