@@ -38,7 +38,7 @@ def test_not_even_for_one_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) 
 @pytest.mark.parametrize(
     ("serve", "error", "words"),
     [
-        (die, ExportError, r"ended by itself \(exit code 3\), often for lack of memory"),
+        (die, ExportError, r"ended unexpectedly \(exit code 3\), often for lack of memory"),
         (lack_memory, ResourceError, "too little memory"),
     ],
 )

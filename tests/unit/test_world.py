@@ -129,7 +129,7 @@ def test_wrong_scenes_are_refused_in_one_sentence(world: World, scene: Scene) ->
                 ),
             )
         )
-    with pytest.raises(SceneError, match="one name"):
+    with pytest.raises(SceneError, match="share a name"):
         world.reset(with_bodies(scene, scene.body("red_cube")))
     with pytest.raises(SceneError, match="other_arm"):
         world.reset(dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, name="other_arm")))
