@@ -114,6 +114,7 @@ def _with_column(table: pa.Table, name: str, values: list[int]) -> pa.Table:
 
 
 @pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("spoil", [without_table, wrong_files])
 @pytest.mark.parametrize("command", READERS)
 def test_what_the_table_lacks_is_found_by_the_rows(

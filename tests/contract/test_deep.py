@@ -367,7 +367,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     run = load_run_file(folder)
     result = RunResult(folder=folder, run=run, made=(), interrupted=False)
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
-    assert "2 episodes made again" in found
+    assert "2 episodes generated again" in found
     assert not [failure for failure in failures if "made again" in failure]
     with Recording(path) as recording:
         info = to_plain(recording.info)
@@ -382,8 +382,8 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
     assert ", 1 warning (made again)" in found
     assert not [failure for failure in failures if "made again" in failure]
-    assert "1 episode made again" in check_run(result, deep_every=5, progress=lambda done, total: None)[0]
-    assert "made again" not in check_run(result, deep_every=0, progress=lambda done, total: None)[0]
+    assert "1 episode generated again" in check_run(result, deep_every=5, progress=lambda done, total: None)[0]
+    assert "again" not in check_run(result, deep_every=0, progress=lambda done, total: None)[0]
 
 
 @pytest.mark.slow
