@@ -1,4 +1,4 @@
-"""Shared by all tests: no network, one thread per process, no deadlines, compiled bytecode is kept."""
+"""Fixtures for all tests: no network, one thread a process, no Hypothesis deadlines, cached bytecode."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 os.environ.setdefault("HF_HUB_OFFLINE", "1")
 os.environ.setdefault("HF_DATASETS_OFFLINE", "1")
-# Containers often forbid Python to write bytecode; every process that a test starts would then compile PyTorch anew.
+# Containers often forbid Python to write bytecode; every process that a test starts would then compile PyTorch again.
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
-    # A shell switches Ctrl-C off for what runs in its background, and for all that this starts.
+    # A shell makes its background processes ignore Ctrl-C, and everything started here would inherit that.
     signal.signal(signal.SIGINT, signal.default_int_handler)
 from support.export import without_verification
 
@@ -32,14 +32,14 @@ hypothesis.settings.load_profile("untimed")
 
 @pytest.hookimpl(wrapper=True)
 def pytest_fixture_setup() -> Iterator[None]:
-    """LeRobot's own AV1 encoding, run by root, would leave the test process with real-time priority."""
+    """Restore priority: LeRobot's AV1 encoding, run as root, would leave the test process with real-time priority."""
     with ordinary_scheduling():
         return (yield)
 
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_call() -> Iterator[None]:
-    """As in fixtures; and LeRobot's code leaves libav writing to the terminal."""
+    """Restore priority as in fixtures, and silence libav, which LeRobot leaves writing to the terminal."""
     av.logging.set_level(None)
     with ordinary_scheduling():
         return (yield)
@@ -47,19 +47,19 @@ def pytest_runtest_call() -> Iterator[None]:
 
 @pytest.fixture(autouse=True)
 def no_allowed_models(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What a command of another test was allowed is forgotten."""
+    """Forget the modules that another test's command was allowed to load."""
     monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
 
 
 @pytest.fixture
 def without_lerobot(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exports are not verified and `lerobot_opens` is left out: a process of LeRobot takes seconds to start."""
+    """Skip LeRobot's verification of exports and the check `lerobot_opens`: its process takes seconds to start."""
     without_verification(monkeypatch)
 
 
 @pytest.fixture(scope="module")
 def hf_datasets_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """Copies of the tables that the package datasets makes go to a temporary folder."""
+    """Keep the table copies made by the package datasets in a temporary folder."""
     import datasets
 
     before = datasets.config.HF_DATASETS_CACHE

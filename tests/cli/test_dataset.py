@@ -1,4 +1,4 @@
-"""`demorec dataset` as a user types it."""
+"""`demorec dataset` from the command line."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_run_stands_for_its_dataset(tmp_path: Path, capsys: pytest.CaptureFixt
 
 @pytest.fixture
 def cups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A dataset `cups` of 5 episodes in the current folder."""
+    """Write a dataset `cups` of 5 episodes into the current folder."""
     monkeypatch.chdir(tmp_path)
     return write_foreign(tmp_path / "cups", episodes=5)
 

@@ -1,4 +1,4 @@
-"""`demorec export` as a user types it: exit codes, one sentence per error, what it prints."""
+"""`demorec export` from the command line: exit codes, one-sentence errors, output."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: py
     words = ("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--corrected-only", "--episodes", "0")
     assert exit_code(*words) == 0
     printed = capsys.readouterr()
-    assert "1 episode, 8 frames" in printed.out  # nobody took over in a demonstration: it stays
+    assert "1 episode, 8 frames" in printed.out  # no takeover happens in a demonstration, so it is exported
     assert "2 recordings left out by --episodes or --corrected-only." in printed.out
 
 
@@ -80,7 +80,7 @@ def test_a_failed_upload_keeps_the_dataset(
     token: str | None,
     message: str,
 ) -> None:
-    """Without a token, and without a network."""
+    """The upload fails without a token, and without a network."""
     monkeypatch.setattr("huggingface_hub.get_token", lambda: token)
     monkeypatch.setattr("huggingface_hub.constants.HF_HUB_OFFLINE", True)
     out = tmp_path / "d"
@@ -123,7 +123,7 @@ def test_an_upload_is_private_and_tagged(
 def test_verification_passes_a_good_dataset_and_drops_a_bad_one(run: Path, tmp_path: Path) -> None:
     report = export_lerobot([run], tmp_path / "good", ExportOptions(privileged=True, fps=15))
     assert report.verified_frames == 4
-    # The recordings change after they were read: what LeRobot reads is no longer what they say.
+    # The recordings change after they were read, so the dataset no longer matches them.
     changing = tmp_path / "run"
     shutil.copytree(run, changing)
 

@@ -1,4 +1,4 @@
-"""An evaluation in which every rollout failed: its recordings are results like any others."""
+"""Recordings of an evaluation in which every rollout failed are read like any others."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from support.recording import write_episode
 
 @pytest.fixture
 def evaluation(tmp_path: Path) -> Path:
-    """Two failed rollouts; only the name of evaluation.json matters to those who read recordings."""
+    """Write two failed rollouts; readers of recordings only check that evaluation.json exists."""
     folder = tmp_path / "evaluation"
     (folder / "failed").mkdir(parents=True)
     (folder / "episodes").mkdir()

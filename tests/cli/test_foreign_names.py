@@ -1,4 +1,4 @@
-"""Names inside files run no code: recordings, runs, datasets and policies name a module that marks its import."""
+"""Names inside files run no code: recordings, runs, datasets and policies name a module that would mark its import."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ HARMFUL = ["os:abort", "builtins:exit", "demorec.core.errors:DemorecError", "no 
 
 @pytest.fixture
 def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """Is there when the stranger's module, which is on the path, has been imported."""
+    """Path that exists once the untrusted module, which is importable, has been imported."""
     folder = tmp_path / "somewhere"
     folder.mkdir()
     (folder / f"{MODULE}.py").write_text(SOURCE)
@@ -50,7 +50,7 @@ def marker(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
 
 
 def recording_of(name: str, path: Path) -> Path:
-    """A recording whose task, robot, camera and renderer are called `name`, with a camera that is off its place."""
+    """Record an episode whose task, robot, camera and renderer are named `name`; its camera is not at its pose."""
     spoilt = Spoilt(SAMPLE)
     camera = spoilt.info.simulated.scene.cameras[0].name
     config = GenerateConfig(task=name, robot=name, cameras=(name,), width=64, height=64, variation="full")
@@ -80,7 +80,7 @@ def dataset_of(name: str, folder: Path, source: Path) -> Path:
     (table_path,) = (folder / "demorec" / "episodes").rglob("*.parquet")
     table = pq.read_table(table_path)
     (described,) = table.column("episode_info").to_pylist()
-    assert json.loads(described)["simulation"]["task"] == name  # the export kept the stranger's word
+    assert json.loads(described)["simulation"]["task"] == name  # the export kept the untrusted name
     assert isinstance(table, pa.Table)
     return folder
 
@@ -92,7 +92,7 @@ COMMANDS = {
     "replay states": "replay PATH --out NEW --states",
     "evaluate": "evaluate --compare PATH PATH",
 }
-"""Every command that reads what others may have made."""
+"""Every command that reads third-party files."""
 
 
 @pytest.mark.slow
@@ -145,14 +145,14 @@ def test_generate_goes_to_work_with_an_allowed_module(
     asked: list[GenerateConfig] = []
 
     class Reached(BaseException):
-        """Passes the command's last resort."""
+        """Signal that generation was reached; a BaseException passes the command's last-resort handler."""
 
     def generate(config: GenerateConfig, *rest: object, **more: object) -> None:
         asked.append(config)
         raise Reached
 
     monkeypatch.setattr("demorec.generate.run.generate", generate)
-    monkeypatch.setattr("demorec.core.config.deciding_versions", lambda config: {})  # the robot is none
+    monkeypatch.setattr("demorec.core.config.deciding_versions", lambda config: {})  # the robot does not exist
     run = run_of(f"{MODULE}:Mine", tmp_path / "run")
     with pytest.raises(Reached):
         exit_code("generate", "--config", run, "--out", tmp_path / "again", "--allow", MODULE)
@@ -160,7 +160,7 @@ def test_generate_goes_to_work_with_an_allowed_module(
 
 
 def without_notes(told: str) -> list[str]:
-    """Lines but those that say which versions differ."""
+    """Lines except notes about different versions."""
     return [line for line in told.splitlines() if not line.startswith("Note: ")]
 
 

@@ -1,4 +1,4 @@
-"""Escape codes, line ends and marks that turn the direction of writing, in every field that a command prints."""
+"""Escape codes, line breaks and bidirectional marks in every field that a command prints."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ NAME = "\x1b[31mred\u202e.mcap"
 
 
 def _spoken(arguments: Sequence[object]) -> str:
-    """All that a command wrote, which must hold nothing that a terminal obeys but the ends of its lines."""
+    """Return everything that a command printed; its only control characters may be line breaks."""
     said = io.StringIO()
     with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), contextlib.suppress(SystemExit):
         main([str(argument) for argument in arguments])
@@ -44,7 +44,7 @@ def _on_a_path(path: Path, new: Path) -> list[Sequence[object]]:
 
 
 def _everywhere(value: Any) -> Any:
-    """JSON data with every string made hostile."""
+    """Return JSON data with every string made hostile."""
     if isinstance(value, dict):
         return {key: _everywhere(child) for key, child in value.items()}
     if isinstance(value, list):
@@ -53,7 +53,7 @@ def _everywhere(value: Any) -> Any:
 
 
 def _fields(info: dict[str, Any]) -> dict[str, Any]:
-    """A description whose free texts are hostile and whose references still fit."""
+    """Make a description's free texts hostile and keep its references valid."""
     info["instruction"] += HOSTILE
     info["origin"] = f"replay of {HOSTILE}"
     info["versions"] = {f"demorec{HOSTILE}": HOSTILE}
@@ -68,7 +68,7 @@ def _fields(info: dict[str, Any]) -> dict[str, Any]:
 
 @pytest.fixture(scope="module")
 def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with a good recording, hostile copies of it, of a run and of a dataset."""
+    """A folder with a good recording and hostile copies of it, of a run and of a dataset."""
     folder = tmp_path_factory.mktemp("hostile")
     good = write_episode(folder / "good.mcap", num_frames=24, cameras=())
     with Recording(good) as recording:
@@ -116,7 +116,7 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
     plain["robot_type"] += HOSTILE
     plain["features"]["observation.state"]["names"][0] += HOSTILE
     file.write_text(json.dumps(plain))
-    file = folder / "dataset" / "demorec" / "configs.json"  # which generate refuses
+    file = folder / "dataset" / "demorec" / "configs.json"  # refused by generate
     file.write_text(json.dumps(_everywhere(json.loads(file.read_text()))))
     shutil.copytree(folder / "dataset", folder / "damaged")
     file = folder / "damaged" / "meta" / "info.json"
@@ -194,12 +194,12 @@ def test_an_unforeseen_error_leaves_a_report(capsys: pytest.CaptureFixture[str],
         """Fail."""
 
         def run(self) -> int:
-            """Fail as nothing of ours should."""
+            """Raise an unexpected exception."""
             raise ZeroDivisionError(HOSTILE)
 
     assert run_command(Fails, [], prog="demorec fails") == 1
     err = capsys.readouterr().err
-    assert err.startswith("demorec fails: ZeroDivisionError: ")  # of a file that is not of the program
+    assert err.startswith("demorec fails: ZeroDivisionError: ")  # a file outside demorec
     report = Path(err.partition("the traceback is in ")[2].partition(")")[0])
     assert "Traceback" in report.read_text()
     report.unlink()

@@ -1,4 +1,4 @@
-"""generate-dataset as a user types it: what is refused, with which words and exit code, and what is left behind."""
+"""`demorec generate` from the command line: rejected input, messages, exit codes and leftover files."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_bad_config_files_are_told(
 
 
 def parsed(monkeypatch: pytest.MonkeyPatch, args: list[str]) -> Generate:
-    """What the command would run with."""
+    """Return the config that the command would run with."""
     seen: list[Generate] = []
 
     def remember(command: Generate) -> int:

@@ -1,4 +1,4 @@
-"""Every command's help: what it says of defaults, and that it fits the terminal."""
+"""Help of every command: the defaults it lists, and that it fits the terminal."""
 
 from __future__ import annotations
 

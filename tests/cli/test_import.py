@@ -1,4 +1,4 @@
-"""`demorec import` as a user meets it: what it says, what it suggests, and how it refuses bad input."""
+"""`demorec import` from the command line: messages, suggested mappings, rejected input."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from support.recording import write_episode
 BAD: dict[str, tuple[int, str]] = {
     "no bag": (2, "No bag is given"),
     "no mapping": (2, "An import needs --mapping and --out"),
-    "a bag that is not there": (2, "No readable bag"),
-    "a mapping that is not there": (2, "No mapping (demorec import ... --suggest > FILE writes one)"),
-    "a word for a format that is misspelt": (2, "No bag 'lerobt'. Did you mean 'lerobot'?"),
+    "a missing bag": (2, "No readable bag"),
+    "a missing mapping": (2, "No mapping (demorec import ... --suggest > FILE writes one)"),
+    "a misspelt format": (2, "No bag 'lerobt'. Did you mean 'lerobot'?"),
     "no toml": (2, "The mapping is not valid TOML"),
     "unknown encoding": (1, "the encoding 'cbor' is not supported"),
     "two types on a topic": (1, "has messages of several types"),
     "a text file": (1, "This is not "),
     "an empty file": (1, "The bag is empty"),
     "somebody's folder": (2, "choose another"),
-    "a URDF that is not there": (2, "The URDF cannot be read"),
+    "a missing URDF": (2, "The URDF cannot be read"),
     "a folder without metadata": (1, "holds no metadata.yaml"),
     "codec": (2, "gop"),
 }
@@ -47,12 +47,12 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
             bag.write_text("hello")
         case "an empty file":
             bag.write_bytes(b"")
-        case "a URDF that is not there":
+        case "a missing URDF":
             text = text.replace('name = "so101"', 'name = "so101"\nurdf = "none.urdf"')
         case "somebody's folder":
             run.mkdir()
             (run / "thesis.tex").write_text("years")
-        case "a bag that is not there":
+        case "a missing bag":
             bag = tmp_path / "none.mcap"
         case "a folder without metadata":
             bag = tmp_path / "folder"
@@ -60,13 +60,13 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
         case "unknown encoding":
             bag = _with_encoding(tmp_path, "cbor")
     mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    if name == "a mapping that is not there":
+    if name == "a missing mapping":
         mapping = tmp_path / "none.toml"
     words: list[str | Path] = [bag, "--mapping", mapping, "--out", run]
     others: dict[str, list[str | Path]] = {
         "no bag": words[1:],
         "no mapping": words[:1],
-        "a word for a format that is misspelt": ["lerobt", bag, "--out", run],
+        "a misspelt format": ["lerobt", bag, "--out", run],
         "codec": [*words, "--gop", "0"],
     }
     words = others.get(name, words)
@@ -95,7 +95,7 @@ def _with_encoding(tmp_path: Path, encoding: str) -> Path:
 
 
 def _two_types(notes: bags.Notes, tmp_path: Path) -> Path:
-    """A bag with two channels of the same topic, which `mcap` writes as two of its own."""
+    """Write a bag with two channels for one topic, which `mcap` keeps apart."""
     one = [note for note in notes if note.type != "std_msgs/msg/String"]
     other = [note for note in notes if note.type == "std_msgs/msg/String"]
     folder = tmp_path / "bag"

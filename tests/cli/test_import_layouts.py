@@ -1,4 +1,4 @@
-"""What `demorec import --suggest` makes of other people's robots, and what an import by it has, unedited."""
+"""Mappings that `demorec import --suggest` writes for third-party robots, and episodes imported with them unedited."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from demorec.mcap import Recording
 
 
 def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int, layout: Layout) -> list[float]:
-    """The last numbers of each part at or before a time, by headers where a topic has them."""
+    """Return the latest values of each part at each time, by header time where a topic has one."""
     row: list[float] = []
     for part in parts:
         known = [
@@ -65,7 +65,7 @@ def test_a_suggestion_is_right_unedited(name: str, tmp_path: Path, capsys: pytes
 
 
 def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A gripper alone is no state of an arm, and a topic of frames may be anything: it is listed with its type."""
+    """A gripper alone is not the state of an arm. Unrecognised topics are listed with their types."""
     moments = bags.times(50, 1.0)
     notes = bags.joints("/franka_gripper/joint_states", bags.FRANKA_FINGERS, moments)
     notes += [

@@ -1,4 +1,4 @@
-"""`demorec info` of bags: their topics, as `rosbags` counts them, whatever a mapping could make of them."""
+"""`demorec info` lists the topics of any bag as `rosbags` counts them."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from support.commands import exit_code
 
 @pytest.fixture(scope="module")
 def notes() -> bags.Notes:
-    """Topics of which none is an arm's: no mapping can be suggested."""
+    """Messages of topics that do not belong to an arm, so no mapping can be suggested."""
     found = bags.in_order(bags.so101(1.0))
     return [note for note in found if "joint" not in note.topic]
 

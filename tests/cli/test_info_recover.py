@@ -1,4 +1,4 @@
-"""`demorec info` and `demorec recover` as a user meets them."""
+"""`demorec info` and `demorec recover` from the command line."""
 
 from __future__ import annotations
 

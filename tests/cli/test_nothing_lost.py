@@ -1,4 +1,4 @@
-"""Every command that replaces or deletes something, made to destroy a neighbour: nothing is lost, and it says why."""
+"""Commands that replace or delete are aimed at neighbouring files: nothing is lost, and they give the reason."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def place(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A folder that is a home, in which somebody works in `work`; all of it is compared afterwards."""
+    """A home folder; the user works in its folder `work`. Tests compare all of it afterwards."""
     home = tmp_path / "home"
     shutil.copytree(made, home)
     (home / "thesis").mkdir()
@@ -106,7 +106,7 @@ def test_nothing_but_a_dataset_is_replaced_by_one(
     said = capsys.readouterr().err
     assert TARGETS[target] in said or name == "dataset"  # which reads no run
     assert len(said.splitlines()) == 1
-    assert exit_code(*arguments) == 2  # and without the flag nobody is told to use it
+    assert exit_code(*arguments) == 2  # without the flag the message does not suggest it
     assert "--overwrite" not in capsys.readouterr().err
     assert files_of(place.parent) == before
 
@@ -126,7 +126,7 @@ def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture
 
 @pytest.mark.parametrize("target", ["mixed", "repository", "thesis", "thesis.tex", "noted"])
 def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) -> None:
-    """Foreign files are taken over; where they cannot be, and in a repository, nothing is appended."""
+    """Third-party files are replaced when appending; where that is impossible, and in a repository, nothing changes."""
     before = files_of(place)
     other = make_run(place.parent / "other", (6,), cameras=("front",), seed=1)
     code = exit_code("export", "lerobot", other, "--out", place / target, "--append", "--no-verify")
@@ -147,7 +147,7 @@ def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.C
     assert files_of(place) == before
 
 
-# A run: --overwrite of generate-dataset.
+# A run: `generate --overwrite`.
 
 
 @pytest.fixture(scope="module")
@@ -196,7 +196,7 @@ def test_a_run_with_something_foreign_is_not_overwritten(run: Path, made: Path, 
     assert foreign in str(error.value)
     with pytest.raises(ConfigError, match="holds another run") as error:
         run_fake(run, num_episodes=2, seed=1)
-    assert "--overwrite" not in str(error.value)  # since it would be refused
+    assert "--overwrite" not in str(error.value)  # --overwrite would be refused
     assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
 
 
@@ -270,7 +270,7 @@ def test_an_overwriting_that_fails_puts_the_run_back(run: Path, monkeypatch: pyt
 def test_somebodys_folder_that_is_called_like_what_was_set_aside(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], aside: str
 ) -> None:
-    """Not even a lock is left in a folder that a run refuses."""
+    """A run that is refused leaves nothing in the folder, not even a lock."""
     folder = tmp_path / "thesis"
     (folder / ".demorec-replaced").mkdir(parents=True)
     (folder / ".demorec-replaced" / "chapter_1.tex").write_text("years of work")
@@ -286,7 +286,7 @@ def test_somebodys_folder_that_is_called_like_what_was_set_aside(
 
 @pytest.mark.parametrize("moment", ["before", "moving", "moved", "made"])
 def test_a_crash_while_overwriting_loses_nothing(tmp_path: Path, moment: str) -> None:
-    """The four states that a kill within replaced_parts can leave, built by hand."""
+    """The four states that a kill inside `replaced_parts` can leave, built by hand."""
     names = ("run.json", "episodes", "failed")
     old = {"run.json": b"old", "episodes/a": b"old a", "failed/b": b"old b"}
     for name, data in old.items():
@@ -325,7 +325,7 @@ def opened(settings: Settings, out: Path, *, overwrite: bool) -> Evaluation:
 
 @pytest.fixture
 def evaluation(tmp_path: Path, made: Path) -> Path:
-    """One with a rollout in each folder."""
+    """An evaluation with a rollout in each folder."""
     out = tmp_path / "evaluation"
     opened(SETTINGS, out, overwrite=False)
     for place in ("episodes", "failed"):
@@ -348,7 +348,7 @@ def test_an_evaluation_with_something_foreign_is_not_overwritten(evaluation: Pat
     assert foreign in str(error.value)
     with pytest.raises(ConfigError, match="Another evaluation") as error:
         opened(replace(SETTINGS, episode_length=7), evaluation, overwrite=False)
-    assert "--overwrite" not in str(error.value)  # since it would be refused
+    assert "--overwrite" not in str(error.value)  # --overwrite would be refused
     assert files_of(evaluation) == before
 
 
@@ -366,7 +366,7 @@ def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) ->
     (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))
     with pytest.raises(ConfigError, match=r"version of torch is 1\.0 there"):
         opened(SETTINGS, evaluation, overwrite=False)
-    del plain["versions"]  # as of an older demorec
+    del plain["versions"]  # older versions of demorec wrote none
     (evaluation / EVALUATION_NAME).write_text(json.dumps(plain))
     assert not opened(SETTINGS, evaluation, overwrite=False).versions
 
@@ -394,7 +394,7 @@ KEPT: dict[str, dict[str, str]] = {
         "lock.mcap": "lock.mcap",
     },
     "view alone.mcap --save": {
-        "alone.rrd": "it is not a Rerun file",  # a recording under another name
+        "alone.rrd": "it is not a Rerun file",  # a recording with the suffix of a Rerun file
         "thesis.rrd": "it is not a Rerun file",
         "link.rrd": "it is an input of this command",
         "folder.rrd": "it is a folder",
@@ -415,12 +415,12 @@ KEPT: dict[str, dict[str, str]] = {
     "report dataset --out": {"dataset/report.html": "A new file inside a dataset would prevent"},
     **{f"export {exporter} alone.mcap --out": {"lock": "lock"} for exporter in EXPORTERS.names()},
 }
-"""Command -> what it shall not write over, and words of the reason."""
+"""Command -> files that it must not overwrite, and part of the reason."""
 
 
 @pytest.fixture
 def full(place: Path) -> Path:
-    """A home with something under every name; an empty file may be somebody's lock or mark."""
+    """A home folder with a file under every name. An empty file may be another program's lock or marker."""
     (place / "broken.mcap").write_bytes((place / "alone.mcap").read_bytes()[:-500])
     shutil.copy(place / "alone.mcap", place / "alone.rrd")
     for suffix in ("rrd", "png", "html", "json"):
@@ -487,7 +487,7 @@ def test_what_a_recovery_of_somebody_else_writes_stays(full: Path) -> None:
 def test_render_and_replay_never_replace_what_they_read(
     place: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
-    """Refused before anything is simulated or drawn, so made-up recordings will do."""
+    """The command refuses before it simulates or renders, so stand-in recordings suffice."""
     copy = place / "copy"
     copy.mkdir()
     shutil.copy(place / "alone.mcap", copy / "alone.mcap")
@@ -510,7 +510,7 @@ def test_render_and_replay_never_replace_what_they_read(
 
 
 def test_a_recording_replaces_recordings_only(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What render, replay and evaluate write with."""
+    """Test the writer that render, replay and evaluate share."""
     from support.recording import make_episode
 
     from demorec.mcap import EpisodeWriter
@@ -544,7 +544,7 @@ INSIDE: dict[str, Sequence[str]] = {
 def test_nothing_is_written_into_another_run_or_dataset(
     place: Path, command: str, target: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """It would be foreign there, and keep --overwrite from replacing the whole."""
+    """The new file would be foreign there, and would keep --overwrite from replacing the folder."""
     for whole, mark in (("runs/other", "run.json"), ("evaluation", "evaluation.json")):
         for part in ("episodes", "failed", "unfinished"):
             (place / whole / part).mkdir(parents=True)
@@ -569,7 +569,7 @@ def test_what_is_made_beside_the_parts_of_a_run_is_taken(place: Path) -> None:
 
 @pytest.mark.parametrize("kind", [RECORDING, RERUN_FILE, IMAGE])
 def test_special_files_are_never_replaced(tmp_path: Path, kind: object) -> None:
-    os.mkfifo(tmp_path / "fifo")  # reading it would wait for ever
+    os.mkfifo(tmp_path / "fifo")  # reading it would block forever
     for target in (tmp_path / "fifo", Path("/dev/null")):
         with pytest.raises(ConfigError, match="no regular file"):
             check_replaceable(target, kind, overwrite=True)  # type: ignore[arg-type]

@@ -1,6 +1,6 @@
-"""Every option of every command, given what it cannot take: exit code 2, before anything is read or written.
+"""Every option of every command, given a value that it cannot take: exit code 2, before anything is read or written.
 
-The options are found by their types, so that those of a new command are tried as well.
+The options are found by their types, so new commands are tested without a change here.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from support.options import OPTIONS, TARGETS, Option, parts_of
 
 READ_PATHS = {"a", "b", "bags", "calibration", "compare", "config", "dataset", "datasets", "file", "mapping", "path",
               "paths", "policy", "scores", "sources", "urdf"}  # fmt: skip
-"""Paths that are read; every other one names something new."""
+"""Paths that are read; every other path names a new file."""
 WITHOUT_REASON = re.compile("Could not (find valid parse for|parse) arguments")
-"""What tyro says of several values."""
+"""tyro's message for an option with several values."""
 
 
 def words_with(option: Option, value: list[str]) -> list[str]:
-    """A command line that has a value for this option, and for what its command requires."""
+    """Return a command line with a value for this option and for every required argument."""
     words = list(option.command)
     for other in OPTIONS:
         if other == option:
@@ -32,7 +32,7 @@ def words_with(option: Option, value: list[str]) -> list[str]:
 
 
 def _example(option: Option, *, is_named: bool) -> list[str]:
-    """A value that the option takes; none if the words of the command are one already."""
+    """Return a valid value for the option, or nothing if the command's own words already are one."""
     if option.name == "format":
         return [] if is_named else ["lerobot"]
     literals = [get_args(kind)[0] for kind in parts_of(option.type) if get_origin(kind) is Literal]
@@ -40,7 +40,7 @@ def _example(option: Option, *, is_named: bool) -> list[str]:
 
 
 def once(options: list[Option]) -> list[Any]:
-    """One of the options of each name and type, of the command that has the fewest."""
+    """Keep one option of each name and type, from the command that has the fewest."""
     counts = {option.command: sum(other.command == option.command for other in OPTIONS) for option in OPTIONS}
     chosen: dict[tuple[str, str], Option] = {}
     for option in sorted(options, key=lambda option: counts[option.command]):
@@ -49,7 +49,7 @@ def once(options: list[Option]) -> list[Any]:
 
 
 def refusal(option: Option, value: list[str], capsys: pytest.CaptureFixture[str]) -> str:
-    """What a command says of the value that it refuses."""
+    """Return the command's message about a value that it refuses."""
     assert exit_code(*words_with(option, value)) == 2
     told = capsys.readouterr()
     assert told.out == ""

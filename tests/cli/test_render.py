@@ -1,4 +1,4 @@
-"""`demorec render` that was ended in the middle: the same command continues, another one is refused."""
+"""An interrupted `demorec render` continues when the same command is repeated; a different command is refused."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def recordings(out: Path) -> dict[str, int]:
-    """Name -> when it was written, ns."""
+    """Name -> modification time of the recording, ns."""
     return {path.name: path.stat().st_mtime_ns for path in sorted((out / "episodes").glob("*.mcap"))}
 
 
@@ -49,7 +49,7 @@ def test_the_same_command_keeps_what_is_drawn(
     assert "Interrupted: 1 of 3 recordings are rendered; run the same command again" in capsys.readouterr().err
     before = recordings(out)
     assert len(before) == 1
-    assert list((out / "episodes").glob("*.part"))  # the half file
+    assert list((out / "episodes").glob("*.part"))  # the partial file
     assert exit_code(*command) == 0
     said = capsys.readouterr().out
     assert "1 of 3 had been rendered before and are unchanged" in said
@@ -106,21 +106,21 @@ def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None
     "number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=[pytest.mark.slow, pytest.mark.long])]
 )
 def test_ended_from_outside_it_is_quiet_and_goes_on(tmp_path: Path, number: signal.Signals) -> None:
-    """With two workers, which hold semaphores that Python would call leaked. The last recording takes seconds."""
+    """Two workers hold semaphores, which Python might report as leaked. The last recording takes seconds."""
     run, out = make_run(tmp_path / "run", (3, 3, 40), cameras=("front",)), tmp_path / "out"
     options = ("--width", "512", "--height", "512", "--looks", "1", "--workers")
     command = [sys.executable, "-m", "demorec", "render", str(run), "--out", str(out), *options, "2"]
     process = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
     deadline = time.monotonic() + 120
     while not list(out.glob("episodes/*.part")):
-        assert process.poll() is None, "it ended before it could be ended"
+        assert process.poll() is None, "it ended before it was interrupted"
         assert time.monotonic() < deadline
         time.sleep(0.01)
     if number == signal.SIGINT:
         os.killpg(process.pid, number)  # as Ctrl-C does
     else:
         process.kill()
-    _, errors = process.communicate(timeout=120)  # until Python's tracker of resources, which writes there, has ended
+    _, errors = process.communicate(timeout=120)  # waits for Python's resource tracker, too
     lines = [line for line in errors.decode().splitlines() if "rendering" not in line]
     if number == signal.SIGINT:
         assert process.returncode == 130, errors.decode()

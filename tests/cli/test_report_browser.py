@@ -1,4 +1,4 @@
-"""A report in a real browser: opened from its file, at two widths, light and dark, with hostile words in it."""
+"""A report in a real browser: opened from its file, at two widths, light and dark, with hostile text in it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ HOSTILE = "<script>document.title = 'taken'</script><img src=x onerror=\"documen
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A report on six episodes, one of which failed and one of which says what would be markup."""
+    """A report on six episodes: one failed, and the text of one would be markup if it were not escaped."""
     folder = make_run(tmp_path_factory.mktemp("browser") / "cubes", (24,) * 5, failures=(1,), cameras=("front",))
     file = folder / "episodes" / "episode_000004.mcap"
     with Recording(file) as recording:
@@ -35,7 +35,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def show(page: Chromium, path: Path, *, width: int, scheme: str) -> dict[str, Any]:
-    """Open a page and tell what came of it."""
+    """Open a page and report its state."""
     page.call("Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=width < 500)
     page.call("Emulation.setEmulatedMedia", features=[{"name": "prefers-color-scheme", "value": scheme}])
     page.call("Page.navigate", url=path.as_uri())
@@ -82,7 +82,7 @@ def test_a_browser_shows_it_and_nothing_foreign_runs(report: Path) -> None:
         assert brightness["dark"] < 60 < 200 < brightness["light"]
         page.value("document.querySelector('.filters button[value=failed]').click()")
         assert page.value("document.querySelector('output').textContent") == "1 of 6 shown"
-        # What the page's own rules forbid would not even run if an escape had been forgotten.
+        # The page's content security policy would block markup even if escaping had been forgotten.
         page.value("document.body.insertAdjacentHTML('beforeend', '<img src=x onerror=\"document.title = 1\">')")
         page.value(
             "document.body.append(Object.assign(document.createElement('script'), {text: 'document.title = 2'}))"

@@ -1,4 +1,4 @@
-"""Recordings that list other sensors than this version simulates, as every command meets them."""
+"""Every command on recordings whose sensors this version does not simulate."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def values_of(feature: Feature, frame: int) -> NDArray[np.float64]:
 
 
 def with_sensors(source: Path, target: Path, sensors: Sequence[Feature]) -> Path:
-    """The episode of a recording with these sensors in place of its own."""
+    """Replace the sensors of a recorded episode."""
     with (
         Recording(source) as recording,
         EpisodeWriter(

@@ -1,5 +1,7 @@
-"""`make setup` with and without a C++ compiler; with a stand-in for uv; the new environment's Python is this one, in
-which torchcodec cannot be imported."""
+"""`make setup` with and without a C++ compiler.
+
+A stand-in replaces uv. The new environment uses this Python, in which torchcodec cannot be imported.
+"""
 
 from __future__ import annotations
 
@@ -28,7 +30,7 @@ esac
 
 @pytest.fixture
 def checkout(tmp_path: Path) -> Path:
-    """What make needs of the repository, and a PATH without a compiler."""
+    """Copy the files of the repository that make needs, and set a PATH without a compiler."""
     (tmp_path / "tools").mkdir()
     for name in ("Makefile", "pyproject.toml", "constraints.txt", ".python-version", "tools/setup.sh"):
         shutil.copy(ROOT / name, tmp_path / name)
@@ -56,12 +58,12 @@ def test_without_a_compiler_a_fork_takes_pybullets_place(checkout: Path) -> None
     assert "pybullet-arm64==3.2.8" in done.stdout
     uninstalled, installed, unusable = (checkout / "asked").read_text().splitlines()
     assert uninstalled.split()[:2] == ["pip", "uninstall"]
-    assert uninstalled.split()[-1] == "pybullet"  # whose files the fork has, too
+    assert uninstalled.split()[-1] == "pybullet"  # the fork owns the same files
     assert "pybullet-arm64==3.2.8" in installed.split()
     assert unusable == "pip uninstall -p .venv torchcodec"
     for plugin in (ROOT / "plugins").iterdir():
         assert f"-e plugins/{plugin.name}/" in installed
-    needed = Requirement((checkout / "override").read_text())  # instead of what demorec itself asks for
+    needed = Requirement((checkout / "override").read_text())  # instead of demorec's own dependencies
     assert needed.name == "pybullet"
     assert needed.marker is not None
     assert not needed.marker.evaluate()
@@ -82,7 +84,7 @@ def test_the_official_package_is_the_default_and_another_choice_sets_up_again(ch
     for choice, last in ((), "pybullet-arm64"), (("PYBULLET=wheel",), "pybullet"), ((), None):
         done = make(checkout, "setup", *choice)
         assert done.returncode == 0, done.stderr
-        if last is None:  # what is there stays
+        if last is None:  # the existing environment is kept
             assert "Nothing to be done" in done.stdout
         else:
             assert (checkout / "asked").read_text().splitlines()[-3].endswith(f" {last}")

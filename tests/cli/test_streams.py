@@ -1,4 +1,4 @@
-"""Standard streams that the shell has closed, or whose reader has left: silence, and the command's own exit code."""
+"""Standard streams that are closed, or whose reader has exited: commands stay silent and keep their exit code."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ class Ended(NamedTuple):
 
 
 def shell(words: str, redirections: str) -> Ended:
-    """What a command comes to in a shell."""
+    """Run a command in a shell and return its result."""
     command = f'set -o pipefail; "{sys.executable}" -m demorec {words} {redirections}'
     ended = subprocess.run(["bash", "-c", command], capture_output=True, text=True, timeout=300, check=False)
     return Ended(ended.returncode, ended.stdout, ended.stderr)
 
 
 CLOSED = {"<&- >&-": ("out",), "2>&-": ("err",), "<&- >&- 2>&-": ("out", "err")}
-"""Redirections -> what cannot be heard then."""
+"""Redirections -> streams that are then lost."""
 
 
 @pytest.mark.slow
@@ -55,7 +55,7 @@ def test_a_full_disk_behind_the_answer_is_one_sentence() -> None:
 
 
 def test_a_file_does_not_take_the_number_of_a_closed_stream(tmp_path: Path) -> None:
-    """What libraries print into a closed stream would go into the file that has its number."""
+    """Text that a library prints to a closed stream must not end up in the file that reuses its number."""
     code = (
         "from demorec.core.streams import open_closed_streams; open_closed_streams(); import os;"
         f"file = os.open({str(tmp_path / 'mine')!r}, os.O_WRONLY | os.O_CREAT); os.system('echo a word');"

@@ -1,4 +1,4 @@
-"""Targets that cannot be written: one sentence and the exit code of the table in docs/README.md from every command."""
+"""Targets that cannot be written: every command prints one sentence, and the exit code is that of docs/README.md."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ CALLS = {
     "render to a file": "render RECORDING --out NEW.mcap --cameras front --workers 1",
     "recover": "recover RECORDING --out NEW.mcap",
 }
-"""What makes each command write something whose name begins with NEW."""
+"""Calls that make each command write a file whose name begins with NEW."""
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +39,7 @@ def sources(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
 
 def call(name: str, sources: dict[str, Path], new: Path) -> list[str]:
-    """The words of a call that writes `new`, or what begins with it."""
+    """Return the arguments of a call that writes `new`, or names that begin with it."""
     words = CALLS[name]
     for word, path in sources.items():
         words = words.replace(word, str(path))
@@ -47,7 +47,7 @@ def call(name: str, sources: dict[str, Path], new: Path) -> list[str]:
 
 
 def said(capsys: pytest.CaptureFixture[str]) -> str:
-    """The one sentence about the error."""
+    """Return the error message, which must be one sentence."""
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("demorec ")]
     assert len(lines) == 1, lines
     return lines[0]

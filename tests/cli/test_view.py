@@ -1,4 +1,4 @@
-"""`demorec view` through the real viewer: images of recordings, runs and datasets; the browser."""
+"""`demorec view` with the real viewer: images of recordings, runs and datasets; the browser."""
 
 from __future__ import annotations
 
@@ -112,7 +112,9 @@ def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path
 
 
 def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "wrist")) -> None:
-    """No view complains; the 3D view shows robot, table and frusta; the cameras show their moving red square."""
+    """Check that no view reports an error, that the 3D view shows robot, table and frusta, and that each camera shows
+    its moving red square.
+    """
     assert viewer.reports() == []
     world = pixels(viewer.view_image("pick_place: the world"))
     assert num_colors(world) > 100
@@ -146,7 +148,7 @@ def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
 @pytest.mark.viewer
 @pytest.mark.parametrize("codec", [pytest.param("av1", marks=pytest.mark.long), "jpeg"])
 def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "jpeg"], tmp_path: Path) -> None:
-    """H.264 is left out: Rerun 0.41 takes it for BT.709 whatever the stream says."""
+    """H.264 is left out: Rerun 0.41 assumes BT.709 whatever the stream specifies."""
     need_vulkan()
     colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)
     image = np.repeat(np.repeat(colours[np.newaxis], 80, axis=1), 240, axis=0)
@@ -179,7 +181,7 @@ def test_episodes_arrive_while_the_viewer_is_open(
     run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     need_vulkan()
-    monkeypatch.setattr(live_module, "_END_SECONDS", 300.0)  # the sender has low priority: on a busy machine it is last
+    monkeypatch.setattr(live_module, "_END_SECONDS", 300.0)  # the sender has low priority and may be late
     first, second = sorted((run_folder / "episodes").iterdir())
     save(find_episodes([first])[0], tmp_path / "x.rrd")
     with HeadlessViewer(tmp_path / "x.rrd") as viewer:
@@ -194,7 +196,7 @@ def test_episodes_arrive_while_the_viewer_is_open(
 
 
 @pytest.mark.slow
-@pytest.mark.long  # the web viewer takes a minute to draw on a software rasteriser
+@pytest.mark.long  # the web viewer needs a minute to draw with a software rasteriser
 @pytest.mark.viewer
 def test_the_browser_shows_an_episode(run_folder: Path, tmp_path: Path) -> None:
     program = need_chromium()

@@ -1,4 +1,4 @@
-"""Whatever lies in the place of a recording, a run or a dataset, every command says the same true sentence about it."""
+"""Every command describes a path that is not a recording, run or dataset in the same words."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def make_fifo(path: Path) -> None:
 
 def make_socket(path: Path) -> None:
     here = Path.cwd()
-    os.chdir(path.parent)  # the name of a socket may have some hundred characters only
+    os.chdir(path.parent)  # a socket's name is limited to about a hundred characters
     try:
         with socket.socket(socket.AF_UNIX) as listening:
             listening.bind(path.name)
@@ -103,7 +103,7 @@ def test_every_command_tells_the_same_about_a_path(
 @pytest.mark.parametrize("command", ON_A_PATH)
 @pytest.mark.parametrize("place", ["the path itself", "in a folder"])
 def test_names_that_are_not_utf8(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str) -> None:
-    """PyArrow and Rerun open none of them."""
+    """Neither PyArrow nor Rerun can open such names."""
     path = tmp_path / os.fsdecode(b"\xff.mcap")
     write_episode(path, num_frames=2, cameras=())
     before = sorted(tmp_path.iterdir())
@@ -123,7 +123,7 @@ def test_what_cannot_be_seen_is_not_called_nothing(tmp_path: Path, monkeypatch: 
     def forbidden(self: Path) -> os.stat_result:
         raise PermissionError(13, "Permission denied", str(self))
 
-    monkeypatch.setattr(Path, "lstat", forbidden)  # these tests may run as a user to whom nothing is forbidden
+    monkeypatch.setattr(Path, "lstat", forbidden)  # the tests may run as root, who may read everything
     found = find(tmp_path / "run")
     assert (found.kind, found.reason) == ("unreadable", "This cannot be read (Permission denied)")
 
@@ -194,7 +194,7 @@ def test_what_is_not_taken_is_named_with_what_is(tmp_path: Path) -> None:
 
 @pytest.fixture
 def after_a_kill(tmp_path: Path) -> Path:
-    """A folder with a whole recording, one that a crash left, and one that was left and has been made again since."""
+    """A folder with a complete recording, one left by a crash, and one left by a crash and recorded again since."""
     folder = tmp_path / "after a kill"
     a_recording("episodes/episode_000000.mcap")(folder)
     for name in ("episodes/episode_000001", "unfinished/node-1-0/episode_000000.attempt_0"):

@@ -1,4 +1,4 @@
-"""One dataset over all tasks together."""
+"""One dataset that contains all tasks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Boxes against the images of segmentation, in the dataset and in playback."""
+"""Bounding boxes in datasets and in playback match the segmentation images."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`demorec dataset cut`: parts have the frames of their episode, bit for bit, as LeRobot reads both."""
+"""`demorec dataset cut`: as LeRobot reads them, the parts have exactly the frames of their episode."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ cut = partial(exit_code, "dataset", "cut")
 
 
 def parts_of(frames: list[dict[str, Any]], *edges: int) -> list[list[dict[str, Any]]]:
-    """Parts between edges, with timestamps from 0."""
+    """Slice the frames at the edges; each part's timestamps start at 0."""
     spans = pairwise(edges)
     return [
         [frame | {"timestamp": np.asarray(number / 10, np.float32)} for number, frame in enumerate(frames[first:last])]
@@ -39,7 +39,7 @@ def test_parts_at_given_frames(video: bool, tmp_path: Path, capsys: pytest.Captu
     told = capsys.readouterr().out
     assert "episode 0: 3 parts of 12 frames, 0:5, 5:9, 9:12" in told
     assert "6 parts of 3 episodes, 39 of 39 frames" in told
-    # Two images a group: each part that begins within one keeps the keyframe before it.
+    # A group of pictures has two images, so a part that begins inside one keeps the keyframe before it.
     assert ("2 images beside cuts stay in the videos" in told) == video
     whole, found = items(root), items(tmp_path / "new")
     expected = [*parts_of(whole[0], 0, 5, 9, 12), whole[1], *parts_of(whole[2], 0, 6, 14)]
@@ -48,7 +48,10 @@ def test_parts_at_given_frames(video: bool, tmp_path: Path, capsys: pytest.Captu
 
 
 def collapsed(root: Path, lengths: tuple[int, ...], *, slow: int = 1) -> Path:
-    """Rollouts of a smooth motion in one episode, as strands-labs/robots#708; a sensor may repeat each number."""
+    """Several rollouts of a smooth motion stored as one episode (strands-labs/robots#708).
+
+    A sensor may repeat each value.
+    """
     rng = np.random.default_rng(0)
     values = [np.cos(np.linspace(0, 3, n))[:, None] * 3 + rng.normal(0, 0.5, 3) for n in lengths]
     motion = np.concatenate([np.repeat(each[::slow], slow, axis=0)[: len(each)] for each in values])

@@ -1,4 +1,4 @@
-"""`demorec dataset` on datasets that LeRobot wrote, of all kinds, with the installed LeRobot as the judge."""
+"""`demorec dataset` on datasets of all kinds that LeRobot wrote; the installed LeRobot verifies the results."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ edit = partial(exit_code, "dataset")
 
 
 def reordered(root: Path) -> Path:
-    """A dataset whose images are stored in another order than they are shown in."""
+    """A dataset with B-frames: images are stored in a different order than they are shown."""
     write_with_lerobot(root)
     (path,) = root.glob(f"videos/{TOP}/*/*.mp4")
     with av.open(str(path)) as container:
         images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
     begins = np.cumsum([0, *LENGTHS])
     with av.open(str(path), "w") as out:
-        # A group of images for each episode, as libx264 chooses it: with up to three images between two others.
+        # One group of pictures an episode, as libx264 chooses it, with up to three B-frames in a row.
         stream = out.add_stream("libx264", rate=10, options={"g": "250", "bf": "3", "qp": "12", "b-adapt": "0"})
         assert isinstance(stream, VideoStream)
         stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
@@ -60,7 +60,7 @@ def in_small_files(root: Path) -> Path:
 
 
 def of_all_types(root: Path) -> Path:
-    """A dataset with depth, arrays of two dimensions, texts and several files."""
+    """A dataset with depth, two-dimensional arrays, text and several files."""
     return write_by_lerobot(root, LENGTHS, depth=True)
 
 
@@ -88,7 +88,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def statistics_are_exact(root: Path) -> None:
-    """Those of numbers, against NumPy's of all rows."""
+    """Check the statistics of numeric features against NumPy over all rows."""
     found = json.loads((root / "meta/stats.json").read_text())
     for name in ("observation.state", "action", "index"):
         values = np.array(data_table(root).column(name).to_pylist(), dtype=np.float64)
@@ -136,7 +136,10 @@ def test_in_another_order_and_in_parts(dataset: Path, tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("dataset", ["all types"], indirect=True)
 def test_statistics_of_arrays_are_those_of_their_last_dimension(dataset: Path, tmp_path: Path) -> None:
-    """As LeRobot has them, whose own dataset is the model; with depth, whose mean is that of what LeRobot decodes."""
+    """LeRobot computes them the same way, so its own dataset is the reference.
+
+    Depth statistics are those of decoded images.
+    """
     assert edit("trim", dataset, "--head", 1, "--out", tmp_path / "t") == 0
     shapes = [
         {name: [np.shape(value) for value in entry.values()] for name, entry in statistics(path).items()}
@@ -178,7 +181,7 @@ def test_decoded_statistics_are_those_of_the_images(small: Path, tmp_path: Path)
 
 
 def test_idle_ends_are_cut_off(small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert edit("trim", small, "--head", 0, "--tail", 0, "--out", tmp_path / "t") == 2  # nothing to cut is no request
+    assert edit("trim", small, "--head", 0, "--tail", 0, "--out", tmp_path / "t") == 2  # cuts nothing
     assert edit("trim", small, "--idle", "--idle-margin", 1, "--out", tmp_path / "t") == 0
     assert "episode 0: 2 frames cut at the beginning, 2 at the end" in capsys.readouterr().out
     assert [len(episode) for episode in items(tmp_path / "t")] == [8 + number for number in range(5)]

@@ -1,4 +1,6 @@
-"""What stands beside the rows of a dataset goes along with `demorec dataset`, or is named with the reason."""
+"""`demorec dataset` carries the files next to a dataset's rows along, or names those that it leaves out, with the
+reason.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +32,7 @@ def poses(root: Path, episode: int) -> np.ndarray[Any, Any]:
 
 
 def boxes(root: Path) -> dict[tuple[int, int], list[tuple[Any, ...]]]:
-    """(episode, frame) of each image of the front camera -> what is seen there."""
+    """(episode, frame) of each image of the front camera -> objects visible in it."""
     told = json.loads((root / BOXES).read_text())
     nouns = {item["id"]: item["name"] for item in told["categories"]}
     ids = {image["id"]: (image["episode_index"], image["frame_index"]) for image in told["images"]}
@@ -51,7 +53,7 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def failing(root: Path) -> set[str]:
-    """Checks of the dataset that fail; motion and images of these episodes are made up."""
+    """Return the failed dataset checks; motion and images are synthetic, so their checks do not count."""
     results = checked(root, "dataset", images=False).results
     assert {result.check: result.level for result in results}["dataset_sidecar"] == "pass"
     return {result.check for result in results if result.level == "fail" and result.check.startswith("dataset")}
@@ -67,7 +69,7 @@ def test_attempts_boxes_and_poses_follow_their_episodes(
     told = capsys.readouterr().out
     assert "Left out: failed attempts: 1 (at episodes that are not in the result)" in told
     edit("trim", tmp_path / "s", "--head", 3, "--tail", 2, "--out", tmp_path / "t")
-    before, origin = boxes(simulated), {0: 2, 1: 1}  # episode of s -> of the first
+    before, origin = boxes(simulated), {0: 2, 1: 1}  # episode of s -> episode of the first dataset
     assert any(before.values())
     for root, first, lost in ((tmp_path / "s", 0, 0), (tmp_path / "t", 3, 5)):
         found = boxes(root)

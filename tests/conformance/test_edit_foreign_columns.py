@@ -1,6 +1,6 @@
-"""Datasets with columns, files and videos that other programs write: what becomes of them in each command.
+"""Columns, files and videos of third-party datasets, and their treatment by each command.
 
-That edits keep every value is tested in tests/property/test_dataset_edits.py.
+tests/property/test_dataset_edits.py verifies that edits keep every value.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ LENGTH, COUNT = 8, 4
 
 
 def foreign(root: Path, columns: Mapping[str, pa.Array | pa.ChunkedArray], *, dtype: str = "int64") -> Path:
-    """A dataset whose episodes have the tasks 4, 0, 1, 0, with other columns, or some in place of its own."""
+    """A dataset whose episodes have the tasks 4, 0, 1, 0, with extra columns or with replaced ones."""
     write_foreign(root, length=LENGTH, episodes=COUNT)
     table, info = pq.read_table(root / DATA), json.loads((root / "meta/info.json").read_text())
     numbers = [4, 0, 1, 0]
@@ -66,7 +66,7 @@ def tasks(root: Path) -> list[str]:
 
 
 def said(root: Path, column: str) -> list[str]:
-    """The text that each row's number stands for."""
+    """Return the task text behind each row's index."""
     texts = tasks(root)
     return [texts[number] for number in rows(root)[column].to_pylist()]
 

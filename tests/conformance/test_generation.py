@@ -1,4 +1,4 @@
-"""The whole job with the real simulator: one digest whatever the workers and the order, and it can be made again."""
+"""A complete run with the real simulator: its digest depends on neither workers nor order, and it can be reproduced."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def make(out: Path, *, workers: int, episodes: list[int] | None = None, num_epis
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """Made by one worker in order."""
+    """A run by one worker, in order."""
     return make(tmp_path_factory.mktemp("reference") / "run", workers=1)
 
 
@@ -61,7 +61,7 @@ def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path: Path, refer
 
 
 def test_recordings_know_the_run_that_they_belong_to(tmp_path: Path, reference: RunResult) -> None:
-    """run.json is lost: everything in it that matters is read back from the recordings."""
+    """Everything in run.json that matters can be restored from the recordings."""
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
     (out / "run.json").unlink()
@@ -107,7 +107,7 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
 
     few = ExportOptions(features=("observation.images.wrist",), action="ee_delta", verify=False)
     export_lerobot([reference.folder], tmp_path / "few", few)
-    # What the dataset says makes the very run that is there already (another is refused), so only the dataset is made.
+    # The dataset describes the run that exists already; any other run would be refused. Only the dataset is made again.
     shutil.copytree(reference.folder, tmp_path / "copy")
     assert reproduce(tmp_path / "few", tmp_path / "copy") == 0
     assert dataset_digest(tmp_path / "copy" / "dataset") == dataset_digest(tmp_path / "few")
@@ -117,7 +117,7 @@ def test_a_dataset_of_few_features_is_made_again_and_can_be_shown(tmp_path: Path
     ):
         assert shown.motion.base_from_tcp is not None
         recorded = recording.trajectory().base_from_tcp
-        # The simulator's pose against that of the joints, which the dataset has as float32.
+        # The simulator's pose against forward kinematics of the joints, which the dataset stores as float32.
         assert np.allclose(shown.motion.base_from_tcp[:, :3], recorded[:, :3], atol=1e-5)
         assert "velocity" not in shown.curves
         assert tuple(shown.videos) == ("wrist",)

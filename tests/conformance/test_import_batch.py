@@ -1,4 +1,4 @@
-"""Many bags at once: a bad one stops no others, and neither processes nor interrupts change what is in the run."""
+"""Imports of many bags: an unreadable bag does not stop the others; workers and interrupts do not change the result."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.slow
 
 FRONT = "/follower/cam_front/image_raw/compressed"
 DROPPING = bag_mappings.SO101.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
-"""A bad bag is no reason to drop an episode: it has none."""
+"""`drop_episode` must not cover up an unreadable bag, which has no episode."""
 
 
 def _bag(path: Path, seconds: float = 0.6, change: Callable[[bags.Notes], bags.Notes] = lambda notes: notes) -> Path:
@@ -49,7 +49,7 @@ def _resized(notes: bags.Notes) -> bags.Notes:
 
 
 def _odd(notes: bags.Notes) -> bags.Notes:
-    """PNG images, which are to be encoded, of a size that no video has."""
+    """PNG images, which need encoding, of a size that video cannot have."""
     buffer = io.BytesIO()
     Image.fromarray(np.zeros((47, 63, 3), np.uint8)).save(buffer, format="PNG")
     data = np.frombuffer(buffer.getvalue(), np.uint8)
@@ -62,7 +62,7 @@ def _named(notes: bags.Notes, name: str) -> bags.Notes:
 
 
 def _recorded(note: bags.Note, time_ns: int) -> bags.Note:
-    """Recorded at that time instead of the epoch of the bags, without one in its header."""
+    """Move a message to that recording time, with an empty header time."""
     return replace(note, log_ns=note.log_ns - bags.EPOCH_NS + time_ns, header_ns=0)
 
 
@@ -97,7 +97,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 def _batch(folder: Path) -> tuple[Path, Path]:
-    """A folder of bags of which every other one is bad, each in another way, and a mapping."""
+    """A mapping and a folder in which every other bag is bad, each for a different reason."""
     (folder / "bags").mkdir(parents=True)
     for number, (spoil, _) in enumerate(BAD.values()):
         _bag(folder / "bags" / f"run_{2 * number}.mcap", 0.5 + 0.1 * number)
@@ -117,13 +117,13 @@ def _files(recording: Recording) -> list[str]:
 
 
 def _content(run: Path) -> dict[str, bytes]:
-    """All that does not say who imported when."""
+    """Recordings and import.json, which have neither the author nor the time of the import."""
     return {path.name: path.read_bytes() for path in [*run.glob("episodes/*"), run / "import.json"]}
 
 
 @pytest.fixture(scope="module")
 def alone(batch: tuple[Path, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The run that one process makes at once."""
+    """The run that a single process makes."""
     run = tmp_path_factory.mktemp("alone") / "run"
     import_bags([batch[0]], batch[1], run, skip_bad=True)
     return run
@@ -194,7 +194,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
 
 
 def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A mistyped name, a full disk, too little memory."""
+    """A mistyped name, a full disk and too little memory stop the batch."""
     bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
     mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
     with pytest.raises(ConfigError, match="No readable bag"):
@@ -221,7 +221,7 @@ def test_the_same_bag_twice_is_imported_once(tmp_path: Path) -> None:
     second.write_bytes(first.read_bytes())
     mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
     result = import_bags([first, first, second], mapping, tmp_path / "run")
-    assert len(result.reports) == 2  # by another name
+    assert len(result.reports) == 2  # under another name
     (tmp_path / "c").mkdir()
     copy = tmp_path / "c" / "a.mcap"
     copy.write_bytes(first.read_bytes())
@@ -271,7 +271,7 @@ def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone
         program.kill()
     _, alive = psutil.wait_procs(children, timeout=30)
     assert not alive
-    assert load_any_run_file(run).planned, "a kill at any moment leaves a run that says what is missing"
+    assert load_any_run_file(run).planned, "a kill at any moment leaves a run that lists the missing episodes"
     import_bags([batch[0]], batch[1], run, skip_bad=True)
     assert not load_any_run_file(run).planned
     assert _content(run) == _content(alone)

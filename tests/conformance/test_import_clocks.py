@@ -1,4 +1,4 @@
-"""Bags whose headers and times of recording are of two clocks, or that lack headers in part; fps by the rows' clock."""
+"""Bags with separate clocks for headers and recording, or with incomplete headers; fps follows the rows' clock."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STATE, ACTION, FRONT = "/joint_states", "/joint_command", "/front/rgb"
 GRIPPER = "/gripper/state"
 WALL_NS = bags.EPOCH_NS + 5 * bags.NS
 SLOWDOWN = 30 / 23
-"""Seconds of recording to one of a simulation that cannot keep up."""
+"""Recorded seconds for each second of a simulation that is slower than real time."""
 MAPPING = """
 [robot]
 name = "arm"
@@ -38,7 +38,9 @@ topic = "/front/rgb"
 
 
 def isaac(seconds: float = 3.0) -> bags.Notes:
-    """As of Isaac Sim's ROS 2 bridge: headers of simulated time, from its start on, recorded at the host's pace."""
+    """Messages as Isaac Sim's ROS 2 bridge sends them: headers count simulated time from 0, recorded at the host's
+    pace.
+    """
 
     def simulated(moments: list[int]) -> list[int]:
         return [moment - bags.EPOCH_NS + 500_000_000 for moment in moments]
@@ -56,7 +58,7 @@ def isaac(seconds: float = 3.0) -> bags.Notes:
 
 
 def real(seconds: float = 2.0, *, skew_s: float = 0.0) -> bags.Notes:
-    """A robot with a camera, and a gripper without headers; those of the others are `skew_s` behind the recorder."""
+    """A robot with a camera, and a gripper without headers; other headers are `skew_s` behind the recorder."""
     notes = bags.joints(STATE, ("a", "b"), bags.times(100, seconds, seed=1))
     notes += bags.joints(ACTION, ("a", "b"), bags.times(100, seconds, seed=2), shift=0.1)
     notes += bags.jpeg_images(FRONT, bags.times(30, seconds, seed=3), 0, "front")
@@ -73,7 +75,7 @@ def real(seconds: float = 2.0, *, skew_s: float = 0.0) -> bags.Notes:
 
 @pytest.fixture
 def imports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[bags.Notes, str], tuple[int, str, str]]:
-    """Exit code, output and error of an import of messages by a mapping; "suggested" for the suggested one."""
+    """Import messages with a mapping, or with the suggested one; return exit code, output and errors."""
 
     def do(notes: bags.Notes, mapping: str) -> tuple[int, str, str]:
         bag = bags.write_rosbag2(notes, tmp_path / "stack_cups_01")
@@ -92,7 +94,7 @@ Imports = Callable[[bags.Notes, str], tuple[int, str, str]]
 
 @pytest.mark.parametrize("mapping", ["suggested", MAPPING])
 def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
-    """By the recorder's clock the camera has 23 images a second, by that of the headers, which rows follow, 30."""
+    """The camera has 23 images a second by the recorder's clock, and 30 by the headers, which rows follow."""
     notes = isaac()
     code, told, _ = imports(notes, mapping)
     assert code == 0
@@ -170,7 +172,7 @@ def test_simulated_headers_beside_none_are_refused(imports: Imports) -> None:
 
 @pytest.mark.parametrize("rate", [5, 12, 30, 59.94, 90])
 def test_the_suggested_rate(rate: float, imports: Imports, tmp_path: Path) -> None:
-    """Though the camera pauses for two seconds, as between two tries."""
+    """A camera pauses for two seconds, as between two attempts."""
     moments = [bags.EPOCH_NS + 1000 * round(k * 1e6 / rate + (2e6 if k > rate else 0)) for k in range(round(3 * rate))]
     notes = bags.joints(STATE, ("a", "b"), range(moments[0] - 10_000_000, moments[-1], 10_000_000))
     notes += bags.joints(ACTION, ("a", "b"), range(moments[0] - 10_000_000, moments[-1], 10_000_000))
@@ -183,7 +185,9 @@ def test_the_suggested_rate(rate: float, imports: Imports, tmp_path: Path) -> No
 def test_the_suggested_task_is_that_of_each_bag(
     name: str, task: str | None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Never the first one's for all; where a name says nothing, it has to be written."""
+    """The suggestion uses each bag's own name, never that of the first for all; otherwise the user has to supply the
+    task.
+    """
     paths = []
     for number in range(2):
         notes = bags.in_order(bags.so101(0.6 + 0.1 * number))
@@ -204,7 +208,7 @@ def test_the_suggested_task_is_that_of_each_bag(
 
 
 def test_simulated_time_that_jumps_is_found(imports: Imports) -> None:
-    """Against the headers of the other streams."""
+    """The jump is relative to the headers of the other streams."""
     jumping = bags.changed(
         isaac(), ACTION, lambda k, note: replace(note, header_ns=note.header_ns + (k > 90) * 120_000_000)
     )
@@ -215,7 +219,7 @@ def test_simulated_time_that_jumps_is_found(imports: Imports) -> None:
 
 @pytest.mark.parametrize("factor", [0.4, 0.7, 2.0])
 def test_simulated_time_without_a_camera(factor: float, imports: Imports, tmp_path: Path) -> None:
-    """Rows follow the headers' rate, whatever the recorder's clock says: no message is lost."""
+    """Rows follow the headers' rate, independent of the recorder's clock: no message is lost."""
     notes = bags.joints(STATE, ("a", "b"), bags.times(25, 6.0, jitter=0, seed=1))
     simulated = [
         replace(note, log_ns=WALL_NS + round((note.log_ns - bags.EPOCH_NS) / factor), header_ns=note.header_ns)
@@ -249,7 +253,7 @@ def test_a_robot_that_moves_a_little_is_not_still(imports: Imports) -> None:
 
 @pytest.mark.parametrize("size", [0.0, 5e-4])
 def test_a_bag_in_which_nothing_moves(size: float, imports: Imports) -> None:
-    """A robot that was never switched on, with or without the noise of its encoders."""
+    """A robot that was never switched on, with and without encoder noise."""
     random = np.random.default_rng(0)
     notes = [
         bags.with_body(note, position=np.array([0.3, -1.2]) + size * random.uniform(-0.5, 0.5, 2))
@@ -263,7 +267,7 @@ def test_a_bag_in_which_nothing_moves(size: float, imports: Imports) -> None:
 
 
 def test_numbers_slower_than_rows_are_a_note(imports: Imports) -> None:
-    """A gripper at 10 Hz beside joints at 100 Hz: each row holds its last opening."""
+    """A gripper at 10 Hz next to joints at 100 Hz: each row repeats the latest opening."""
     slow = [note for k, note in enumerate(note for note in real(3.0) if note.topic == GRIPPER) if k % 10 == 0]
     notes = bags.in_order([note for note in real(3.0) if note.topic != GRIPPER] + slow)
     _, told, _ = imports(notes, _with_gripper(stamp="log", max_age_s="XX").replace('"XX"', "0.3"))
@@ -272,7 +276,7 @@ def test_numbers_slower_than_rows_are_a_note(imports: Imports) -> None:
 
 
 def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp_path: Path) -> None:
-    """Joints take the next state, the gripper the last command of its own topic, row by row."""
+    """Joint actions are the next state; gripper actions are the latest command of a separate topic, row by row."""
     notes = real(3.0)
     mapping = MAPPING.replace('[[features.action]]\ntopic = "/joint_command"\nfield = "position"\n', "")
     mapping += '[[features.action]]\nnext = "observation.state"\n'

@@ -1,4 +1,4 @@
-"""Depth in bags of ROS 1 and ROS 2: every distance stays what it was, and readers that are not ours find it."""
+"""Depth in bags of ROS 1 and ROS 2: every distance is preserved, and third-party readers find it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ topic = "{DEPTH}"
 
 
 def millimetres(time_ns: int) -> NDArray[np.uint16]:
-    """Distances with holes, the largest value of 16 bits, and noise that tells the moment."""
+    """Distances with holes, the largest 16-bit value, and noise that identifies the image."""
     values = np.random.default_rng(time_ns % 2**32).integers(300, 4000, (bags.HEIGHT, bags.WIDTH)).astype(np.uint16)
     values[:6] = 0
     values[10, 10] = 65535
@@ -50,7 +50,7 @@ def millimetres(time_ns: int) -> NDArray[np.uint16]:
 
 
 def metres(time_ns: int) -> NDArray[np.float32]:
-    """Distances that no whole millimetre is, with a hole, NaN and infinity."""
+    """Distances that are not whole millimetres, with a hole, NaN and infinity."""
     values = millimetres(time_ns).astype(np.float32) / np.float32(997.3)
     values[7, :3] = [np.nan, np.inf, 0.0]
     return values
@@ -84,7 +84,7 @@ def body(kind: str, time_ns: int) -> dict[str, Any]:
 
 
 def notes_with_depth(kind: str, moments: Sequence[int]) -> bags.Notes:
-    """A follower, a leader, a colour camera, and distances at its times."""
+    """A follower, a leader, a colour camera, and depth images at the same times."""
     notes = [note for note in bags.so101(0.6) if "joint_states" in note.topic]
     notes += bags.raw_images(COLOR, moments, 1, "wrist_optical")
     name = "CompressedImage" if kind in ("png", "rvl") else "Image"
@@ -101,7 +101,7 @@ def notes_with_depth(kind: str, moments: Sequence[int]) -> bags.Notes:
 
 
 def imported(kind: str, folder: Path, *, is_ros1: bool = False) -> tuple[Path, list[int]]:
-    """A run, and the moments of its depth images."""
+    """A run, and the times of its depth images."""
     moments = bags.times(30, 0.6)
     bag = bags.write_mcap(notes_with_depth(kind, moments), folder / "bag.mcap", is_ros1=is_ros1)
     mapping = bag_mappings.write_mapping(MAPPING, folder / "robot.toml")
@@ -115,7 +115,7 @@ def recording_of(run: Path) -> Path:
 
 
 def held(recording: Recording, moments: Sequence[int]) -> list[int]:
-    """The moments of the images that a recording has."""
+    """Times of the images in a recording."""
     stamps: list[int] = recording.table().image_stamps["wrist_depth"].tolist()
     assert set(stamps) <= set(moments)
     assert len(stamps) > 10

@@ -1,4 +1,4 @@
-"""HDF5 files in the documented layouts of robomimic and ALOHA, written by h5py alone, become runs: h5py judges."""
+"""HDF5 files in the documented layouts of robomimic and ALOHA, written with h5py alone, are imported and compared."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ DEMOS = ("demo_0", "demo_1", "demo_10")
 
 
 def suggested(file: Path, changes: dict[str, str] | None = None) -> Path:
-    """The suggested mapping of a file, with some texts exchanged."""
+    """The suggested mapping of a file, with some text replaced."""
     text = "\n".join(suggested_hdf5_mapping(file, print))
     for old, new in (changes or {}).items():
         assert old in text
@@ -47,14 +47,14 @@ def suggested(file: Path, changes: dict[str, str] | None = None) -> Path:
 
 
 def imported(*files: Path, changes: dict[str, str] | None = None) -> tuple[FramesImport, Path]:
-    """Files imported by the suggested mapping of the first."""
+    """Import files with the suggested mapping of the first."""
     run = files[0].with_name("run")
     return import_hdf5(files, suggested(files[0], changes), run), run
 
 
 @pytest.fixture(scope="module")
 def robomimic(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """A file of robomimic's, and the run that was made of it by its suggested mapping."""
+    """A robomimic file, and the run imported from it with its suggested mapping."""
     file = write_robomimic(tmp_path_factory.mktemp("robomimic") / "demo.hdf5", compression="gzip")
     return file, imported(file)[1]
 
@@ -86,7 +86,7 @@ def test_numbers_of_robomimic_are_those_of_the_file(robomimic: tuple[Path, Path]
 
 
 def nearest(shown: NDArray[np.uint8], candidates: NDArray[np.uint8]) -> int:
-    """Which of some images one is like."""
+    """Return the index of the most similar image."""
     return int(np.abs(candidates.astype(int) - shown).mean(axis=(1, 2, 3)).argmin())
 
 
@@ -157,7 +157,7 @@ def test_distances_stay(kind: str, tmp_path: Path) -> None:
 
 
 def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
-    """Rows as h5py's `vlen_dtype` makes them, in one stretch and in chunks."""
+    """Rows of h5py's `vlen_dtype`, contiguous and in chunks."""
     file = write_aloha(tmp_path / "episode_0.hdf5")
     given = [jpeg(image, 60 + 4 * row) for row, image in enumerate(images(8, 3))]
     with h5py.File(file, "r+") as opened:
@@ -181,7 +181,9 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", ["uint8", "float32", "float64", "float16", "255"])
 @pytest.mark.parametrize("has_channels_first", [False, True])
 def test_pixels_of_other_forms_are_those_of_the_usual_one(kind: str, has_channels_first: bool, tmp_path: Path) -> None:
-    """The same images as uint8 of height, width, RGB make the same recording, but for the words about it."""
+    """The same images in other layouts than (height, width, RGB) uint8 make the same recording, apart from its
+    description.
+    """
     found = []
     for folder in ("usual", "other"):
         file = write_aloha(tmp_path / folder / "episode_0.hdf5")
@@ -202,7 +204,7 @@ def test_pixels_of_other_forms_are_those_of_the_usual_one(kind: str, has_channel
 
 
 def _one_observation_more(file: Path) -> None:
-    """A row more in all that was observed, as recorders write it that observe before and after each action."""
+    """Add a row to every observation, like recorders that observe both before and after each action."""
     with h5py.File(file, "r+") as opened:
         for name in ("qpos", "qvel", *(f"images/{camera}" for camera in ALOHA_CAMERAS)):
             values = opened[f"observations/{name}"][:]
@@ -405,7 +407,7 @@ def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
     with h5py.File(file, "r+") as opened:
         settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
         settings.set_chunk((8, 7))
-        settings.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, ())  # Zstandard, which h5py does not come with
+        settings.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, ())  # Zstandard, which h5py does not include
         space = h5py.h5s.create_simple((8, 7))
         group = opened["observations"].id
         stored = h5py.h5d.create(group, b"effort", h5py.h5t.NATIVE_DOUBLE, space, settings)
@@ -490,7 +492,7 @@ def test_wrong_requests_are_refused(
 
 @pytest.mark.parametrize("robot", ["robot", "franka", "left_arm"])
 def test_the_state_of_isaac_lab_is_the_absolute_one(robot: str, tmp_path: Path) -> None:
-    """obs/joint_pos is relative to a pose that the file does not hold; the simulator's state is absolute."""
+    """obs/joint_pos is relative to a pose that the file does not contain; the simulator's state is absolute."""
     file = write_isaac(tmp_path / "demo.hdf5", robot=robot)
     result, run = imported(file, changes={"# fps = 20 ": "fps = 50 "})
     assert result.num_episodes == 2

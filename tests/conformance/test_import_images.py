@@ -1,6 +1,6 @@
-"""Images of other recorders' bags, by `rosbags` and `mcap`: none is lost, nothing is found in clean ones, faults are.
+"""Images in bags of other recorders, by `rosbags` and `mcap`: none is lost, and only faulty bags give findings.
 
-Stamps are made here from exact ticks, rounded as drivers do; which image a row holds is read from the recording.
+Timestamps are derived from exact ticks and rounded like those of drivers. The recording tells which image a row has.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ WRITERS: dict[str, Write] = {
 def ticks(
     rate: float, count: int, *, phase: float = 0.0, jitter_s: float = 0.0, unit: int = 1, mode: str = "nearest"
 ) -> list[int]:
-    """Stamps of a sensor, in whole `unit` ns, rounded as `mode` says; `phase` in periods."""
+    """Timestamps of a sensor, in whole `unit` ns, rounded by `mode`; `phase` in periods."""
     off = np.random.default_rng(count).uniform(-jitter_s, jitter_s, count) * bags.NS
     exact = [((phase + k) * bags.NS / rate + off[k]) / unit for k in range(count)]
     rounded = {"nearest": np.rint, "down": np.floor, "up": np.ceil}[mode](exact)
@@ -60,7 +60,9 @@ def ticks(
 
 
 def bag(cameras: Mapping[str, Sequence[int]], *, shift_s: float = 0.0, joints_rate: float = 100.0) -> bags.Notes:
-    """Cameras, and two joint topics from 50 ms before them to after them, whose headers are off by `shift_s`."""
+    """A bag with cameras and two joint topics that start 50 ms earlier and end 50 ms later, with headers off by
+    `shift_s`.
+    """
     first, last = min(min(times) for times in cameras.values()), max(max(times) for times in cameras.values())
     count = round((last - first) / bags.NS * joints_rate) + 15
     moments = [first - 50_000_000 + round(k * bags.NS / joints_rate) for k in range(count)]
@@ -74,7 +76,7 @@ def bag(cameras: Mapping[str, Sequence[int]], *, shift_s: float = 0.0, joints_ra
 def imported(
     path: Path, mapping: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> tuple[str, dict[str, list[int]]]:
-    """What an import says, and the stamp of the image that each row of its only episode shows of each camera."""
+    """Return the output of an import, and the timestamp of each camera's image in every row of the only episode."""
     file = bag_mappings.write_mapping(mapping, tmp_path / "robot.toml")
     assert exit_code("import", path, "--mapping", file, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
@@ -85,7 +87,7 @@ def imported(
 
 
 def suggested(path: Path, capsys: pytest.CaptureFixture[str]) -> str:
-    """The suggestion for a bag."""
+    """Suggest a mapping for a bag."""
     assert exit_code("import", "--suggest", path) == 0
     return capsys.readouterr().out
 
@@ -121,14 +123,14 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
         mapping = mapping.replace("fps = 30", 'fps = 30\nrows = "grid"')
     told, shown = imported(path, mapping, tmp_path, capsys)
     assert "No findings." in told
-    # Before the second camera's first image nothing can be shown, and nothing after the last of the first one.
+    # Nothing can be shown before the second camera's first image, nor after the first camera's last one.
     begin, end = max(times[0] for times in cameras.values()), min(times[-1] for times in cameras.values())
     for times, stamps in zip(cameras.values(), shown.values(), strict=True):
         assert {time for time in times if begin <= time <= end} <= set(stamps)
 
 
 def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Rows follow the camera of which images are missing, and so have no place for as many of the other."""
+    """Rows follow the camera that lost images, so as many images of the other camera have no row."""
     side = [time for k, time in enumerate(ticks(30, 300, phase=0.1)) if k % 50 != 20]
     told, shown = imported(
         WRITERS["mcap"](bag({FRONT: ticks(30, 300), SIDE: side}), tmp_path), MAPPING, tmp_path, capsys
@@ -139,7 +141,10 @@ def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureF
 
 @pytest.mark.parametrize(("fps", "slow"), [(30, 15), (15, 15), (25, 25)])
 def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What repeats, or is in no row, by design is a note: rows go by the camera that has fps images a second."""
+    """Rows follow the camera whose rate equals fps.
+
+    Repeated and unused images of other cameras are expected, so only noted.
+    """
     cameras = {FRONT: ticks(30, 90, jitter_s=0.001), SIDE: ticks(slow, 3 * slow, phase=0.2, jitter_s=0.001)}
     path = WRITERS["rosbags"](bag(cameras), tmp_path)
     told, shown = imported(path, MAPPING.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
@@ -159,7 +164,7 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
 
 @pytest.mark.parametrize(("fps", "kind"), [(20, "skips"), (15, "note"), (25, "skips"), (60, "slow")])
 def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Every second image can be meant; now the next one and now the one after it cannot."""
+    """Using every second image may be intended; using sometimes the second and sometimes the third cannot be."""
     path = WRITERS["mcap"](bag({FRONT: ticks(30, 90, jitter_s=0.001)}), tmp_path)
     told, shown = imported(path, ONE_CAMERA.replace("fps = 30", f"fps = {fps}"), tmp_path, capsys)
     lines = [line for line in told.splitlines() if line.startswith(f"  {kind}: ")]

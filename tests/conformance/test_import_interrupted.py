@@ -1,4 +1,4 @@
-"""An import that was interrupted says what is missing, in every command, and the same command continues it."""
+"""After an interrupted import every command lists the missing episodes, and the same import command continues it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ EPISODES = ("episode 0", "episode 1", "episode 2")
 
 @pytest.fixture(scope="module")
 def calls(tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[list[object], tuple[str, ...]]]:
-    """Kind of an import -> its command but for --out, and what it plans, each of one episode."""
+    """Kind of import -> its command without --out, and its planned sources, each of one episode."""
     folder = tmp_path_factory.mktemp("sources")
     run = make_run(folder / "run", (4, 5, 6), cameras=("front",))
     export(run, folder / "dataset")
@@ -94,7 +94,7 @@ def test_an_interrupted_import_says_what_is_missing(
 def test_what_is_planned_is_what_the_last_import_was_given(
     calls: dict[str, tuple[list[object], tuple[str, ...]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Whoever gives the broken bag up has a complete run."""
+    """An import without the broken bag makes the run complete."""
     (monday, tuesday, wednesday, *mapping), _ = calls["bags"]
     broken = tmp_path / "broken.mcap"
     broken.write_bytes(Path(str(tuesday)).read_bytes()[:2000])

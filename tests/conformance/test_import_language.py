@@ -1,4 +1,4 @@
-"""What somebody said of subtasks in a bag is what the language columns of a dataset have, row by row, and no more."""
+"""Subtasks spoken in a bag become the language columns of a dataset, row by row, with nothing added."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SAID = ((0.41, "grasp the cup"), (0.7, "grasp the cup"), (1.013, "lift  the\tcup
 
 
 def texts(topic: str, said: Sequence[tuple[float, str]]) -> bags.Notes:
-    """std_msgs/String, which has no header: the time of recording counts."""
+    """Messages of std_msgs/String, which has no header: the recording time counts."""
     return [
         bags.Note(
             topic=topic, type="std_msgs/msg/String", log_ns=bags.EPOCH_NS + round(at * bags.NS), header_ns=0,
@@ -45,7 +45,7 @@ def imported(notes: bags.Notes, mapping: str, folder: Path) -> int:
 
 
 def row_at(recording: Path, at_s: float) -> int:
-    """The first frame that is not before a moment."""
+    """Index of the first frame at or after a time."""
     with Recording(recording) as opened:
         times = opened.table().time_ns
     return next(row for row, time in enumerate(times.tolist()) if time >= bags.EPOCH_NS + round(at_s * bags.NS))

@@ -1,4 +1,4 @@
-"""Datasets of LeRobot's own writer become runs, and are the same again when they are exported: PyArrow and av judge."""
+"""Datasets written by LeRobot are imported, and are identical when exported again; PyArrow and av verify them."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ NAME = CAMERA.removeprefix("observation.images.")
 
 @pytest.fixture(scope="module", params=[pytest.param("video", marks=pytest.mark.slow), "image", "long_gops"])
 def imported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> tuple[str, Path, Path]:
-    """How images are kept, a dataset by LeRobot, and the run that was made of it."""
+    """The kind of images, a dataset written by LeRobot, and the run imported from it."""
     from lerobot.configs import RGBEncoderConfig
 
     kind = str(request.param)
@@ -95,7 +95,7 @@ def test_images_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None
     assert len(found) == len(expected) == sum(LENGTHS)
     if kind == "video":
         assert all(np.array_equal(a, b) for a, b in zip(found, expected, strict=True))
-    else:  # each is nearer to its own image than to that of the frame before, by far
+    else:  # each is far closer to its own image than to the previous one
         for index in range(1, len(found)):
             own, before = (np.abs(found[index].astype(int) - expected[k]).mean() for k in (index, index - 1))
             assert own < before / 2, index
@@ -132,7 +132,7 @@ def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
 
 @pytest.mark.slow
 def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
-    """LeRobot says what its codes stand for, and writes the same ones when they come back."""
+    """LeRobot defines the distance of each code, and an export writes the same codes."""
     from lerobot.datasets.depth_utils import dequantize_depth
 
     write_by_lerobot(tmp_path / "d", LENGTHS, depth=True)
@@ -149,7 +149,7 @@ def test_distances_are_those_of_the_dataset(tmp_path: Path) -> None:
     assert len(found) == sum(LENGTHS)
     for number, (metres, code) in enumerate(zip(found, codes, strict=True)):
         expected = np.squeeze(dequantize_depth(code, output_unit="m", output_tensor=False))
-        expected = np.where(np.squeeze(code) == 0, 0, expected)  # nothing was measured, or noise was encoded badly
+        expected = np.where(np.squeeze(code) == 0, 0, expected)  # not measured, or noise that was encoded badly
         np.testing.assert_allclose(metres, expected, atol=1e-5, err_msg=str(number))
 
 

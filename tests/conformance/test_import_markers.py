@@ -1,4 +1,4 @@
-"""Markers that cut a bag: what an operator discards is no episode, and what the mapping does not know is an error."""
+"""Markers that split a bag: discarded takes are left out, and markers that the mapping does not list are an error."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def _import(tmp_path: Path, marks: list[tuple[float, str]], *, keys: str = "", m
 
 
 def _begins(run: Path) -> list[float]:
-    """When each episode begins, seconds, to a twentieth."""
+    """Start of each episode in seconds, to a twentieth."""
     found = []
     for path in sorted((run / "episodes").glob("*.mcap")):
         with Recording(path) as recording:
@@ -44,9 +44,9 @@ def _begins(run: Path) -> list[float]:
     [
         (TAKES, [0.2, 1.1, 2.0], []),
         ([*TAKES, (1.9, "discard")], [0.2, 2.0], ["1.09 to 1.79"]),  # after its end
-        ([*TAKES, (1.5, "discard")], [0.2, 2.0], ["1.09 to 1.49"]),  # while it goes on; the stop ends nothing then
+        ([*TAKES, (1.5, "discard")], [0.2, 2.0], ["1.09 to 1.49"]),  # during the episode; the later stop has no effect
         ([*TAKES, (2.8, "discard"), (0.5, "discard")], [1.1], ["0.19 to 0.49", "1.99 to 2.69"]),
-        ([*TAKES, (0.1, "discard"), (0.95, "")], [0.2, 1.1, 2.0], []),  # of no episode; and nothing at all
+        ([*TAKES, (0.1, "discard"), (0.95, "")], [0.2, 1.1, 2.0], []),  # outside of episodes, and an empty marker
     ],
 )
 def test_what_is_discarded_is_no_episode(

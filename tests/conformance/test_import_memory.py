@@ -1,4 +1,4 @@
-"""What an import keeps of a long bag: the numbers and times of its messages, and of images next to nothing."""
+"""Memory that an import needs for a long bag: numbers and times of messages, and next to nothing for images."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(MAPPING)
     mapping = read_mapping(tmp_path / "robot.toml")
     kept = []
-    for seconds in (1, 2, 32):  # the first loads what is loaded once
+    for seconds in (1, 2, 32):  # the first import also loads libraries
         bag = open_bag(write_bag(tmp_path / f"{seconds}.mcap", seconds, rate=100))
         gc.collect()
         tracemalloc.start()
@@ -68,7 +68,7 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
         kept.append(tracemalloc.get_traced_memory()[0])
         tracemalloc.stop()
         assert len(streams.all["observation.state", 0]) == 100 * seconds
-    # Arrays grow by an eighth more than is needed; what other tests leave behind is little beside 30 s of messages.
+    # Arrays may be an eighth larger than needed; garbage of other tests is small compared to 30 s of messages.
     assert kept[2] - kept[1] < 30 * 100 * (2 * PER_JOINT_MESSAGE + PER_IMAGE) * 1.2
 
 

@@ -1,4 +1,4 @@
-"""Bags of four robots become runs: every number, age and packet of the recordings is that of the bag."""
+"""Bags of four robots are imported: all numbers, ages and packets of the recordings equal those of the bag."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ SECONDS = 1.5
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """A robot's bag, its mapping, and which topic each camera is."""
+    """A robot's bag, its mapping, and the topic of each camera."""
 
     make: Callable[[float], bags.Notes]
     write: Callable[[bags.Notes, Path], Path]
@@ -72,7 +72,7 @@ LAYOUTS = {
 def imported(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Layout, bags.Notes, Path]:
-    """A layout, its messages and the run that was made of them."""
+    """A layout, its messages and the run imported from them."""
     layout = LAYOUTS[request.param]
     folder = tmp_path_factory.mktemp(request.param)
     notes = layout.make(SECONDS)
@@ -88,7 +88,7 @@ def _open(run: Path, index: int = 0) -> Recording:
 
 
 def _vector(note: bags.Note, joints: tuple[str, ...], field: str) -> list[float]:
-    """What a source takes of a message, in the order of its joints."""
+    """Return a source's part of a message, in the order of its joints."""
     if field == "pose":
         position, orientation = note.body["pose"]["position"], note.body["pose"]["orientation"]
         return [*(position[k] for k in "xyz"), *(orientation[k] for k in "xyzw")]
@@ -97,7 +97,7 @@ def _vector(note: bags.Note, joints: tuple[str, ...], field: str) -> list[float]
 
 
 def test_numbers_and_ages(imported: tuple[Layout, bags.Notes, Path]) -> None:
-    """Each row holds the messages that the plainest search finds; its stamp is that of the oldest of them."""
+    """Each row holds the messages that a brute-force search finds; its timestamp is that of the oldest."""
     _, notes, run = imported
     mapping = read_mapping(run.parent / "robot.toml")
     with _open(run) as recording:
@@ -205,7 +205,7 @@ def test_a_stream_that_is_not_there_all_the_time(keep: Callable[[int], bool], to
 
 
 def test_an_import_that_was_killed_goes_on(tmp_path: Path) -> None:
-    """Between two episodes of a bag, and within one."""
+    """The import is killed between two episodes of a bag, and within one."""
     bag = _so101(tmp_path, bags.so101(2.0))
     cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.7]]\n'
     mapping, run = _mapping(tmp_path, ("[cameras.front]", cut + "[cameras.front]")), tmp_path / "run"
@@ -292,7 +292,7 @@ def test_a_run_whose_recording_was_exchanged_is_refused(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Notes, Path]:
-    """Messages with video, and the LeRobot dataset that was made of them."""
+    """Messages with video, and the LeRobot dataset made from them."""
     folder = tmp_path_factory.mktemp("dataset")
     notes = bags.trossen(SECONDS)
     bag = bags.write_trossen(bags.in_order(notes), folder / "bag.mcap")
@@ -305,7 +305,9 @@ def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Note
 
 @pytest.mark.slow
 def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) -> None:
-    """As LeRobot reads it: float32 as the bag has it, and the row's message found by the plainest search."""
+    """LeRobot reads the bag's numbers as float32, and the message of each row is the one that a brute-force search
+    finds.
+    """
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     notes, folder = trossen_dataset
@@ -335,7 +337,7 @@ def test_kept_packets_are_in_the_dataset_byte_for_byte(trossen_dataset: tuple[ba
 
 
 def _slices(packet: bytes) -> list[bytes]:
-    """The coded images of an access unit, without parameter sets and the lengths of start codes."""
+    """Coded images of an access unit, without parameter sets and with start codes of one length."""
     units = [unit.rstrip(b"\0") for unit in packet.split(b"\0\0\1")[1:]]
     return [unit for unit in units if unit[0] & 31 in (1, 5)]
 

@@ -1,4 +1,4 @@
-"""Bags of robots whose services are watched: events as rosbag2 stores them, with the definition of the service."""
+"""Bags with recorded services: events as rosbag2 stores them, including the definition of the service."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A LeRobot v2.1 dataset, written by PyArrow and av as that format was, is read; only appending needs a conversion."""
+"""A LeRobot v2.1 dataset, written with PyArrow and av, is read; only appending to it requires a conversion."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def write_video(path: Path, length: int) -> None:
 
 
 def write_v21(root: Path) -> Path:
-    """A file of rows and a video for each episode, and tables in JSON lines."""
+    """Write a file of rows and a video for each episode, and tables as JSON lines."""
     (root / "meta").mkdir(parents=True)
     (root / "data" / "chunk-000").mkdir(parents=True)
     tables: dict[str, list[dict[str, Any]]] = {"episodes": [], "episodes_stats": []}
@@ -103,7 +103,7 @@ def write_v21(root: Path) -> Path:
 
 
 def assert_imported(root: Path, run: Path) -> None:
-    """Numbers, instruction and images of every episode are those that were written."""
+    """Check that the numbers, instruction and images of every episode equal those written."""
     assert exit_code("import", "lerobot", root, "--out", run) == 0
     found = sorted((run / "episodes").glob("*.mcap"))
     assert len(found) == len(LENGTHS)

@@ -1,4 +1,4 @@
-"""Bags of foreign writers are read message for message, number for number, in every form that they have."""
+"""Bags of third-party writers in all their forms are read message by message, number by number."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_ros_1(notes: bags.Notes, compression: Ros1Writer.CompressionFormat | No
 
 
 def test_a_folder_of_ros_1_bags(notes: bags.Notes, tmp_path: Path) -> None:
-    """In the natural order of their names; other files are ignored."""
+    """Bags are read in the natural order of their names; other files are ignored."""
     for number in (10, 2):
         bags.write_ros1(notes, tmp_path / f"run_{number}.bag")
     (tmp_path / "notes.txt").write_text("of the day")
@@ -99,7 +99,7 @@ def test_a_folder_of_ros_1_bags(notes: bags.Notes, tmp_path: Path) -> None:
 def test_a_bag_of_ros_1_that_was_not_finished(
     damage: str, compression: Ros1Writer.CompressionFormat | None, notes: bags.Notes, tmp_path: Path
 ) -> None:
-    """What the file still holds is read, by records where the index is gone."""
+    """An unfinished bag is read as far as it lasts, record by record where the index is missing."""
     path = bags.write_ros1(notes, tmp_path / "bag.bag", compression=compression)
     whole = path.read_bytes()
     place = whole.index(b"index_pos=") + len(b"index_pos=")
@@ -114,7 +114,7 @@ def test_a_bag_of_ros_1_that_was_not_finished(
     assert data != whole
     path.write_bytes(data)
     if damage == "half a chunk":
-        if compression is not None:  # its checksums are those of the compression
+        if compression is not None:  # bzip2 and lz4 have checksums
             problems: list[str] = []
             assert len(list(open_bag(path).messages(problems))) < len(notes)
             assert problems[0].startswith("bag.bag: it is damaged")
@@ -125,7 +125,7 @@ def test_a_bag_of_ros_1_that_was_not_finished(
         assert len(problems) == 1
     if damage == "half a file":
         assert len(found) < len(notes)
-        assert bool(found) == (compression is None)  # one chunk holds all, and half of it cannot be unpacked
+        assert bool(found) == (compression is None)  # one chunk holds all; half of it cannot be unpacked
         assert "cut off" in problems[1]
     else:
         assert len(found) == len(notes)

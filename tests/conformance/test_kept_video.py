@@ -1,6 +1,6 @@
-"""Video that stays as it is though episodes begin between its keyframes: every image is that of the bag's stream.
+"""Episodes that begin between keyframes keep the encoded video: every image equals that of the bag's stream.
 
-What the bag shows is decoded here by PyAV from the stream's beginning; the episodes are cut out of its middle.
+PyAV decodes the bag's stream from its beginning; the episodes are taken from its middle.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from demorec.view.from_dataset import open_dataset_episode
 TOPIC, KEY = "/cameras/cam_high/image", "observation.images.high"
 GOP = 20
 CUTS = ((0.7, 1.9), (2.2, 4.2))
-"""Seconds; both between keyframes, which come every two thirds of a second."""
+"""Seconds; both are between keyframes, which are two thirds of a second apart."""
 
 pytestmark = pytest.mark.usefixtures("hf_datasets_cache")
 Images = list[NDArray[np.uint8]]
@@ -63,7 +63,7 @@ def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def expected(notes: bags.Notes, run: Path) -> list[Images]:
-    """Episode -> the image of each frame, out of the whole stream."""
+    """Episode -> image of each frame, from the whole stream."""
     of_topic = bags.of_topic(notes, TOPIC)
     stream = io.BytesIO(b"".join(bytes(note.body["data"]) for note in of_topic))
     with av.open(stream, "r", format="h264") as container:
@@ -77,7 +77,7 @@ def expected(notes: bags.Notes, run: Path) -> list[Images]:
 
 
 def shown_by(dataset: Path) -> list[Images]:
-    """Episode -> its images, each found by its time in the file, which PyAV decodes as a whole."""
+    """Episode -> its images, found by their times in the file, which PyAV decodes as a whole."""
     found = []
     for row in episode_rows(dataset):
         name = f"chunk-{row[f'videos/{KEY}/chunk_index']:03d}/file-{row[f'videos/{KEY}/file_index']:03d}.mp4"
@@ -96,7 +96,7 @@ def assert_equal(found: list[Images], expected: list[Images]) -> None:
 
 
 def test_whole_episodes_between_keyframes(expected: list[Images], dataset: Path) -> None:
-    # No frame is left out to begin with a keyframe, and none is coded anew.
+    # No frame is left out to begin with a keyframe, and none is encoded again.
     assert [len(images) for images in expected] == pytest.approx([30 * (end - begin) for begin, end in CUTS], abs=1)
     assert_equal(shown_by(dataset), expected)
     (first, second) = (row[f"videos/{KEY}/from_timestamp"] * 30 for row in episode_rows(dataset))
@@ -134,7 +134,7 @@ def test_lerobots_tools_keep_them(expected: list[Images], dataset: Path, run: Pa
     aggregate_datasets(["local/1", "local/2"], "local/all", roots=roots, aggr_root=tmp_path / "merged")
     assert_equal(shown_by(tmp_path / "merged"), [*expected, *expected])
     opened = LeRobotDataset("local/1", root=dataset)
-    delete_episodes(opened, [0], output_dir=tmp_path / "left", repo_id="local/left")  # which codes images anew
+    delete_episodes(opened, [0], output_dir=tmp_path / "left", repo_id="local/left")  # which encodes images again
     ((*left,),) = shown_by(tmp_path / "left")
     assert len(left) == len(expected[1])
     differences = [np.abs(a.astype(float) - b).mean() for a, b in zip(left, expected[1], strict=True)]
@@ -185,7 +185,7 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Imag
 def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> None:
     for name in ("undecodable_images", "dataset_sidecar"):
         assert level_of(dataset, name, "dataset") == "pass"
-    # An episode that is off by an image has a gap of the right kind in front, but not the images of its digest.
+    # An episode that is off by one image has a gap of the expected kind in front, but not the expected digest.
     for check, episode, shift in (
         ("dataset_sidecar", 1, -1),
         ("dataset_sidecar", 1, 1),

@@ -1,4 +1,4 @@
-"""LeRobot's language columns of all tasks, judged by LeRobot, by the recordings' phases and by brute force."""
+"""LeRobot's language columns of all tasks, verified by LeRobot, by the recordings' phases and by brute force."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
 
 @pytest.fixture(scope="module")
 def dataset(runs: list[Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All of them in one dataset, with everything that can be said."""
+    """All episodes in one dataset, with every kind of language."""
     out = tmp_path_factory.mktemp("dataset") / "all"
     report = export(runs, out, language=(), progress=True)
     assert report.digest == dataset_digest(out)
@@ -205,7 +205,7 @@ def test_memories_come_when_it_is_done(runs: list[Path], dataset: Path) -> None:
         for row in memories:
             if "picked up" in row["content"].split(". ")[-1]:
                 assert subtasks[row["timestamp"]].startswith("carry the ")
-        if not tutorial:  # which ends with the fall
+        if not tutorial:  # it ends with the fall
             assert len(re.findall(r"I put the", memories[-1]["content"])) == len(goals)
 
 
@@ -273,7 +273,7 @@ def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset
         assert ends[-1] == row["length"] - 1
         own = found[row["dataset_from_index"] : row["dataset_to_index"]]
         assert own[0] == 0
-        assert own[-1] == 1  # all of them succeed
+        assert own[-1] == 1  # all episodes succeed
         stages = [stage for stage in share if stage in names]
         assert all(f"goal {goal + 1}: " in " ".join(stages) for goal in range(row["num_goals"]))
         shares = {stage: share[stage] for stage in stages}
@@ -286,7 +286,7 @@ def test_progress_is_lerobots_own_over_the_true_stages(runs: list[Path], dataset
             misses, phase = recording.trajectory().is_deliberate_miss, recording.phases
         changes = {frame for frame in range(1, len(phase)) if phase[frame] != phase[frame - 1]}
         assert set(starts[1:]) <= changes
-        # It falls only where an attempt missed.
+        # The object falls only after an attempt that missed.
         falls = np.flatnonzero(np.diff(own) < 0)
         assert falls.tolist() == (np.flatnonzero(misses)[-1:].tolist() if misses.any() else [])
 
@@ -301,7 +301,7 @@ def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
     weighter = make_sample_weighter(config, policy, torch.device("cpu"), dataset_root=str(dataset))
     assert isinstance(weighter, RABCWeights)
     row = next(row for row in episode_rows(dataset) if row["has_deliberate_miss"])
-    missed = row["dense_subtask_end_frames"][2]  # the last frame of the missed close
+    missed = row["dense_subtask_end_frames"][2]  # the last frame of the missed grasp
     frames = torch.arange(row["dataset_from_index"], row["dataset_from_index"] + missed + 20)
     weights, _ = weighter.compute_batch_weights({"index": frames})
     assert (weights[missed - 8 : missed + 1] == 0).all()
@@ -358,7 +358,7 @@ def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None
     split_dataset(first, {"one": [0], "other": [1]}, output_dir=tmp_path / "split")
     for out, digest in (("left", known[1]), ("split/one", known[0]), ("split/other", known[1])):
         assert episode_digests(LeRobotFolder(tmp_path / out)) == [digest]
-        assert "task_name" not in episode_rows(tmp_path / out)[0]  # LeRobot leaves out what it does not know
+        assert "task_name" not in episode_rows(tmp_path / out)[0]  # unknown to LeRobot
         assert not (tmp_path / out / "sarm_progress.parquet").exists()
 
 

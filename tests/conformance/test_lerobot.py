@@ -1,4 +1,4 @@
-"""The installed LeRobot as the judge of a dataset with several files of each kind."""
+"""A dataset with several files of each kind, verified by the installed LeRobot."""
 
 from __future__ import annotations
 
@@ -128,7 +128,7 @@ def test_statistics_equal_those_of_the_decoded_data(dataset: Path) -> None:
         pixels = np.stack([image(item, camera) for item in images]).reshape(-1, 3) / 255
         shaped = {what: np.asarray(value).reshape(-1) for what, value in stats[key].items()}
         assert stats[key]["mean"].shape == (3, 1, 1)
-        # Counted before coding, on every other image.
+        # Counted on every other image, before encoding.
         assert np.abs(shaped["mean"] - pixels.mean(axis=0)).max() < 0.01
         assert np.abs(shaped["std"] - pixels.std(axis=0)).max() < 0.02
         for what in ("q10", "q50", "q90"):
@@ -207,9 +207,9 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     merged = merge_datasets([open_dataset(other), open_dataset(dataset)], "d/d", tmp_path / "merged")
     assert merged.num_episodes == len(LENGTHS) + 2
     assert_readable(tmp_path / "merged", (*LENGTHS[:2], *LENGTHS))
-    assert (dataset / "demorec" / "robots").is_dir()  # what docs/dataset-format.md says of LeRobot's tools
+    assert (dataset / "demorec" / "robots").is_dir()  # docs/dataset-format.md describes LeRobot's tools
     assert not any((tmp_path / name / "demorec").exists() for name in ("both", "merged"))
-    # The merge takes means of both datasets' quantiles: said, but no failure; other numbers are one.
+    # The merge averages both datasets' quantiles: noted, but no failure; other numbers would be a failure.
     levels = {r.check: r.level for r in checked(tmp_path / "both", "dataset").results}
     assert levels["wrong_statistics"] == "warn"
     assert [name for name, level in levels.items() if level == "fail"] == ["copied_episodes"]  # they are
@@ -324,7 +324,7 @@ def test_lerobot_doctor_finds_no_fault(run: Path, tmp_path: Path) -> None:
     text = lerobot_command("lerobot-doctor", "check", str(tmp_path / "d"), "--ci")
     report, _ = json.JSONDecoder().raw_decode(text)
     assert report["summary"]["FAIL"] == 0
-    # Warnings remain about what is made up here: short episodes, joints that hardly move.
+    # Warnings about synthetic data remain: short episodes, joints that hardly move.
     assert report["summary"]["PASS"] >= 6
 
 
@@ -347,7 +347,7 @@ def test_the_example_of_the_readme_runs_without_a_warning(
     monkeypatch: pytest.MonkeyPatch,
     backend: str,
 ) -> None:
-    """Without FFmpeg, LeRobot's default video backend cannot be loaded and fills the screen with the reason."""
+    """Without FFmpeg LeRobot's default video backend cannot be loaded, and prints a long reason."""
     if backend == "missing":
         monkeypatch.setitem(sys.modules, "torchcodec", None)
     assert run_examples("README.md", "LeRobotDataset", {"recordings/demo/dataset": dataset}) == 1

@@ -1,4 +1,6 @@
-"""LeRobot's own commands find the environment, train for it and run in it; demorec evaluate runs what they save."""
+"""LeRobot's own commands find the environment, train for it and run in it; demorec evaluates the policies that they
+save.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +35,7 @@ ACT = [
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A policy of few parameters, trained by lerobot-train for two steps on an exported dataset; then lerobot-eval."""
+    """A small policy that lerobot-train trained for two steps on an exported dataset; then lerobot-eval."""
     folder = tmp_path_factory.mktemp("trained")
     recordings = folder / "recordings"
     recordings.mkdir()
@@ -136,8 +138,8 @@ def test_evaluate_records_every_rollout_goes_on_and_refuses_another(
 @pytest.mark.long
 def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["correct", "--policy", str(trained / "train"), "--episode-length", "9", "--workers", "1", "--seed", "3"]
-    words += ["--stray-metres", "0", "--stray-radians", "0"]  # it strays from its first action on
-    for count in ("1", "2"):  # the second time it goes on
+    words += ["--stray-metres", "0", "--stray-radians", "0"]  # it deviates from its first action on
+    for count in ("1", "2"):  # the second command resumes
         assert exit_code(*words, "--num-episodes", count, "--out", trained / "corrections") == 0
     told = capsys.readouterr().out
     assert "taken over       2  the policy has had its time" in told

@@ -13,7 +13,7 @@ from lerobot_robot_demorec import DemorecPanda, DemorecPandaConfig, DemorecSO101
 
 
 class Listener:
-    """Of pynput, which needs a screen: hears what `press` is told."""
+    """A stand-in for pynput's listener, which needs a screen; it receives the keys given to `press`."""
 
     def __init__(self, on_press: Any, on_release: Any) -> None:
         self.on_press, self.on_release, self._is_alive = on_press, on_release, False
@@ -63,7 +63,7 @@ def test_a_key_that_is_held_moves_the_hand(key: str, axis: int, sign: int, teleo
 
 @pytest.mark.slow
 def test_increments_move_the_hand_along_the_base(tmp_path: Path) -> None:
-    """As of LeRobot's gamepad: x forward, y to the left, z up; the hand keeps its direction, and stays in reach."""
+    """As with LeRobot's gamepad: x forward, y to the left, z up; the hand keeps its orientation and stays in reach."""
     robot = DemorecPanda(DemorecPandaConfig(calibration_dir=tmp_path, cameras=[]))
     robot.connect()
     arm = robot._env.world.arm

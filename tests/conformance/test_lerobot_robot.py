@@ -1,4 +1,4 @@
-"""LeRobot's own commands drive the simulated SO-101, and what we export drives the real one, whose bus is a stub."""
+"""LeRobot's commands drive the simulated SO-101; exported datasets drive the real arm, whose bus is a stub."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
     assert observation["front"].shape == robot.observation_features["front"] == (48, 64, 3)
     robot.disconnect()
     state = np.array(data_table(dataset)["observation.state"].to_pylist())
-    assert np.abs(np.array(seen) - state).max() < 0.1  # degrees, per cent; the dataset has float32
+    assert np.abs(np.array(seen) - state).max() < 0.1  # degrees, percent; the dataset has float32
     recording = tmp_path / "recorded" / "episode_000000.mcap"
     with Recording(recording) as recorded:
         assert recorded.success
@@ -112,7 +112,7 @@ def test_panda_has_the_elements_of_our_datasets(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def ran(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """LeRobot's commands, one after the other."""
+    """Run LeRobot's commands one after the other."""
     folder = tmp_path_factory.mktemp("lerobot")
     script = folder / "script.json"
     script.write_text(json.dumps({"names": NAMES, "rows": actions(dataset).tolist()}))
@@ -132,7 +132,7 @@ def ran(dataset: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     again = ["--dataset.repo_id=local/simulated", f"--dataset.root={folder / 'simulated'}", "--dataset.episode=0"]
     pair = f"['{dataset}', '{folder / 'real'}']"
     merge = ["--operation.type=merge", "--operation.repo_ids=['local/ours', 'local/real']", f"--operation.roots={pair}"]
-    # LeRobot's own H.264 has B-frames, which it cannot append to ours, which has none, in one file.
+    # LeRobot's own H.264 has B-frames, ours has none; LeRobot cannot append one to the other in one file.
     merge += ["--operation.concatenate_videos=false"]
     merged = ["--dataset.repo_id=local/both", f"--dataset.root={folder / 'both'}", "--dataset.episode=1"]
     merged += ["--play_sounds=false"]
@@ -207,7 +207,7 @@ def test_ours_and_a_real_arms_merge_unedited(ran: Path, dataset: Path) -> None:
 
 @slow
 def test_a_real_arm_can_do_what_we_export(ran: Path, dataset: Path) -> None:
-    """Every goal that came to the servos: within their range, and no faster than they turn."""
+    """Check every goal sent to the servos: within their range, and no faster than they turn."""
     goals = np.array([line.split() for line in (ran / "goals.txt").read_text().splitlines()], dtype=int)
     counts = np.stack([goals[goals[:, 0] == servo, 1] for servo in range(1, 7)], axis=1)
     assert len(counts) == len(actions(dataset))
@@ -215,7 +215,7 @@ def test_a_real_arm_can_do_what_we_export(ran: Path, dataset: Path) -> None:
     assert (counts >= ranges[:, 0]).all()
     assert (counts <= ranges[:, 1]).all()
     speed = np.abs(np.diff(counts[:, :5], axis=0)).max() * 30 * math.tau / 4096
-    assert 0.1 < speed < 52 / 60 * math.tau  # rad/s: the data sheet's 52 turns a minute
+    assert 0.1 < speed < 52 / 60 * math.tau  # rad/s: the data sheet specifies 52 rpm
 
 
 def test_the_plugins_are_called_as_lerobot_looks_for_them() -> None:

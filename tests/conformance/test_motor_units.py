@@ -1,4 +1,4 @@
-"""A dataset of the SO-101 in motor units, against LeRobot's own driver of the arm."""
+"""An SO-101 dataset in motor units, compared with LeRobot's own driver of the arm."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ OWN = {
     "wrist_roll": {"id": 5, "drive_mode": 0, "homing_offset": -1320, "range_min": 0, "range_max": 4095},
     "gripper": {"id": 6, "drive_mode": 1, "homing_offset": 400, "range_min": 1993, "range_max": 3471},
 }
-"""As LeRobot saves it: of an arm whose stops lie elsewhere, with two motors whose shares run backwards."""
+"""A calibration as LeRobot saves it: an arm with different stops, and two motors with inverted percentages."""
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +62,7 @@ def columns(dataset: Path) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
 
 @pytest.fixture(params=["urdf", "own"])
 def calibration(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    """A file in LeRobot's form: ours, or that of somebody's arm."""
+    """A calibration file in LeRobot's form: demorec's own, or that of another arm."""
     if request.param == "urdf":
         return OF_THE_URDF
     (tmp_path / "arm.json").write_text(json.dumps(OWN))
@@ -71,7 +71,7 @@ def calibration(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def driver(monkeypatch: pytest.MonkeyPatch) -> Callable[[Path, MotorUnits], Any]:
-    """LeRobot's driver of the arm, by a calibration; the library of the bus is a stub."""
+    """LeRobot's driver of the arm with a calibration; the library of the bus is a stub."""
     from lerobot.motors import motors_bus
     from lerobot.motors.feetech import feetech
     from lerobot.robots.so_follower import SO101Follower, SO101FollowerConfig
@@ -111,7 +111,8 @@ def test_values_are_the_radians_of_the_recording(run: Path, dataset: Path) -> No
         jaw = recording.info.simulated.robot.gripper.joint_position(c.action_gripper)
     state, action = columns(dataset)
     for found, radians in ((state, c.joint_position), (action, np.column_stack([c.action_joint_target, jaw]))):
-        # A count is 0.088 degrees: LeRobot's whole turn lacks one, and the roll's middle lies half a count off.
+        # A count is 0.088 degrees. LeRobot's full turn is one count short, and the centre of the roll is half a count
+        # off.
         assert np.abs(found[:, :5] - np.degrees(radians[:, :5])).max() < 0.1
         assert np.abs(found[:, 5] - 100 * (radians[:, 5] - JAW[0]) / (JAW[1] - JAW[0])).max() < 0.1
     assert np.ptp(state[:, 1]) > 10
@@ -119,7 +120,7 @@ def test_values_are_the_radians_of_the_recording(run: Path, dataset: Path) -> No
 
 
 def radians(run: Path) -> np.ndarray[Any, Any]:
-    """(T, 6) of the recording, the jaw's last."""
+    """(T, 6) of the recording, the jaw last."""
     with Recording(next((run / "episodes").iterdir())) as recording:
         return recording.trajectory().joint_position
 
@@ -134,7 +135,7 @@ def test_lerobot_makes_the_same_of_what_the_servos_count(
     state, _ = columns(out)
     follower = driver(calibration, units)
     assert len(follower.calibration) == 6
-    # Between the stops, which LeRobot's range is, lie the URDF's zeros; the jaw's 0 is not in the middle of its limits.
+    # LeRobot's range covers the stops, and the URDF's zeros are between them; the jaw's 0 is not at its centre.
     middles = [(motor.range_min + motor.range_max) / 2 for motor in follower.calibration.values()]
     counts = np.array(middles) + (radians(run) - [0, 0, 0, 0, 0, sum(JAW) / 2]) * 4096 / math.tau
     ranges = [motor.range_max - motor.range_min for motor in follower.calibration.values()]
@@ -142,17 +143,17 @@ def test_lerobot_makes_the_same_of_what_the_servos_count(
     a_count[5] = 100 / ranges[5]
     for t in range(0, len(state), 10):
         said = follower.bus._normalize(dict(zip(range(1, 7), np.rint(counts[t]).astype(int).tolist(), strict=True)))
-        # LeRobot rounds to whole counts, and the middle of a range may lie half a count off one.
+        # LeRobot rounds to whole counts, and the centre of a range may be half a count off.
         assert (np.abs(state[t] - np.array(list(said.values()))) < 1.02 * a_count).all()
         sent = follower.bus._unnormalize(dict(zip(range(1, 7), state[t].tolist(), strict=True)))
-        assert np.abs(np.array(list(sent.values())) - counts[t]).max() < 1.6  # it cuts the rest off
+        assert np.abs(np.array(list(sent.values())) - counts[t]).max() < 1.6  # it truncates
 
 
 @pytest.mark.parametrize("units", UNITS)
 def test_what_lerobot_recorded_is_read_as_radians(
     run: Path, tmp_path: Path, calibration: Path, units: MotorUnits
 ) -> None:
-    """As of a real arm: the dataset says nothing but its names and numbers."""
+    """As with a real arm, the dataset has nothing but names and numbers."""
     named = ("--motor-units", units, "--calibration", calibration)
     assert exit_code("export", "lerobot", run, *named, "--no-verify", "--out", tmp_path / "d") == 0
     shutil.rmtree(tmp_path / "d" / "demorec")
@@ -214,7 +215,7 @@ def test_what_is_no_calibration_is_refused(
     assert not (tmp_path / "d").exists()
 
 
-@pytest.mark.usefixtures("without_lerobot")  # which read it in the tests above
+@pytest.mark.usefixtures("without_lerobot")  # the tests above read it this way
 def test_check_is_clean_and_knows_degrees(dataset: Path) -> None:
     results = {result.check: result.level for result in checked(dataset, "dataset").results}
     assert {"warn", "fail"}.isdisjoint(results.values())
@@ -232,7 +233,7 @@ def test_what_cannot_be_in_motor_units_is_refused(
     assert not (tmp_path / "a").exists()
     assert not (tmp_path / "b").exists()
     (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"root": str(dataset)}}))
-    assert trained_action(tmp_path) is None  # of a policy that learnt from it
+    assert trained_action(tmp_path) is None  # of a policy trained on it
 
 
 def test_a_recording_cut_off_by_a_crash_stays_out(run: Path, tmp_path: Path) -> None:

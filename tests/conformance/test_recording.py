@@ -1,6 +1,6 @@
-"""Recordings read by other people's programs: mcap's reader, rosbags, FFmpeg, Rerun; and the robot by PyBullet.
+"""Recordings read by third-party programs: mcap's reader, rosbags, FFmpeg, Rerun; PyBullet reads the robot.
 
-What holds for any episode is tried with a simulated one and with one of other people's.
+Properties of any episode are tested with a simulated one and with an external one.
 """
 
 from __future__ import annotations
@@ -190,14 +190,14 @@ def test_rosbags_deserialises_every_message(recorded: Recorded) -> None:
     with AnyReader([path], default_typestore=store) as reader:
         for connection, _, raw in reader.messages():
             message = reader.deserialize(raw, connection.msgtype)
-            # What was read, written again, gives the same bytes: no field was skipped or padded otherwise.
+            # Messages that are read and written again have the same bytes: no field was skipped or padded differently.
             assert bytes(store.serialize_cdr(message, connection.msgtype)) == bytes(raw), connection.topic
             counts[connection.topic] = counts.get(connection.topic, 0) + 1
     assert counts | COUNTS[kind] == counts
 
 
 def test_definitions_are_those_of_ros(path: Path) -> None:
-    """Names, types and order of all fields, against the definitions that rosbags carries for ROS 2 Humble."""
+    """Names, types and order of all fields match the definitions that rosbags includes for ROS 2 Humble."""
     theirs = get_typestore(Stores.ROS2_HUMBLE).fielddefs
     compared = set()
     for name, definition in DEFINITIONS.items():
@@ -227,7 +227,7 @@ def test_ffmpeg_decodes_the_bytes_of_the_topic(tmp_path: Path, codec: Codec) -> 
 
 
 def cdr_compressed_image(message: bytes) -> bytes:
-    """The last field of sensor_msgs/CompressedImage: a sequence that ends with the message, as the start of a code."""
+    """The last field of sensor_msgs/CompressedImage: a sequence that ends with the message, from its start code on."""
     for code in (b"\0\0\0\1", b"\xff\xd8\xff"):
         at = message.find(code, 30)
         if at > 0 and int.from_bytes(message[at - 4 : at], "little") == len(message) - at:
@@ -236,7 +236,7 @@ def cdr_compressed_image(message: bytes) -> bytes:
 
 
 def protobuf_field(message: bytes, number: int) -> bytes:
-    """A field of foxglove.CompressedVideo, through Google's own protobuf and the schema that comes with it."""
+    """A field of foxglove.CompressedVideo, read with Google's protobuf library and the published schema."""
     from foxglove.messages import CompressedVideo
     from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
@@ -251,7 +251,7 @@ def protobuf_field(message: bytes, number: int) -> bytes:
 
 
 def rerun_entities(path: Path, folder: Path) -> dict[str, set[str]]:
-    """Entity -> archetypes that `rerun mcap convert` makes of a recording, on its own."""
+    """Entity -> archetypes that `rerun mcap convert` makes of a recording."""
     rerun = Path(sys.executable).with_name("rerun")
     result = folder / "a.rrd"
     subprocess.run([rerun, "mcap", "convert", path, "-o", result], check=True, capture_output=True, timeout=120)
@@ -279,7 +279,7 @@ def test_rerun_shows_everything_without_code_of_ours(path: Path, tmp_path: Path)
         "/tf": "Transform3D",
         "/tf_static": "Transform3D",
         "/ee_pose": "InstancePoses3D",
-        "/wrench": "geometry_msgs.msg.WrenchStamped",  # as Rerun shows types that it has no archetype for
+        "/wrench": "geometry_msgs.msg.WrenchStamped",  # Rerun shows types without an archetype like this
         "/object/cube/pose": "InstancePoses3D",
         "/events": "TextLog",
         "/phase": "TextDocument",
@@ -338,7 +338,7 @@ def test_no_description_needs_another_file(path: Path) -> None:
 def test_coordinate_frames_are_where_pybullet_has_the_links(
     path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]
 ) -> None:
-    """Every link's pose from /tf and /tf_static alone, against PyBullet's own forward kinematics."""
+    """Every link's pose from /tf and /tf_static, against PyBullet's own forward kinematics."""
     pybullet = pytest.importorskip("pybullet")
     info, frames, _ = episode
     transforms: dict[str, tuple[str, np.ndarray[Any, Any]]] = {}

@@ -1,4 +1,4 @@
-"""`demorec dataset repair` on datasets that LeRobot wrote and that were damaged as people report it; LeRobot judges."""
+"""`demorec dataset repair` on LeRobot datasets with damage from public reports; LeRobot verifies the result."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def frames(whole: Path) -> list[list[dict[str, Any]]]:
-    """All that LeRobot gives of the whole dataset."""
+    """All items that LeRobot reads from the undamaged dataset."""
     assert len(list(whole.glob("data/*/*.parquet"))) > 1
     return items(whole)
 
@@ -61,7 +61,7 @@ def column(place: str, name: str, values: Callable[[list[Any]], list[Any]]) -> D
 
 
 def without(*names: str) -> Damage:
-    """Leave columns out of the rows and of info.json."""
+    """Remove columns from the rows and from info.json."""
 
     def damage(root: Path) -> None:
         for path in root.glob("data/*/*.parquet"):
@@ -72,7 +72,7 @@ def without(*names: str) -> Damage:
 
 
 def as_double(root: Path) -> None:
-    """Rows as pandas writes them, while info.json says float32."""
+    """Rows as pandas writes them, while info.json specifies float32."""
     for path in root.glob("data/*/*.parquet"):
         table = pq.read_table(path)
         values = pa.array(table.column("observation.state").to_pylist(), pa.list_(pa.float64()))
@@ -82,7 +82,7 @@ def as_double(root: Path) -> None:
 
 
 def same_numbers(root: Path) -> None:
-    """Files joined by hand, each with episodes from 0 on; the table of episodes was not."""
+    """Files joined by hand: each numbers its episodes from 0; the table of episodes was not joined."""
     for path in root.glob("data/*/*.parquet"):
         edit_parquet(path, "episode_index", lambda values: [value - min(values) + 10 for value in values])
     shutil.rmtree(root / "meta/episodes")
@@ -157,7 +157,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
     "tasks numbered otherwise": (other_task_numbers, "numbered from 0, in order"),
     "a copy beside the files": (stray, "file-000 (copy).parquet is left out"),
 }  # fmt: skip
-"""Fault, with a public report of it -> what makes it, and words of the sentence about it."""
+"""Fault, with a public report of it -> function that makes it, and part of the message about it."""
 
 
 @pytest.mark.slow
@@ -241,7 +241,7 @@ def test_an_old_dataset_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.slow
 def test_wrong_paths_a_camera_without_videos_and_counters_as_floats(tmp_path: Path) -> None:
-    """As GR00T's demo data (paths, camera) and fixtures of lerobot-studio (counters) have them."""
+    """As in GR00T's demo data (paths, camera) and in fixtures of lerobot-studio (counters)."""
     roots = [write_v21(tmp_path / name) for name in ("whole", "d")]
     for path in roots[1].glob("data/*/*.parquet"):
         table = pq.read_table(path)
@@ -270,7 +270,7 @@ def no_text(root: Path) -> None:
 
 
 def short_video(root: Path) -> None:
-    """Rows that no image belongs to, of which no file tells which (AgiBot-World#149)."""
+    """Fewer images than rows, and no file identifies the rows without one (AgiBot-World#149)."""
     shutil.rmtree(root)
     write_with_lerobot(root, episodes=2)
     path = next(root.glob("data/*/*.parquet"))

@@ -1,4 +1,4 @@
-"""What a real SO-101 did, by its numbers alone: the simulated one does it again, and says how far off it is."""
+"""Actions of a real SO-101, given as numbers alone: the simulated arm replays them and reports its error."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ ARM = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll"
 CALIBRATION = CALIBRATIONS / "so101_urdf.json"
 DEGREES = ("--robot", "so101", "--motor-units", "degrees")
 HELD = 0.012
-"""Metres that the recorded fingers may be held apart by the cube, which the replay does not know of."""
+"""Metres by which a cube may have held the recorded fingers apart; the replay has no cube."""
 
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes as LeRobot would have them of a real arm, which says nothing but names and numbers."""
+    """Two episodes as LeRobot would record them from a real arm, with nothing but names and numbers."""
     folder = tmp_path_factory.mktemp("real")
     run = simulate_run(folder / "run", 2, robot="so101", seed=11, variation="none", cameras=())
     out = folder / "d"
@@ -39,7 +39,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def replayed(capsys: pytest.CaptureFixture[str], path: Path, *flags: object) -> list[dict[str, tuple[float, float]]]:
-    """Of each episode: joint -> (median, largest) error, degrees; the gripper's in metres."""
+    """For each episode, joint -> (median, largest) error, degrees; metres for the gripper."""
     capsys.readouterr()
     assert exit_code("replay", *flags, path, "--json") == 0
     found = [report["tracking"] for report in json.loads(capsys.readouterr().out)]
@@ -50,7 +50,7 @@ def replayed(capsys: pytest.CaptureFixture[str], path: Path, *flags: object) -> 
 
 
 def changed(dataset: Path, out: Path, change: Any) -> Path:
-    """A copy whose states (T, 6) have been changed, the first row of each episode kept."""
+    """A copy with changed states (T, 6); the first row of each episode is kept."""
     shutil.copytree(dataset, out)
     (path,) = (out / "data").glob("*/*.parquet")
     number = np.array(pq.read_table(path)["episode_index"].to_pylist())
@@ -106,7 +106,7 @@ def test_an_offset_and_a_lag_show_in_their_joints(
     for before, after in zip(plain, delayed, strict=True):
         assert before["shoulder_pan"][1] > 1.0
         assert after["shoulder_pan"][1] < 0.1
-    # More than a hundredth of a radian off: not as recorded, if that is asked for.
+    # More than a hundredth of a radian off: not as recorded, if a comparison was requested.
     assert exit_code("replay", *DEGREES, "--tolerance", 0.01, lagging) == 1
 
 
@@ -140,7 +140,7 @@ def test_other_robots_are_refused(tmp_path: Path, capsys: pytest.CaptureFixture[
 
 
 def test_the_jaw_turns_as_far_as_a_real_one(dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """LeRobot's 100 is the joint's stop, far beyond what tasks use."""
+    """LeRobot's 100 is the joint's stop, far beyond the range of the tasks."""
     shutil.copytree(dataset, tmp_path / "d")
     action = np.array(data_table(dataset)["action"].to_pylist())
     action[:, 5] = 100.0

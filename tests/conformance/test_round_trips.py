@@ -1,4 +1,4 @@
-"""What an export wrote comes back when it is imported, as far as recordings have a place for it; the rest is named."""
+"""An exported dataset is imported again: everything that recordings can hold comes back, and the rest is named."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SUBTASKS = {0: "reach", 7: "grasp"}
 
 
 def episode(index: int, *, success: bool | None, reason: str = "") -> Episode:
-    """Twelve frames with colours, whole millimetres and metres, all of which every frame has an image of."""
+    """Twelve frames with colour and depth in millimetres and metres; every frame has an image of each."""
     given = make_external(cameras=(TOP,), num_frames=12, episode_index=index, success=success)
     random = np.random.default_rng(index)
     stamps = [stamp for stamp, _ in given.images["top"]]
@@ -56,7 +56,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def imported(exporter: str, source: Path, out: Path) -> Path:
-    """The run that the command makes of a dataset."""
+    """The run that the command makes from a dataset."""
     if exporter == "lerobot":
         assert exit_code("import", "lerobot", source, "--out", out) == 0
         return out
@@ -87,11 +87,12 @@ def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pyte
             assert set(here.depth_cameras) == {"near_depth", "far"}
             millimetres = np.array(list(there.distances("near_depth")))
             metres = np.array(list(here.distances("near_depth")))
-            if exporter == "hdf5":  # which has them as float32
+            if exporter == "hdf5":  # the dataset has float32
                 np.testing.assert_array_equal(np.rint(metres * 1000), millimetres)
                 np.testing.assert_array_equal(list(here.distances("far")), list(there.distances("far")))
                 continue
-            # Half a step of LeRobot's codes: (z + 3.5 m) ln(13.5 / 3.51) / 4095, and 1 cm stands for nothing at all.
+            # Half a step of LeRobot's codes: (z + 3.5 m) ln(13.5 / 3.51) / 4095; distances below 1 cm mean no
+            # measurement.
             step = (millimetres / 1000 + 3.5) * np.log(13.5 / 3.51) / 4095
             seen = millimetres > 20
             assert (np.abs(metres - millimetres / 1000)[seen] < 0.51 * step[seen]).all()
@@ -112,14 +113,14 @@ def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pyte
         names: list[str] = []
         a.visit(names.append)
         datasets = [name for name in names if isinstance(a[name], h5py.Dataset) and not name.endswith("_image")]
-        assert len(datasets) == 3 * 6 + 2 + 2  # rewards of two, and both masks
+        assert len(datasets) == 3 * 6 + 2 + 2  # rewards of two episodes, and both masks
         for name in datasets:
             np.testing.assert_array_equal(a[name][()], b[name][()], err_msg=name)
 
 
 @pytest.mark.slow
 def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Colours and distances of two cameras, subtasks and outcome come back; scene, boxes and the rest are named."""
+    """Colour and depth of two cameras, subtasks and outcome come back; scene, boxes and the rest are named."""
     made = make_run(tmp_path / "run", (4, 6), depth=True, segmentation=True)
     export(made, tmp_path / "a", depth=True, language=(), boxes=True, progress=True)
     again = imported("lerobot", tmp_path / "a", tmp_path / "again")
@@ -145,7 +146,7 @@ def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[st
 
 
 def test_what_nobody_would_keep_beside_a_dataset_is_not_believed(run: Path, tmp_path: Path) -> None:
-    """A camera that is none, a pose without a rotation, control characters in a reason."""
+    """An unknown camera, a pose without a rotation, control characters in a reason."""
     export(run, tmp_path / "a", include_failures=True)
     (path,) = (tmp_path / "a" / "demorec" / "episodes").glob("*/*.parquet")
     table = pq.read_table(path)

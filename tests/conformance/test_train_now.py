@@ -1,4 +1,4 @@
-"""README's "Train now": lerobot-train with the settings of examples/, and policies of plug-ins in `evaluate`."""
+"""README's "Train now": lerobot-train with the settings of examples/, and plug-in policies in `evaluate`."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_policy_of_an_unknown_type_names_its_package(tmp_path: Path, capfd: py
 def test_a_plugin_that_lacks_a_package_is_one_sentence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """An installed plug-in, whose own import fails: LeRobot would print its traceback."""
+    """An installed plug-in whose own import fails: LeRobot would print its traceback."""
     folder = tmp_path / "installed"
     (folder / "lerobot_policy_nowhere-1.0.dist-info").mkdir(parents=True)
     about = folder / "lerobot_policy_nowhere-1.0.dist-info" / "METADATA"

@@ -1,4 +1,4 @@
-"""The plug-in's reader for training on demorec's datasets: the items of LeRobot's own reader, bit for bit."""
+"""The plug-in's training reader on demorec's datasets: its items equal those of LeRobot's own reader, bit for bit."""
 
 from __future__ import annotations
 

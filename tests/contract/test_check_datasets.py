@@ -1,4 +1,4 @@
-"""Faults of datasets, one at a time, and the checks that are meant for them."""
+"""Faults of datasets, one at a time, and the checks that must find them."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Rows = np.ndarray[Any, Any]
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Three filmed episodes and their dataset."""
+    """Three recorded episodes with images, and their dataset."""
     folder = simulate_run(tmp_path_factory.mktemp("faults") / "run", 3, seed=3, cameras=("front",), width=64, height=64)
     export_lerobot([folder], folder / "dataset", ExportOptions(verify=False))
     return folder
@@ -49,7 +49,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def dataset(run: Path, tmp_path: Path) -> Path:
-    """A copy to be spoilt."""
+    """A copy to be damaged."""
     return copy(run / "dataset", tmp_path / "dataset")
 
 
@@ -80,7 +80,7 @@ def of_table(place: str, change: Callable[[pa.Table], pa.Table]) -> Fault:
 
 
 def value_of(name: str, row: int, value: Any, place: str = "data") -> Fault:
-    """One value of one row becomes another."""
+    """Change one value of one row."""
 
     def change(values: list[Any]) -> list[Any]:
         if isinstance(values[row], list) and not isinstance(value, list):
@@ -93,7 +93,7 @@ def value_of(name: str, row: int, value: Any, place: str = "data") -> Fault:
 
 
 def of_rows(name: str) -> Fault:
-    """A counter that jumps by one."""
+    """Make a counter jump by one."""
     return of_column(name, lambda rows: np.concatenate([rows[:50], rows[50:] + 1]))
 
 
@@ -136,14 +136,14 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "colours that are text": (of_stats(CAMERA, "mean", lambda v: "grey"), "wrong_statistics"),
     "colours that are not numbers": (of_stats(CAMERA, "std", lambda v: [[[float("nan")]]] * 3), "wrong_statistics"),
     "an episode's mean": (value_of("stats/action/mean", 1, 0.7, "meta/episodes"), "wrong_statistics"),
-    "statistics that are gone": (lambda dataset: (dataset / "meta/stats.json").unlink(), "missing_statistics"),
+    "missing statistics": (lambda dataset: (dataset / "meta/stats.json").unlink(), "missing_statistics"),
     "colours of 0 to 255": (of_stats(CAMERA, "mean", lambda v: [[[140.0]]] * 3), "wrong_colours"),
     "half a video": (half_a_video, "undecodable_images"),
-    "an image too few": (
+    "one image missing": (
         lambda dataset: rewrite_video(dataset, CAMERA, lambda images: images[:-1]), "undecodable_images"
     ),
 }  # fmt: skip
-"""Name -> what is done to the files of a dataset without sidecar, and the check that finds it."""
+"""Name -> damage to the files of a dataset without sidecar, and the check that finds it."""
 
 
 @pytest.mark.parametrize("name", ALONE)
@@ -232,7 +232,7 @@ def test_an_external_episode_that_was_changed(tmp_path: Path) -> None:
 
 
 def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> None:
-    """As after LeRobot's resume: those that it knows are judged by their own rows."""
+    """As after LeRobot's resume: episodes that the sidecar lists are compared with their own rows."""
     spoilt = copy(run, tmp_path / "run")
     path = next((spoilt / "dataset/demorec/episodes").glob("*/*.parquet"))
     pq.write_table(pq.read_table(path).slice(1), path)
@@ -257,7 +257,7 @@ def test_an_episode_twice(run: Path, tmp_path: Path) -> None:
 
 
 def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
-    """LeRobot's delete and split renumber rows and keep the statistics of the old numbers."""
+    """LeRobot's delete and split renumber rows but keep the statistics of the old numbers."""
 
     def renumbered(stats: dict[str, Any]) -> None:
         stats["index"]["max"] = [10**6]

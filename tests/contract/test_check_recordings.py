@@ -1,4 +1,4 @@
-"""Faults, one at a time, in good recordings: each is caught by the check that is meant for it."""
+"""Faults in good recordings, one at a time: each is found by its own check."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def findings(path: Path) -> list[tuple[str, str]]:
-    """The checks that do not pass."""
+    """Return the checks that do not pass."""
     return [(result.check, result.level) for result in checked(path).results if result.level in ("warn", "fail")]
 
 
@@ -104,7 +104,7 @@ def late(frames: int) -> Callable[[Rows], Rows]:
 
 
 def frozen(rows: Rows) -> Rows:
-    """As it was after a third, from then on."""
+    """Repeat the value at one third of the episode until its end."""
     rows[len(rows) // 3 :] = rows[len(rows) // 3]
     return rows
 
@@ -192,7 +192,7 @@ def dropped(topic: str, at: int | None = None) -> Callable[[Message], list[Messa
 
 
 def exchanged_messages(m: Message) -> list[Message]:
-    """The messages of two frames in each other's place."""
+    """Swap the messages of two frames."""
     times = {2 * SECOND: 3 * SECOND, 3 * SECOND: 2 * SECOND}
     return [(m[0], m[1], m[2], times[m[3]])] if m[0] == channels.EE_POSE and m[3] in times else [m]
 
@@ -269,7 +269,7 @@ def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
     def edit(m: Message) -> list[Message]:
         if m[0] != topic or m[3] < 3 * SECOND:
             return [m]
-        # The bytes of the image come last; its head stays.
+        # The bytes of the image are at the end; its header stays intact.
         return [(m[0], m[1], m[2][:-300] + rng.integers(0, 255, 300, dtype=np.uint8).tobytes(), m[3])]
 
     assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "fail"

@@ -1,4 +1,4 @@
-"""Faults of a run's folder, each caught by the check that compares run.json, recordings and dataset."""
+"""Faults of a run's folder, each found by the check that compares run.json, recordings and dataset."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from demorec.extensions.doctor.evidence import Evidence
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two filmed episodes and their dataset."""
+    """Two recorded episodes with images, and their dataset."""
     run = simulate_run(tmp_path_factory.mktemp("runs") / "good", 2, seed=3, fps=10, cameras=("front",))
     export_lerobot([run], run / "dataset", ExportOptions(verify=False))
     return run
@@ -31,7 +31,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def run(good: Path, tmp_path: Path) -> Path:
-    """A copy to be spoilt."""
+    """A copy to be damaged."""
     return copy(good, tmp_path / "run")
 
 
@@ -72,7 +72,7 @@ def test_the_good_one_passes(good: Path) -> None:
 
 
 def places_in(plain: Any, above: tuple[str | int, ...] = ()) -> Iterator[tuple[str | int, ...]]:
-    """Where every value of a JSON document is."""
+    """Path of every value in a JSON document."""
     items = plain.items() if isinstance(plain, dict) else enumerate(plain) if isinstance(plain, list) else ()
     for key, value in items:
         yield (*above, key)
@@ -81,7 +81,7 @@ def places_in(plain: Any, above: tuple[str | int, ...] = ()) -> Iterator[tuple[s
 
 @pytest.mark.slow
 def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
-    """One value after the other becomes null."""
+    """Each value in turn becomes null."""
     path = run / "run.json"
     plain = json.loads(path.read_text())
     plain["export"] = {"run_digest": "a", "repo_id": "local/a", "dataset_digest": "b", "seconds": 1.0}
@@ -92,7 +92,7 @@ def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
         for key in above:
             owner = owner[key]
         if owner[last] is None or {"config", "seconds", "versions", 1} & set(above):
-            continue  # one of the config's values and one episode stand for all
+            continue  # one value of the config and one episode represent all
         owner[last] = None
         path.write_text(json.dumps(spoilt))
         is_damaged = exit_code("info", run) == 1
@@ -152,7 +152,7 @@ def test_an_episode_twice_is_a_copy(run: Path) -> None:
 
 
 def with_its_digest(dataset: Path) -> None:
-    """A number that an exporter with a fault changed: only the recording has the right one."""
+    """A number changed by a faulty exporter, with its digest: only the recording has the right one."""
     edit_column(dataset, "observation.velocity", lambda rows: rows * (1 + 1e-5))
     digests = episode_digests(LeRobotFolder(dataset))
     edit_parquet(next(dataset.glob("demorec/episodes/*/*.parquet")), "content_digest", lambda _: digests)

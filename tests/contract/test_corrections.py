@@ -1,4 +1,4 @@
-"""The expert takes over from a policy, which is here a function of what it sees."""
+"""The expert takes over from a policy, which is a function of its observations in these tests."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ pytestmark = pytest.mark.slow
 
 FPS = 30
 UNSEEN = Action(joint_target=np.zeros(7), gripper_target=0.0, base_from_tcp_target=Pose())
-"""A command that no rule but straying looks at."""
+"""A command that only the deviation rule evaluates."""
 
 
 class Lazy:
-    """Reaches down for half a second with a closed hand, and then stays there."""
+    """Lower the closed hand for half a second, then stay there."""
 
     def __init__(self, *_: Any, **__: Any) -> None:
         self.calls = 0
@@ -67,7 +67,7 @@ def rollout(tmp_path_factory: pytest.TempPathFactory) -> tuple[Attempt, Path]:
 
 
 def roll_out(folder: Path, policy: Any, rules: TakeOver, *, action: ActionKind) -> tuple[Attempt, Path]:
-    """What a worker of `demorec correct` does with scene 3, and the recording that it leaves."""
+    """Roll out scene 3 as a worker of `demorec correct` does; return the result and its recording."""
     settings = Settings(
         policy="p",
         policy_type="lazy",
@@ -116,7 +116,7 @@ def test_no_check_fails_on_a_correction(rollout: tuple[Attempt, Path]) -> None:
 
 
 def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Path) -> None:
-    """As LeRobot's own DAgger writes it: a column of booleans, true where the expert acted."""
+    """As LeRobot's own DAgger does: a boolean column, true where the expert acted."""
     export(rollout[1], tmp_path / "plain")
     assert "intervention" not in info(tmp_path / "plain")["features"]
     export(rollout[1], tmp_path / "dataset", intervention=True)
@@ -154,7 +154,7 @@ def test_what_a_policy_did_alone_can_be_left_out(
 
 @dataclass
 class Hand:
-    """As much of an observation as a watch looks at: a hand that is open and somewhere."""
+    """The part of an observation that takeover rules read: a hand that is open, and its position."""
 
     position: Array
     gripper_width: float = 0.08
@@ -165,7 +165,7 @@ class Hand:
 
 
 def situations(speed: float) -> list[Situation]:
-    """Ten seconds and a frame, in which the hand moves with so many m/s."""
+    """Ten seconds and one frame, in which the hand moves at the given speed in m/s."""
     hands = [Hand(np.array([speed * frame / FPS, 0.0, 0.2])) for frame in range(301)]
     return [
         Situation(
@@ -184,7 +184,7 @@ def situations(speed: float) -> list[Situation]:
     ("takeover", "speed", "expected"),
     [
         (TakeOver(stuck_seconds=1.0), 0.0, (FPS - 1, "the policy is stuck")),
-        (TakeOver(stuck_seconds=1.0), 0.02, (300, "the policy has had its time")),  # m/s: 2 cm in a second is no rest
+        (TakeOver(stuck_seconds=1.0), 0.02, (300, "the policy has had its time")),  # m/s: 2 cm a second is not rest
         (TakeOver(stuck_seconds=0.0), 0.0, (300, "the policy has had its time")),
         (TakeOver(stuck_seconds=0.0, after_seconds=4.0), 0.0, (120, "the policy has had its time")),
     ],
@@ -197,14 +197,14 @@ def test_the_moment(takeover: TakeOver, speed: float, expected: tuple[int, str])
 
 
 class Wanderer:
-    """Does what the expert does in a scene, but from a frame on goes sideways for half a second."""
+    """Act like the expert in a scene, but move sideways for half a second from a given frame on."""
 
     def __init__(self, actions: Array, *, astray_from: int, drift: float) -> None:
         self._actions, self._from, self._drift = actions, astray_from, drift
         self._frame = -1
 
     def reset(self, seed: int) -> None:
-        """All that it knows is which frame it is."""
+        """Return to the first frame, the only state."""
 
     def act(self, observation: dict[str, Any], instruction: str) -> Array:
         self._frame += 1
@@ -216,7 +216,7 @@ class Wanderer:
 
 @pytest.fixture(scope="module")
 def expert_poses() -> Array:
-    """(T, 8) what the expert commands in scene 3 without noise, as of --action ee."""
+    """(T, 8) noise-free commands of the expert in scene 3, in the form of --action ee."""
     config = GenerateConfig(cameras=(), split="train")
     episode = prepare(EpisodePlan(config=config, episode_index=3))
     episode = replace(episode, behaviour=replace(episode.behaviour, action_noise=0.0))
@@ -243,7 +243,7 @@ def test_who_does_as_the_expert_does_is_left_alone(expert_poses: Array) -> None:
 
 @pytest.mark.parametrize("hand_back", [False, True])
 def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
-    """It leaves the way at frame 20 by 1 cm a frame: beyond 5 cm from frame 26 on, for 6 frames at frame 31."""
+    """It leaves the expert's path at frame 20 by 1 cm a frame: beyond 5 cm from frame 26, for 6 frames at frame 31."""
     rules = TakeOver(stray_metres=0.05, stray_seconds=0.2, hand_back=hand_back)
     turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=20, drift=0.01), rules)
     assert turns.success
@@ -254,11 +254,11 @@ def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
     assert (POLICY_PHASE in phases[phases.index("halt") :]) == hand_back
     assert [event.name for event in events[:2]] == ["take_over", "hand_back"][: 1 + hand_back]
     before = frames[phases.index("halt") - 1]
-    assert np.array_equal(before.action.joint_target, before.command.joint_target)  # what it did is what it said
+    assert np.array_equal(before.action.joint_target, before.command.joint_target)  # the policy's output
 
 
 def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Array, tmp_path: Path) -> None:
-    """With noise on what the expert sends: labels and commands differ in its frames alone."""
+    """With noise on the expert's commands: labels and commands differ in the expert's frames only."""
     rules = TakeOver(hand_back=True)
     attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), rules, action="ee")
     assert attempt.success

@@ -1,4 +1,4 @@
-"""`demorec dataset diff` on a dataset that LeRobot wrote: it names what was changed, and nothing else."""
+"""`demorec dataset diff` on a dataset that LeRobot wrote: it names each change, and nothing else."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ run = partial(exit_code, "dataset")
 
 
 def compared(a: Path, b: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    """What `diff` says, whose exit code says the same."""
+    """Return the output of `diff`, after comparing it with the exit code."""
     capsys.readouterr()
     code = run("diff", a, b, "--json")
     found: dict[str, Any] = json.loads(capsys.readouterr().out)
@@ -76,7 +76,7 @@ def row(episode: int, frame: int) -> int:
 
 
 def put(episode: int, frame: int, value: Any, element: int | None = None) -> Callable[[list[Any]], None]:
-    """Set a value of a column, or of an element of it."""
+    """Set a value of a column, or of one of its elements."""
 
     def change(values: list[Any]) -> None:
         if element is None:
@@ -96,7 +96,7 @@ def both(*changes: Callable[[Path], None]) -> Callable[[Path], None]:
 
 
 def paint(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[Path], None]:
-    """Another image in a video."""
+    """Replace an image of a video."""
 
     def changed(images: list[Any]) -> None:
         images[row(episode, frame)] = change(images[row(episode, frame)].copy())
@@ -105,7 +105,7 @@ def paint(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[P
 
 
 def paint_row(episode: int, frame: int, change: Callable[[Any], Any]) -> Callable[[Path], None]:
-    """Another image in a row."""
+    """Replace an image in a row."""
 
     def changed(values: list[Any]) -> None:
         number = row(episode, frame)
@@ -144,7 +144,7 @@ def forget_lists(values: list[Any]) -> None:
 
 
 def reword(root: Path) -> None:
-    """One task, wherever its text stands."""
+    """Reword one task everywhere."""
     edit_column(TASKS, TASK_COLUMN, forget)(root)
     edit_column(EPISODES, "tasks", forget_lists)(root)
 
@@ -157,7 +157,7 @@ def more_tasks(root: Path) -> None:
 
 
 def rewrite(root: Path) -> None:
-    """Every table and JSON file as it is: after that, bytes change only with content."""
+    """Rewrite every table and JSON file unchanged: after that, bytes change only with content."""
     for path in (DATA, EPISODES, TASKS):
         edit_table(path, lambda table: table)(root)
     for path in (INFO, STATS):
@@ -173,7 +173,7 @@ def state(name: str) -> Callable[[dict[str, Any]], Any]:
 INJECTED: dict[str, tuple[str, Callable[[Path], None], Found]] = {
     "robot": ("video", edit_json(INFO, lambda d: d.update(robot_type="so101")), ("info", "robot_type", None, None)),
     "rate": ("images", edit_json(INFO, lambda d: d.update(fps=20)), ("info", "fps", None, None)),
-    "a field of somebody's": ("video", edit_json(INFO, lambda d: d.update(operator="me")),
+    "a third-party field": ("video", edit_json(INFO, lambda d: d.update(operator="me")),
                               ("info", "operator", None, None)),
     "names": ("video", edit_json(INFO, lambda d: state("action")(d).update(names=["x", "y", "w"])),
               ("features", "action: names", None, None)),
@@ -211,7 +211,7 @@ IN_IMAGES = {"one pixel": (1, 4), "an image black": (3, 14), "a pixel in a row":
 
 @pytest.fixture(scope="module")
 def bases(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Four episodes with their images in a video, and with their images in the rows; each has a fact of its own."""
+    """Four episodes with images in a video, and with images in the rows; each differs from the others."""
     made = {}
     for name in ("video", "images"):
         root = write_with_lerobot(tmp_path_factory.mktemp(name) / "d", video=name == "video", episodes=len(LENGTHS))
@@ -293,7 +293,7 @@ def test_episodes_are_found_by_their_content(
     assert found["pairs"] == [[0, 1], [1, 3], [2, 0], [3, 2]]
     assert "The same episodes in another order, A to B: 0 is 1, 1 is 3, 2 is 0, 3 is 2." in found["notes"]
     assert run("drop", tmp_path / "moved", "--episodes", 3, "--out", other) == 0
-    edit_column(DATA, "action", lambda values: values[20].__setitem__(0, 9.0))(other)  # frame 6 of what was episode 0
+    edit_column(DATA, "action", lambda values: values[20].__setitem__(0, 9.0))(other)  # frame 6 of the former episode 0
     expected = [("episodes", "missing", 1, None), ("rows", "action", 0, 1)]
     base = tmp_path / "copy"  # LeRobot estimates the quantiles of every episode
     assert named(compared(base, other, capsys)) == expected

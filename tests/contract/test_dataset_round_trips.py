@@ -1,4 +1,4 @@
-"""An edit of a dataset and its opposite: `diff` finds no difference, with all that stands beside the rows."""
+"""An edit of a dataset and its inverse: `diff` finds no difference, sidecar files included."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ BOXES = "demorec/boxes/observation.images.front.json"
 
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Ours, with sidecar, boxes, progress, failed attempts and language, as an edit wrote it.
+    """A demorec dataset with sidecar, boxes, progress, failed attempts and language, as an edit wrote it.
 
-    An edit has image quantiles averaged over the episodes, where an export counts every pixel.
+    An edit averages image quantiles over the episodes, where an export counts every pixel.
     """
     folder = tmp_path_factory.mktemp("made")
     run = make_run(folder / "run", LENGTHS, failures=(1, 3), segmentation=True)
@@ -78,7 +78,7 @@ def test_one_round_trip(dataset: Path, tmp_path: Path) -> None:
 def test_differences_of_boxes_are_named(dataset: Path, tmp_path: Path) -> None:
     other = written(reorder(LeRobotFolder(dataset), order=[1, 0, 2, 3, 4]), tmp_path / "d").root
     told: dict[str, Any] = json.loads((other / BOXES).read_text())
-    # Episode 1 of the other one is episode 0; its frame 4 stands behind the 7 frames of the first.
+    # Episode 1 of the other dataset is its episode 0; frame 4 follows the 7 frames of the first.
     index = LENGTHS[1] + 4
     shown = next(item for item in told["annotations"] if item["image_id"] == index)
     lines = (other / BOXES).read_text().splitlines(keepends=True)

@@ -1,5 +1,7 @@
-"""Every command that reads a dataset notices missing episodes and rows of other episodes, and one damaged file spoils
-only its own episode."""
+"""Every command that reads a dataset detects missing episodes and rows of other episodes.
+
+One damaged file affects only its own episode.
+"""
 
 from __future__ import annotations
 
@@ -38,7 +40,7 @@ READERS = {
     "shuffle": "dataset shuffle PATH --out NEW",
     "diff": "dataset diff PATH PATH",
 }
-"""Command -> how it is called with a PATH; what it writes begins with NEW."""
+"""Command -> its call with a PATH; names of outputs begin with NEW."""
 
 
 @pytest.fixture(scope="module")
@@ -48,14 +50,14 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def exported(run: Path) -> Path:
-    """A dataset with all rows in one file, and all images in another one."""
+    """A dataset with all rows in one file, and all images in another."""
     export(run, run / "dataset")
     return run / "dataset"
 
 
 @pytest.fixture(scope="module")
 def apart(run: Path) -> Path:
-    """The same with files of its own for each episode."""
+    """The same dataset with separate files for each episode."""
     export(run, run.parent / "apart", data_files_mb=1e-6, video_files_mb=1e-6)
     assert len(list((run.parent / "apart").glob("data/*/*.parquet"))) == NUM_EPISODES
     return run.parent / "apart"
@@ -82,7 +84,7 @@ def longer_episode(root: Path) -> None:
 
 
 def exchanged_rows(root: Path) -> None:
-    """Two rows of the episodes 1 and 2 change places."""
+    """Swap one row of episode 1 with one of episode 2."""
     order = np.arange(NUM_EPISODES * LENGTH)
     order[[LENGTH + 2, 2 * LENGTH + 3]] = order[[2 * LENGTH + 3, LENGTH + 2]]
     change_table(root, "data", lambda table: table.take(pa.array(order)))
@@ -101,11 +103,11 @@ FAULTS: dict[str, tuple[Callable[[Path], None], tuple[str, ...]]] = {
     "rows exchanged between episodes": (exchanged_rows, ("belong to another",)),
     "rows exchanged in an episode": (rows_of_one_episode_exchanged, ("belong to another",)),
 }
-"""Fault -> what makes it, and the words of which one names it."""
+"""Fault -> function that makes it, and phrases of which one must name it."""
 
 
 def wrong_files(root: Path) -> None:
-    """The table puts the rows of all episodes into the first data file, as converters did (lerobot#2401)."""
+    """The table assigns the rows of all episodes to the first data file, as some converters did (lerobot#2401)."""
     change_table(root, "meta/episodes", lambda table: _with_column(table, "data/file_index", [0] * NUM_EPISODES))
 
 
@@ -150,7 +152,7 @@ def test_an_old_dataset_without_its_table_is_found_by_the_rows(
 def test_rows_that_do_not_say_enough_are_refused(
     exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An image less than rows: which episode lacks it, no file knows (AgiBot-World#149)."""
+    """One image fewer than rows: no file identifies the episode that lacks it (AgiBot-World#149)."""
     root = Path(shutil.copytree(exported, tmp_path / "d"))
     without_table(root)
     change_table(root, "data", lambda table: pa.concat_tables([table, table.slice(len(table) - 1)]))
@@ -191,7 +193,7 @@ def test_a_dataset_that_is_not_whole_is_refused(
     assert any(text in captured.out + captured.err for text in words)
     assert content_of(root) == before
     written = [path for path in tmp_path.glob("new*") for path in (path, *path.rglob("*")) if path.is_file()]
-    # An import goes on with the recordings, and a split writes the parts one after the other.
+    # An import continues with the recordings, and a split writes its parts one after the other.
     assert not written or (command in ("import", "split") and fault.startswith("rows exchanged"))
 
 
@@ -230,7 +232,7 @@ def test_a_report_names_the_fault(
 
 @pytest.fixture(params=["data", "videos"])
 def spoilt(request: pytest.FixtureRequest, apart: Path, tmp_path: Path) -> tuple[Path, Path]:
-    """A dataset without one file of the episode 1, and that file."""
+    """A dataset without one file of episode 1, and the path of that file."""
     root = Path(shutil.copytree(apart, tmp_path / "d"))
     (path,) = root.glob(f"{request.param}/**/file-001.*")
     path.unlink()

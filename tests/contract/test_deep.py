@@ -1,4 +1,4 @@
-"""`check --deep` names whatever differs from the recording made again: every field of every topic, every image."""
+"""`check --deep` names every difference from the regenerated recording: every field of every topic, every image."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def simulators() -> Iterator[SimulatorCache]:
 
 @pytest.fixture(scope="module")
 def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Every stream that there is: two cameras, depth, segmentation, joint states at the physics rate, noise."""
+    """A recording with every stream: two cameras, depth, segmentation, joint states at the physics rate, noise."""
     path = tmp_path_factory.mktemp("deep") / "filmed.mcap"
     return simulate(
         path, seed=7, fps=FPS, cameras=("front", "wrist"), width=96, height=96, depth=True, segmentation=True,
@@ -53,7 +53,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def blind(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Without images, which makes it again in no time."""
+    """A recording without images, which is regenerated quickly."""
     return simulate(tmp_path_factory.mktemp("deep") / "blind.mcap", seed=7, fps=FPS)
 
 
@@ -88,7 +88,7 @@ def test_a_rendering_comes_out_the_same(blind: Path, tmp_path: Path, simulators:
 
 
 def single_values(message: Any, path: str = "") -> Iterator[tuple[str, Callable[[], None]]]:
-    """(name, what changes it) of every single value of a decoded message, the last of each array standing for it."""
+    """(name, function that changes it) of every scalar in a decoded message; the last element represents an array."""
     for name in message.__slots__:
         value, where = getattr(message, name), f"{path}.{name}".lstrip(".")
         if hasattr(value, "__slots__"):
@@ -117,7 +117,9 @@ def other(value: Any) -> Any:
 
 @pytest.mark.slow
 def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
-    """One value of one message each, all in one file: every one is named with its frame, and nothing else is."""
+    """One changed value of one message for each field, all in one file: each is named with its frame, and nothing else
+    is.
+    """
     with Recording(filmed) as recording:
         topics = recording.topics
     kinds = {kind for kind, _ in topics.values()}
@@ -133,7 +135,7 @@ def test_every_field_of_every_topic(filmed: Path, tmp_path: Path, simulators: Si
         message = decoders[kind](data)
         changes = dict(single_values(message))
         known = fields.setdefault(topic, list(changes))
-        per_frame = 1 if topics[topic][1] > 1 else len(known)  # what is said once has all its faults in one message
+        per_frame = 1 if topics[topic][1] > 1 else len(known)  # else all faults are in one message
         for name in known[number * per_frame : (number + 1) * per_frame]:
             if name in changes:
                 changes[name]()
@@ -174,7 +176,7 @@ def test_one_bit_of_one_number(blind: Path, tmp_path: Path, simulators: Simulato
     report = deep_check(spoilt, simulators)
     assert found(report) == {("/ee_pose", "pose.position.x", (5,))}
     assert report.level == "fail"
-    assert "from frame 5 on (the EE pose)" in report.replay  # the commands and joint states are sound
+    assert "from frame 5 on (the EE pose)" in report.replay  # commands and joint states are correct
 
 
 @pytest.mark.slow
@@ -201,7 +203,7 @@ def test_other_messages_of_a_topic(edit: Any, blind: Path, tmp_path: Path, simul
 
 
 def leaves(value: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
-    """(name, container, key) of every single value in JSON data."""
+    """(name, container, key) of every scalar in JSON data."""
     items = value.items() if isinstance(value, dict) else enumerate(value) if isinstance(value, list) else ()
     for key, child in items:
         where = f"{path}.{key}" if isinstance(key, str) else f"{path}[{key}]"
@@ -213,13 +215,13 @@ def leaves(value: Any, path: str) -> Iterator[tuple[str, Any, Any]]:
 
 @pytest.mark.parametrize("record", [pytest.param(EPISODE, marks=pytest.mark.slow), OUTCOME])
 def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
-    """One value each, in turn: it is named, and nothing else is."""
+    """Change one value at a time: it is named, and nothing else is."""
     again = Contents.of(filmed)
     with Recording(filmed) as recording:
         info = recording.info
     count = 0
     for key, text in again.metadata[record].items():
-        if key == "crc32":  # is made anew with each change
+        if key == "crc32":  # made again with each change
             continue
         data = json.loads(text) if text.startswith(("{", "[")) else text
         places = list(leaves(data, key)) if isinstance(data, dict | list) else [(key, None, None)]
@@ -234,7 +236,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
             metadata = {**again.metadata[record], key: spoilt if isinstance(spoilt, str) else json.dumps(spoilt)}
             recorded = replace(again, metadata={**again.metadata, record: metadata})
             differences, images = content_differences(recorded, again, info, info.fps)
-            if name.startswith(("info.versions", "info.simulation.cpu")):  # told by themselves
+            if name.startswith(("info.versions", "info.simulation.cpu")):  # reported separately
                 assert not differences
                 continue
             assert [(d.stream, d.field) for d in differences] == [(f"metadata {record}", name)]
@@ -261,7 +263,7 @@ def test_what_another_version_or_cpu_made_is_not_provable_here(
     simulators: SimulatorCache,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    """What differs beside it is named, and is a warning; without it the same difference is a failure."""
+    """A difference under another version or CPU is a warning; under the same ones it is a failure."""
     with Recording(blind) as recording:
         info = to_plain(recording.info)
     if also_differs:
@@ -317,7 +319,7 @@ def test_images_that_differ_are_measured(filmed: Path, tmp_path: Path, simulator
     assert report.level == "fail"
     images = {d.stream: d for d in report.differences if d.field == "image"}
     colours = {f"/camera/{camera}/{stream}" for camera in ("front", "wrist") for stream in ("h264", "video")}
-    assert set(images) == {*colours, "/camera/front/depth", "/camera/wrist/segmentation"}  # all is encoded again
+    assert set(images) == {*colours, "/camera/front/depth", "/camera/wrist/segmentation"}  # everything is encoded again
     assert images["/camera/front/depth"].frames == (9,)
     assert images["/camera/front/depth"].recorded == "the image differs in 1 of 9216 pixels, by up to 0.001 m"
     assert images["/camera/wrist/segmentation"].frames == (12,)
@@ -361,7 +363,7 @@ def test_a_damaged_file_among_good_ones(blind: Path, tmp_path: Path, simulators:
 
 @pytest.mark.slow
 def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
-    """What generate-dataset does at the end: the first and the third of four episodes."""
+    """The check at the end of `generate`: the first and the third of four episodes."""
     folder = simulate_run(tmp_path / "run", 4, seed=7, fps=FPS)
     path = folder / "episodes" / "episode_000002.mcap"
     run = load_run_file(folder)
@@ -377,7 +379,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
     (failure,) = (failure for failure in failures if "made again" in failure)
     assert failure.startswith(path.name)
     assert "info.instruction" in failure
-    info["versions"]["pybullet"] = "0.0.1"  # made by another version, so that nothing is proved
+    info["versions"]["pybullet"] = "0.0.1"  # recorded by another version, so nothing is proved
     path.write_bytes(rewritten(path, change={EPISODE: {"info": json.dumps(info)}}))
     found, failures = check_run(result, deep_every=2, progress=lambda done, total: None)
     assert ", 1 warning (made again)" in found

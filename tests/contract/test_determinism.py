@@ -1,4 +1,4 @@
-"""Every task on every robot: the same bits again, alone or after others, and from the recorded commands."""
+"""Every task on every robot: identical bits again, alone or after others, and from the recorded commands."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The doctor on teleoperated-looking episodes: sound ones are good, each planted fault is found by its check."""
+"""Dataset checks on simulated teleoperation: sound episodes are good, each planted fault is found by its check."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_a_fault_of_numbers_is_found_in_its_episode(name: str, sound: Evidence) 
 
 
 def held_by_dead_band(target: Array, dead_band: float) -> Array:
-    """(T,) places of a hobby servo: it follows where the target is further away than its dead band, to 0.1 degrees."""
+    """(T,) positions of a hobby servo in 0.1 degree steps: it moves only when the target leaves its dead band."""
     held = [target[0]]
     for wanted in target[1:]:
         excess = max(abs(wanted - held[-1]) - dead_band, 0.0)

@@ -1,4 +1,4 @@
-"""Checks of third-party datasets find planted faults in a dataset that demorec did not make, and pass it without them.
+"""Checks of third-party datasets find planted faults in a dataset not made by demorec, and pass without them.
 
 All bases and faults: `benchmarks/doctor_faults.py`.
 """
@@ -26,7 +26,7 @@ def test_a_sound_dataset_is_good(arm: Bench) -> None:
 
 
 def test_a_parked_arm_with_the_rounding_of_lerobot_is_good(tmp_path: Path) -> None:
-    """LeRobot's float32 gives a parked joint a deviation; its encoder flickers by one tick."""
+    """LeRobot's float32 gives a parked joint a nonzero deviation; its encoder flickers by one tick."""
     (tmp_path / "videos").mkdir()
     dataset = record(BASES["two arms"], seed=10, episodes=4)
     answer = check(write_dataset(dataset, tmp_path / "parked", VideoStore(tmp_path / "videos")))
@@ -48,7 +48,7 @@ def test_a_parked_arm_with_the_rounding_of_lerobot_is_good(tmp_path: Path) -> No
     ],
 )
 def test_a_planted_fault_is_found(arm: Bench, name: str) -> None:
-    """Alone, with a second bad episode, and with a NaN in another episode."""
+    """The fault alone, with a second bad episode, and with a NaN in another episode."""
     for second in ("", "bad", "nan"):
         answer = check(arm.plant(name, second))
         assert is_found(FAULTS[name], answer, episodes_of(name), arm.alarms), (second, answer)

@@ -1,5 +1,8 @@
-"""Every command that reads episodes, on every kind of episode: it names the user's path, leaves nothing behind, and
-gives each episode and frame. And every other command, on what was imported: it works, or says why it cannot."""
+"""Every command that reads episodes, on every kind of episode.
+
+It names the user's path, leaves nothing behind, and reads each episode and frame. Every other command works on imported
+episodes, or gives the reason why it cannot.
+"""
 
 from __future__ import annotations
 
@@ -54,7 +57,7 @@ ROWS = {
     "lerobot v2.1": (2, 11),
     "lerobot v3.0": (2, 16),
 }
-"""Kind -> episodes and frames, as its writer made them."""
+"""Kind -> episodes and frames, as written."""
 CASES = [
     (command, kind)
     for command in COMMANDS
@@ -64,9 +67,9 @@ CASES = [
 FORMATS = {"robomimic": "hdf5", "aloha": "hdf5"} | dict.fromkeys(
     ("dataset of simulations", "imported dataset", "lerobot v2.0", "lerobot v2.1", "lerobot v3.0"), "lerobot"
 )
-"""Kind -> word of `demorec import`; bags and recordings, which are bags too, have none."""
+"""Kind -> format word of `demorec import`; bags and recordings, which are bags too, have none."""
 FRAMES_OF = {"run of simulations": (24, 20)}
-"""Kind -> frames of each episode, where they are listed so."""
+"""Kind -> frames of each episode, where the output lists them."""
 EXTERNAL = "recorded by another robot or program"
 OF_IMPORTED: dict[str, tuple[int, str]] = {
     "check RUN": (0, "good: 1 episode, 24 frames, 2 cameras; "),
@@ -88,12 +91,12 @@ OF_IMPORTED: dict[str, tuple[int, str]] = {
     "recover RECORDING --out NEW.mcap": (0, "Complete: all 24 frames"),
     "info RECORDING": (0, "/frames "),
 }
-"""Command -> exit code, and words of what it says."""
+"""Command -> exit code, and phrases of its output."""
 
 
 @pytest.fixture(scope="module")
 def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path | str]]:
-    """Kind -> words that name it."""
+    """Kind -> path."""
     folder = tmp_path_factory.mktemp("readable")
     notes = bags.in_order(bags.so101(1.6))
     (folder / "bags").mkdir()
@@ -131,7 +134,7 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[Path | st
 
 @pytest.fixture
 def scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty folder in which temporary files are made."""
+    """An empty folder for temporary files."""
     folder = tmp_path / "scratch"
     folder.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(folder))
@@ -190,7 +193,7 @@ def test_a_command_reads_it(
         assert page.count("<article") == episodes
         assert f"{frames} (" in page
         assert page.count('src="data:image/jpeg') == episodes
-        assert "failed:" not in page  # nobody said so
+        assert "failed:" not in page  # nothing specifies it
     if command == "view":
         assert len(list(tmp_path.glob("new*.rrd"))) == episodes
 

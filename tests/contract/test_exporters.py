@@ -1,4 +1,4 @@
-"""What every row of the table of exporters promises."""
+"""Guarantees of every row in the table of exporters."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run:
     assert len(names) == expected.shape[1]
     card = tmp_path / "d" / "README.md"
     assert not card.is_file() or "filled in" not in card.read_text().split(f"`{name}`")[1].splitlines()[0]
-    export(run, tmp_path / "d", exporter, overwrite=True)  # what has it is still known as ours
+    export(run, tmp_path / "d", exporter, overwrite=True)  # files with it are still recognised
 
 
 def test_what_it_makes_is_known(exporter: str, run: Path, tmp_path: Path) -> None:
-    """By every command that is given it; and nothing else is written into it, if it is a folder."""
+    """Every command that is given the result recognises it; in a folder, none writes anything else."""
     out = tmp_path / "d"
     export(run, out, exporter)
     kind = find(out).kind

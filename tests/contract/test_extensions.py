@@ -36,7 +36,7 @@ OWN = [extension.name for extension in extensions().found if extension.name != "
 
 
 def install(site: Path, module: str) -> None:
-    """Write what pip writes beside a package that has an entry point."""
+    """Write the metadata that pip writes for a package with an entry point."""
     info = site / f"{module}-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {module}\nVersion: 1.0\n")
@@ -53,7 +53,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def demorec(path: Path, *words: object, code: int = 0, program: str = "main") -> str:
-    """Run a command with a folder in front of the path of modules; return what it printed."""
+    """Run a command with a folder prepended to the module path; return its output."""
     start = f"import sys; from demorec.cli import {program} as main; main(sys.argv[1:])"
     paths = [str(path), str(SOURCE.parent)]
     done = subprocess.run(
@@ -144,7 +144,7 @@ def test_a_broken_extension_is_named_and_harms_nothing(fault: str, site: Path, t
     "name", [name if name == "doctor" else pytest.param(name, marks=pytest.mark.long) for name in OWN]
 )
 def test_a_folder_can_be_deleted(name: str, tmp_path: Path) -> None:
-    """Without it, and what needs it, the rest is imported and works, and no list or help mentions it."""
+    """Without the folder and its dependents, the rest is imported and works, and no list or help mentions it."""
     shutil.copytree(SOURCE, tmp_path / "demorec", ignore=shutil.ignore_patterns("__pycache__"))
     gone = [name, *(each.name for each in extensions().found if name in each.needs)]
     gone += [each.name for each in extensions().found if set(each.needs) & set(gone) and each.name not in gone]

@@ -1,4 +1,4 @@
-"""What is held is held at its faces: no finger sinks in, whatever the object's mass, friction and size."""
+"""Held objects are held at their faces: no finger sinks in, whatever the object's mass, friction and size."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world
 pytestmark = pytest.mark.slow
 
 SINKING = 1e-3
-"""Of each finger, metres, that is too much."""
+"""Maximum depth of each finger in an object, metres."""
 
 
 def smallest_opening(made: PreparedEpisode) -> float:
-    """The gripper's smallest opening, metres, while something is lifted and carried."""
+    """Return the gripper's smallest opening, metres, while it lifts and carries an object."""
     with make_world(made.info) as world:
         frames = Session.of_episode(world, made).run(ScriptAgent(made))
         return min(frame.observation.gripper_width for frame in frames if frame.phase in ("lift", "transport"))
@@ -47,7 +47,7 @@ def with_cube(made: PreparedEpisode, *, side: float, mass: float, friction: floa
     ("side", "mass", "friction"), [(0.0328, 0.030, 0.42), (0.0318, 0.038, 0.42), (0.0328, 0.102, 0.456)]
 )
 def test_fingers_stand_as_far_apart_as_the_cube_is_wide(robot: str, side: float, mass: float, friction: float) -> None:
-    """Small, light, slippery cubes: with fingers of one corner each they rock, and the fingers go in by up to 13 mm."""
+    """Small, light, slippery cubes: fingers with one contact each would rock and sink in by up to 13 mm."""
     scale = ROBOTS.load(robot).task_scale
     made = episode(957, robot=robot, seed=2718, split="train")
     side, mass = scale * side, scale * mass
@@ -62,7 +62,7 @@ def test_an_episode_that_crushes_something_is_a_failure() -> None:
 
 
 def test_a_hand_that_opens_lets_go_at_any_rate() -> None:
-    """At 60 frames a second the fingers still touch the cube one frame after they began to open."""
+    """At 60 frames a second the fingers still touch the cube one frame after they begin to open."""
     frames, outcome = run(episode(0, task="tutorial", robot="iiwa", variation="full", fps=60, seed=72008))
     assert outcome.success
     assert frames[-1].observation.object_poses["red_cube"].position[2] < 0.3  # on the table, not in the hand at 0.8 m
@@ -72,4 +72,4 @@ def test_what_was_dropped_rests_in_the_last_recorded_frames() -> None:
     frames, outcome = run(episode(0, task="tutorial", variation="full", fps=10, seed=72019))
     before, last = (frame.observation.object_poses["red_cube"].position for frame in frames[-2:])
     assert outcome.success
-    assert np.linalg.norm(last - before) * 10 < 0.01  # m/s, what a success allows
+    assert np.linalg.norm(last - before) * 10 < 0.01  # m/s, the maximum of a success

@@ -1,4 +1,4 @@
-"""The environment of every task: gymnasium's rules, and the very numbers of the recordings."""
+"""The environment of every task: gymnasium's rules, and the exact numbers of the recordings."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ ON_REQUEST = ("observation.effort", "observation.contact_force", "observation.wr
 
 FRAMES = 45
 VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes", "pick_anything")
-"""Tasks whose scenes differ in the number of objects, so that no vector can hold their poses."""
+"""Tasks whose scenes differ in the number of objects, so that no vector of fixed size can hold their poses."""
 KEYS = {
     "observation.state": "agent_pos",
     "observation.velocity": "velocity",
@@ -51,7 +51,7 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
 
 @pytest.mark.slow
 def test_things_are_drawn_from_the_named_shelves_and_their_split() -> None:
-    """The same as `generate-dataset` draws for these flags; by the flags of LeRobot's plug-in, too."""
+    """The environment draws the same objects as `generate` for these flags, and for the flags of LeRobot's plug-in."""
     flags: dict[str, Any] = {"objects": ("blocks",), "object_split": "eval", "split": "all"}
     env = make("pick_anything", **flags)
     env.reset(seed=3)
@@ -81,12 +81,12 @@ def test_gymnasium_accepts_the_environment(task: str) -> None:
 
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
 def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_path: Path) -> None:
-    """The numbers of the exported features of a file on disk, against those that a policy would see."""
+    """The features exported from a file equal those that a policy would observe."""
     with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, trajectory = recording.info, recording.trajectory()
     rows = ObservationRows.of_trajectory(trajectory)
     expected = features.observation_vectors(rows, info.simulated.robot, info.simulated.scene, privileged=True)
-    # The first task to its end, the others until they have touched something.
+    # The first task runs to its end, the others until they touch an object.
     count = trajectory.num_frames if task == "pick_place" else min(trajectory.num_frames, 2 * FRAMES)
 
     env = make(task, split="all")
@@ -129,7 +129,7 @@ def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> 
 
 @pytest.fixture(scope="module")
 def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, Trajectory]:
-    """What the expert did in an episode without noise, read from a file."""
+    """The expert's actions in an episode without noise, read from a file."""
     path = simulate(tmp_path_factory.mktemp("expert") / "e.mcap", episode_index=2, variation="none")
     with Recording(path) as recording:
         return recording.info, recording.trajectory()
@@ -138,7 +138,7 @@ def expert(tmp_path_factory: pytest.TempPathFactory) -> tuple[EpisodeInfo, Traje
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ACTION_KINDS)
 def test_exported_actions_solve_the_task(expert: tuple[EpisodeInfo, Trajectory], kind: features.ActionKind) -> None:
-    """float32 actions of each kind, executed one after the other, do what the expert did (without noise)."""
+    """float32 actions of each kind, executed in order, solve the task like the expert (without noise)."""
     info, trajectory = expert
     actions = features.action_vectors(trajectory, info.simulated.scene, kind)
     assert actions.dtype == np.float32

@@ -1,4 +1,4 @@
-"""Each fault of a bag is named by the report of its import; bags without a fault give no finding."""
+"""An import reports each fault of a bag; bags without a fault give no finding."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
 
 
 def test_copies_are_counted_beside_messages_without_a_time(notes: bags.Notes, tmp_path: Path) -> None:
-    """Every third message twice, and no time in the last header, which the copied_episodes do not belong to."""
+    """Every third message is repeated, and the last header has no time; `copied_episodes` must not count it."""
     topic = "/follower/joint_states"
     twice = hurt(notes, "duplicated messages")
     last = max(note.log_ns for note in twice if note.topic == topic)
@@ -79,7 +79,7 @@ def test_a_bag_that_is_cut_off_is_named(notes: bags.Notes, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
-    """Ordinary jitter, latency, a robot that rests, and a gripper's commands on change are no faults."""
+    """Ordinary jitter, latency, a resting robot and a gripper that is commanded only on change are not faults."""
     seconds = 2.0 + 0.3 * seed
     notes = bags.so101(seconds)
     resting = bags.changed(
@@ -90,7 +90,7 @@ def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
 
 
 def test_a_drawn_camera_at_rest_is_not_frozen(notes: bags.Notes, tmp_path: Path) -> None:
-    """Its images have no noise: they are the same wherever all rests, for two images as for six."""
+    """Rendered images have no noise: they repeat while everything rests, for two images as for six."""
     images = bags.of_topic(notes, FRONT)
     same = {11: 10, **dict.fromkeys(range(21, 26), 20)}
     drawn = bags.changed(notes, FRONT, lambda k, note: replace(note, body=images[same.get(k, k)].body))
@@ -101,7 +101,7 @@ def test_a_drawn_camera_at_rest_is_not_frozen(notes: bags.Notes, tmp_path: Path)
 def test_a_drawn_camera_that_sees_a_robot_rest_once(
     notes: bags.Notes, rests: bool, count: int, is_frozen: bool, tmp_path: Path
 ) -> None:
-    """Its image repeats for a moment. If it repeats for longer, or while the robot moves, the camera hangs."""
+    """Rendered images may repeat briefly. If they repeat for longer, or while the robot moves, the camera hangs."""
     images, states = bags.of_topic(notes, FRONT), bags.of_topic(notes, STATE)
     begin, end = (images[k].header_ns for k in (20, 20 + count))
     stands = min(states, key=lambda note: abs(note.header_ns - begin)).body["position"]
@@ -127,7 +127,7 @@ def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Pat
 
 
 def test_headers_without_time_are_no_finding_where_the_mapping_knows(notes: bags.Notes, tmp_path: Path) -> None:
-    """As of a JointTrajectory, whose time 0 means at once."""
+    """As with JointTrajectory, where time 0 means "at once"."""
     unstamped = bags.changed(notes, ACTION, lambda k, note: replace(note, header_ns=0))
     bag = bags.write_mcap(unstamped, tmp_path / "bag.mcap")
     place = f'topic = "{ACTION}"'
@@ -137,7 +137,7 @@ def test_headers_without_time_are_no_finding_where_the_mapping_knows(notes: bags
 
 @pytest.mark.parametrize("kind", ["drops", "frozen", "nothing"])
 def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) -> None:
-    """The bag itself is gone by then."""
+    """The bag itself has been deleted by then."""
     name = next((name for name in sorted(FAULTS) if FAULTS[name].kind == kind), "")
     bag = bags.write_mcap(hurt(notes, name) if name else bags.in_order(notes), tmp_path / "bag.mcap")
     mapping = bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml")

@@ -1,4 +1,4 @@
-"""An arm of five joints with a turning jaw does what the others do; what it cannot reach is said in words."""
+"""An arm of five joints with a turning jaw does every task; unreachable poses are described in words."""
 
 from __future__ import annotations
 
@@ -49,9 +49,9 @@ ARM = ArmKinematics(
 @pytest.mark.parametrize(
     ("task", "index"),
     [
-        ("sort_by_color", 96),  # at the nearest yaw the open jaw comes down on the rim of a tray
+        ("sort_by_color", 96),  # at the nearest yaw the open jaw would land on the rim of a tray
         ("pick_shapes", 49),  # the roll's limit is between the grasp's yaw and the mark
-        ("pick_shapes", 165),  # a mug that rocks when the hand has let go of it
+        ("pick_shapes", 165),  # a mug that rocks after its release
     ],
 )
 def test_a_small_arm_finds_a_clear_grasp_a_yaw_in_reach_and_waits_for_what_rocks(task: str, index: int) -> None:

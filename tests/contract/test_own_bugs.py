@@ -1,4 +1,4 @@
-"""A bug in the user's own task: the message ends with the line of their file at which it came up."""
+"""A bug in the user's task: the message ends with the line of the user's file that raised the error."""
 
 from __future__ import annotations
 

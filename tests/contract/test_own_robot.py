@@ -1,4 +1,4 @@
-"""The robot and the camera of examples/own_robot, for somebody outside of this repository, as docs/robots.md says."""
+"""The robot and camera of examples/own_robot, used outside of this repository as docs/robots.md describes."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def forget(*modules: str) -> None:
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """The example's folder, where the user is; it is not on the path, as for the installed commands."""
+    """The example's folder is the current folder but is not importable, as for the installed commands."""
     folder = tmp_path / "mine"
     shutil.copytree(EXAMPLE, folder)
     monkeypatch.chdir(folder)
@@ -67,7 +67,8 @@ def test_the_example_makes_checks_and_replays_a_dataset(
         assert opened.info.versions == load_run_file(run).versions
     assert (run / "dataset" / "videos" / "observation.images.corner").is_dir()
 
-    # Elsewhere, without the module: the recording is enough to look and to check, and says what replaying needs.
+    # Elsewhere, without the module: the recording suffices for viewing and checking, and names the module that a replay
+    # needs.
     (folder / "xarm6.urdf").rename(tmp_path / "xarm6.urdf")
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("demorec.robots.assets._modules_with_models", set())
@@ -82,7 +83,7 @@ def test_the_example_makes_checks_and_replays_a_dataset(
     assert exit_code("replay", recording, "--allow", "my_robots") == 0
     assert "identical, succeeds" in capsys.readouterr().out
 
-    # What the file says has changed since: the run is not gone on with, and replay says so.
+    # Once the file has changed, the run cannot continue, and replay prints a note.
     (folder / "my_robots.py").write_text((folder / "my_robots.py").read_text() + "\nFASTER = True\n")
     forget("my_robots")
     assert exit_code(*flags, "--num-episodes", "3", "--workers", "1", "--out", run, program=generate_dataset_main) == 2
@@ -178,7 +179,7 @@ def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
 
 
 def fixed_to_the_tool(origin: str) -> str:
-    """A tcp that is moved or turned against where the example has it."""
+    """Attach a tcp that is moved or turned relative to the example's."""
     joint = f'<parent link="true"/><child link="tcp"/><origin {origin}/>'
     return f'<link name="true"/><joint name="t" type="fixed">{joint}</joint>'
 
@@ -213,7 +214,7 @@ def test_fingers_that_move_along_x_of_the_tcp_are_refused(
 
 @pytest.mark.slow
 def test_a_plug_in_of_gazebo_is_not_a_mesh_and_ros_names_lead_to_the_package(folder: Path, tmp_path: Path) -> None:
-    """As a vendor lays it out: my_arm_description/urdf/arm.urdf beside my_arm_description/meshes."""
+    """A vendor's layout: my_arm_description/urdf/arm.urdf next to my_arm_description/meshes."""
     from demorec.robots.assets import data_folder
 
     package = tmp_path / "my_arm_description"
@@ -281,7 +282,7 @@ def test_a_model_that_changed_is_another_version(folder: Path) -> None:
     after = deciding_versions(config)
     assert {name for name in after if after[name] != before[name]} == {"source of my_robots:xarm6.urdf"}
     assert changed_sources(before, ["my_robots"]) == ("the source of my_robots:xarm6.urdf has changed",)
-    assert changed_sources(before, []) == ()  # nobody may look
+    assert changed_sources(before, []) == ()  # unreadable
     assert deciding_versions(GenerateConfig()) == deciding_versions()
 
 
@@ -299,7 +300,7 @@ def test_a_module_counts_with_its_file_and_a_package_with_all_of_its_files(folde
         return versions["source of my_tasks"], versions["source of arms.one"]
 
     before = first = digests()
-    for name in ("my_robots.py", *left_out):  # beside the module, and what is no source
+    for name in ("my_robots.py", *left_out):  # next to the module, but not source code
         (folder / name).write_text((folder / name).read_text() + "# edited\n")
         assert digests() == first
     (folder / "my_tasks.py").write_text("A = 2\n")

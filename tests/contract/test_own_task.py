@@ -1,4 +1,4 @@
-"""The examples of docs/tasks.md work as printed, for somebody outside of this repository."""
+"""The examples of docs/tasks.md work as printed, outside of this repository."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Several processes that start at once on an empty cache: all draw, and the work of the first start is done once."""
+"""Several processes start at once on an empty cache: all draw, and the cache is filled once."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def start(cache: Path) -> subprocess.Popen[str]:
 
 
 def result(process: subprocess.Popen[str]) -> tuple[dict[str, Any], str]:
-    """What a process printed, and what it said beside it."""
+    """Standard output and standard error of a process."""
     out, errors = process.communicate(timeout=900)
     assert process.returncode == 0, errors
     return json.loads(out.splitlines()[-1]), errors
@@ -67,10 +67,10 @@ def test_processes_that_start_at_once_share_the_first_start(tmp_path: Path) -> N
     results = [found for found, _ in together]
     assert len({found["image"] for found in [*results, later[0]]}) == 1
     assert results[0]["colours"] > 100
-    # One compiles and says so; the others wait and load what it compiled.
+    # One compiles and prints a note; the others wait and load the result.
     assert sorted(found["compiled"] > 0 for found in results) == [False] * (PROCESSES - 1) + [True]
     assert sum("Compiling the renderer" in errors for _, errors in together) == 1
-    # Each level of detail (one for the image, one for the shadow map) is made by one of them.
+    # Each level of detail (one for the image, one for the shadow map) is built by one process.
     levels = [level for found in results for level in found["decimated"]]
     assert len(levels) == len(set(levels)) == 2
     assert later[0]["compiled"] == 0

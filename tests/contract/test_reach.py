@@ -1,4 +1,4 @@
-"""What an arm can reach it reaches, however it stands; what it cannot is not asked of it."""
+"""An arm reaches every reachable target from any pose; unreachable ones are not requested."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ pytestmark = pytest.mark.slow
         pytest.param("line_up", "iiwa", "full", 0, 3, id="found from another start only"),
         pytest.param("line_up", "iiwa", "full", 0, 110, id="no way to lift it at the nearest yaw"),
         pytest.param("sort_by_color", "panda", "full", 0, 252, id="no straight line leads there"),
-        pytest.param("pick_shapes", "iiwa", "mild", 0, 126, id="a duck that is dropped when held over beak and tail"),
+        pytest.param("pick_shapes", "iiwa", "mild", 0, 126, id="a duck that slips when held at beak and tail"),
         pytest.param("line_up", "iiwa", "full", 77, 177, id="no line leads down, since the elbow gets straight"),
         pytest.param("tutorial", "iiwa", "none", 82000, 117, id="the cube falls to where no grasp is in reach"),
-        pytest.param("tutorial", "iiwa", "full", 82000, 241, id="the cube lies lower than its size says"),
-        pytest.param("sort_by_color", "panda", "full", 82000, 135, id="it cannot rise as high as it wants"),
+        pytest.param("tutorial", "iiwa", "full", 82000, 241, id="the cube is lower than its size implies"),
+        pytest.param("sort_by_color", "panda", "full", 82000, 135, id="it cannot rise to the intended height"),
     ],
 )
 def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed: int, index: int) -> None:
@@ -35,27 +35,27 @@ def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed
 
 
 def test_a_line_on_which_the_joints_jump_is_given_up_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Slowed down again and again it took minutes to plan; at another yaw the hand gets there."""
-    monkeypatch.setattr("demorec.tasks.tutorial.SINKS", 0.0)  # or the layout would be drawn anew
+    """Slowing the line down again and again took minutes to plan; at another yaw the hand gets there."""
+    monkeypatch.setattr("demorec.tasks.tutorial.SINKS", 0.0)  # otherwise the layout would be drawn again
     _, outcome = run(episode(230, task="tutorial", robot="iiwa", variation="full", seed=82000))
     assert outcome.success
 
 
 def test_a_blow_that_turns_the_cube_into_a_finger_is_no_success() -> None:
-    """It touches down on an edge: a finger is 1.36 mm in it, though it was not when the contacts were found."""
+    """It lands on an edge: a finger is 1.36 mm inside it, although there was no overlap when contacts were computed."""
     _, outcome = run(episode(235, task="pick_place", robot="iiwa", variation="none", seed=82000))
     assert (outcome.success, outcome.failure_reason) == (False, "crush")
 
 
 def farthest(index: int, **config: Any) -> float:
-    """Of the middle of the cubes at the start, seen from above, metres from the base."""
+    """Largest horizontal distance of a cube's centre from the base at the start, metres."""
     scene = episode(index, task="support.odd_tasks:Wide", variation="none", **config).info.simulated.scene
     return max(math.hypot(*body.world_from_body.position[:2].tolist()) for body in scene.movable)
 
 
 @pytest.mark.parametrize("robot", ["panda", "iiwa"])
 def test_layouts_are_drawn_anew_until_the_arm_reaches_everything(robot: str) -> None:
-    """The Panda's reach is 0.855 m from a shoulder 0.33 m up, its hand 0.21 m long; the iiwa's is no longer."""
+    """The Panda reaches 0.855 m from a shoulder 0.33 m up, with a hand of 0.21 m; the iiwa reaches no further."""
     assert max(farthest(index, robot=robot) for index in range(20)) < 0.83
 
 

@@ -1,4 +1,4 @@
-"""The examples of examples/recorder work as programs, and record what their loops did."""
+"""The programs of examples/recorder run, and their recordings match their loops."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def test_a_robots_loop(runs: Path) -> None:
         position += 0.5 * (target - position)
     held = table.images["top"]
     assert [int(number) for number in held] == [-1 if step % 3 == 2 else step - step // 3 for step in range(60)]
-    assert (table.image_age_ns("top") >= 0).all()  # taken before the frame was written
+    assert (table.image_age_ns("top") >= 0).all()  # captured before the frame was written
 
 
 def test_a_simulation_of_ones_own(runs: Path) -> None:
@@ -97,4 +97,4 @@ def test_the_first_example_of_the_docs_passes_the_checks(tmp_path: Path, monkeyp
     exec(compile(snippet, "recorder.md", "exec"), {})
     reports = check_subjects(find_subjects([tmp_path / "runs" / "first"]), CheckOptions(workers=1))
     odd = {result.check for report in reports for result in report.results if result.level in ("warn", "fail")}
-    assert odd <= {"rate"}  # which a busy machine is slower than
+    assert odd <= {"rate"}  # a busy machine is slower

@@ -1,4 +1,4 @@
-"""The expert takes over from any state: what a policy or a person has begun, spoilt or nearly finished."""
+"""The expert takes over from any state: a task that a policy or a person has begun, spoilt or nearly finished."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Spoil = Callable[[World, Expert], Iterator[Step]]
 
 
 def apply(world: World, steps: Iterator[Step]) -> list[Step]:
-    """Send the commands of a script; all of its steps."""
+    """Send the commands of a script; return all of its steps."""
     done = []
     for step in steps:
         world.apply(step.action)
@@ -31,7 +31,7 @@ def apply(world: World, steps: Iterator[Step]) -> list[Step]:
 
 
 def begin(world: World, prepared: PreparedEpisode, until: str = "", frames: int = 10_000) -> None:
-    """Run the script until a phase, or for so many frames."""
+    """Run the script until a phase, or for a number of frames."""
     session = Session.of_episode(world, prepared)
     for frame in session.run(ScriptAgent(prepared)):
         if frame.phase == until or frame.frame_index == frames:
@@ -39,7 +39,7 @@ def begin(world: World, prepared: PreparedEpisode, until: str = "", frames: int 
 
 
 def taken_over(world: World, prepared: PreparedEpisode) -> list[Step]:
-    """What the expert does from here on; the joints never jump."""
+    """Return the expert's frames from here on, after checking that the joints never jump."""
     before = world.arm.target.copy()
     steps = apply(world, prepared.task.resume(Expert(world, Behaviour(action_noise=0.0))))
     targets = np.array([before, *(step.action.joint_target for step in steps)])
@@ -53,7 +53,7 @@ def failed_conditions(world: World, prepared: PreparedEpisode) -> list[str]:
 
 
 def close_beside(world: World, expert: Expert) -> Iterator[Step]:
-    """The closed hand stands low beside the cube, where opening alone would push it."""
+    """Lower the closed hand next to the cube, where opening alone would push it."""
     pose = world.pose(world.scene.goals[0].object)
     beside = hand_down(pose.position + np.array([0.0, 0.075, 0.0]), 0.3)
     yield from expert.move(raised(beside, 0.1), speed=0.5)
@@ -62,13 +62,13 @@ def close_beside(world: World, expert: Expert) -> Iterator[Step]:
 
 
 def push_away(world: World, expert: Expert) -> Iterator[Step]:
-    """The closed hand pushes the cube over the table, out of the place where it was seen."""
+    """Push the cube over the table with the closed hand, away from its observed place."""
     yield from close_beside(world, expert)
     yield from expert.move(raised(expert.tcp_target() @ Pose(position=np.array([0.02, 0.1, 0.0])), 0.0), speed=0.2)
 
 
 def carry_tilted(world: World, expert: Expert) -> Iterator[Step]:
-    """The cube is in the hand, which tilts by 25 degrees on the way."""
+    """Grasp the cube, then tilt the hand by 25 degrees while carrying."""
     yield from expert.pick(world.scene.goals[0].object)
     tilt = np.array([np.sin(0.22), 0.0, 0.0, np.cos(0.22)])
     here = expert.tcp_target()
@@ -77,7 +77,7 @@ def carry_tilted(world: World, expert: Expert) -> Iterator[Step]:
 
 
 def wave(world: World, expert: Expert) -> Iterator[Step]:
-    """The arm flails: a random walk of all joints, which is not at rest when the expert takes over."""
+    """Move all joints in a random walk; the arm is not at rest when the expert takes over."""
     random = np.random.default_rng(4)
     velocity: Array = np.zeros(7)
     for _ in range(45):
@@ -106,7 +106,7 @@ def test_the_expert_finishes_from_any_state(spoil: Spoil) -> None:
 
 @pytest.mark.parametrize(("phase", "after"), [("descend", "close"), ("lower", "release")])
 def test_who_halts_above_the_place_is_shown_the_way_down(phase: str, after: str) -> None:
-    """Rising and coming again would contradict every demonstration, which goes down from there."""
+    """Rising and returning would contradict every demonstration, which moves down from there."""
     prepared = episode(2, variation="none")
     with make_world(prepared.info) as world:
         seen = 0
@@ -115,7 +115,7 @@ def test_who_halts_above_the_place_is_shown_the_way_down(phase: str, after: str)
             if seen == 7:
                 break
         expert = Expert(world)
-        apply(world, (expert.step() for _ in range(20)))  # which holds the arm where it is
+        apply(world, (expert.step() for _ in range(20)))  # it holds the arm in place
         height = float(expert.tcp().position[2])
         heights, phases = [], []
         for step in prepared.task.resume(Expert(world, Behaviour(action_noise=0.0))):
@@ -143,7 +143,7 @@ def test_what_is_served_is_left_alone() -> None:
 
 @pytest.mark.slow
 def test_a_bystander_in_the_hand_is_put_back() -> None:
-    """Carried off by mistake: it goes back to where it lay, and then the goal is served."""
+    """An object grasped by mistake is put back in its place before the goal is pursued."""
     prepared = episode(0, task="pick_from_clutter", variation="none")
     with make_world(prepared.info) as world:
         begin(world, prepared, frames=0)

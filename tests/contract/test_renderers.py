@@ -1,7 +1,7 @@
-"""Every row of the renderers' table draws what is there: bounds are tight for raster, documented for PyBullet's own.
+"""Every renderer in the table draws the scene: bounds are tight for raster, and documented for PyBullet's renderers.
 
-TinyRenderer samples half a pixel off and its depth is millimetres out; a 24 bit depth buffer makes the EGL plugin's
-depth coarser. docs/rendering.md tells the figures.
+TinyRenderer samples half a pixel off and its depth is millimetres out; a 24-bit depth buffer makes the EGL plugin's
+depth coarser. docs/rendering.md has the figures.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ BOUNDS = {
 
 @dataclass(frozen=True)
 class Stage:
-    """A client that is emptied for each test (EGL bears only one in a process), and the renderer."""
+    """A client that is emptied for each test (EGL allows only one in a process), and the renderer."""
 
     name: str
     client: Any

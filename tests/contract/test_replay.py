@@ -1,4 +1,4 @@
-"""Recorded actions and states, back in the simulator."""
+"""Recorded actions and states are replayed in the simulator."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_first_different_step_is_found(recorded: Path, tmp_path: Path) -> No
     targets[70, 2] += 1e-12
     spoilt.set(command_joint_target=targets)
     report = _replay(spoilt.write(tmp_path / "s.mcap"))
-    assert report.first_difference == (71, "joint positions")  # command 70 shows in state 71
+    assert report.first_difference == (71, "joint positions")  # state 71 is the first to show command 70
     assert 0 < report.joint_error < 1e-6
     assert report.success
 
@@ -115,7 +115,7 @@ def test_an_outcome_that_was_changed_is_found(
 
 @pytest.mark.slow
 def test_an_expert_that_gave_up_is_a_failure_whatever_the_conditions_say(recorded: Path, tmp_path: Path) -> None:
-    """As with a thing that was misplaced three times and comes to rest after that."""
+    """As with an object that was misplaced three times and comes to rest after that."""
     spoilt = Spoilt(recorded)
     assert spoilt.outcome is not None
     spoilt.outcome = replace(spoilt.outcome, success=False, failure_phase="verify", failure_reason="misplaced_speed")
@@ -163,7 +163,7 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
         assert x.phase == y.phase
         assert [p.data for p in a.packets("front")] == [p.data for p in b.packets("front")]
         assert b.outcome == a.outcome
-    # The same replay stays; another one does not replace it, unless asked for; nothing replaces the source.
+    # The same replay is kept; a different one replaces it only on request; nothing replaces the source.
     replayed = (tmp_path / "out" / "e.mcap").read_bytes()
     assert exit_code("replay", source, "--out", tmp_path / "out") == 0
     assert exit_code("replay", source, "--out", tmp_path / "out", "--delay", "1") == 2
@@ -196,7 +196,7 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
 
 @pytest.fixture(scope="module")
 def quiet_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Without exploration noise, actions are what was executed, rounded to float32."""
+    """Without exploration noise, recorded actions are the executed ones, rounded to float32."""
     return simulate_run(tmp_path_factory.mktemp("quiet") / "run", 2, seed=3, variation="none")
 
 
@@ -213,7 +213,7 @@ def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path
     ]
     assert [report.success for report in found] == [True, True]
     assert all(report.unreachable == 0 for report in found)
-    # Inverse kinematics may bend the elbow another way; the joints themselves come back to rounding and drift.
+    # Inverse kinematics may bend the elbow differently; the joints themselves match except for rounding and drift.
     limit = 2e-3 if action.startswith("joint") else 0.5
     assert max(report.joint_error for report in found) < limit
     assert exit_code("replay", tmp_path / "ds", "--episodes", "1") == 0
@@ -234,7 +234,7 @@ def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytes
     episode, total, _ = capsys.readouterr().out.splitlines()
     (gripper,) = re.findall(r"gripper (\S+) mm", episode)
     assert float(gripper) > 0
-    assert total.endswith(f"gripper {gripper} mm.")  # and nothing of objects, whose places a dataset does not hold
+    assert total.endswith(f"gripper {gripper} mm.")  # but not for objects, whose poses a dataset does not have
     assert exit_code("replay", run) == 0
     assert "gripper 0 mm, objects 0 mm.\n" in capsys.readouterr().out
 
@@ -258,7 +258,7 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
 
 
 def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
-    """An action of a damaged dataset: the arm stays where it is, and the step is counted."""
+    """An action of a damaged dataset: the arm stays in place, and the step is counted."""
     options = ReplayOptions()
     whole = open_file(recorded, options)
     actions = np.array([[*command.joint_target, command.gripper_target] for command in whole.commands[:6]])
@@ -272,7 +272,9 @@ def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 def test_increments_of_a_jaw_arm_are_judged_by_the_arm_alone(tmp_path: Path) -> None:
-    """Without demorec's own files only the jaw's action is a target; it stops at what it holds, so it has no lag."""
+    """Without demorec's own files only the jaw's action is a target; the jaw stops at the held object, so it has no
+    lag.
+    """
     run = simulate_run(tmp_path / "run", 4, seed=61, robot="so101", cameras=())
     export_lerobot([run], tmp_path / "ds", ExportOptions(verify=False, action="joint_increment"))
     shutil.rmtree(tmp_path / "ds" / "demorec")

@@ -1,4 +1,4 @@
-"""`generate-dataset --config RUN/run.json` compares with the content of the recordings, whatever run.json says."""
+"""`demorec generate --config RUN/run.json` compares with the content of the recordings, not with run.json."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def one_bit(source: Path) -> bytes:
-    """The recording with another last bit of one coordinate."""
+    """The recording with the last bit of one coordinate changed."""
     seen = 0
 
     def spoil(topic: str, data: bytes) -> bytes:

@@ -1,4 +1,4 @@
-"""Recorded states, new images."""
+"""Recorded states are rendered as new images."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SIDE = CameraPreset(summary="", eye=(0.5, 0.9, 0.5), target=(0.5, 0.0, 0.1), fov
 
 
 def own_camera(folder: Path) -> Path:
-    """A folder for Python's path, with `rerender_cameras:SIDE` in it."""
+    """A folder on Python's path that contains `rerender_cameras:SIDE`."""
     (folder / "path").mkdir()
     (folder / "path" / "rerender_cameras.py").write_text(SIDE)
     return folder / "path"
@@ -57,7 +57,7 @@ def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_
 
 
 def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
-    """What was drawn anew does not follow from a seed; the error that it tells leads to where the camera was."""
+    """An error that was drawn anew does not follow from the seed; the recorded one leads to the camera's true pose."""
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
     assert (report.compared, report.differing) == (("front",), {})
@@ -91,7 +91,7 @@ def test_other_cameras_sizes_and_looks_pass_the_checks(
 
 def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
     scenes = []
-    with WarmRenderer() as warm:  # "c" is drawn by a renderer that drew other colours before
+    with WarmRenderer() as warm:  # "c" is drawn by a renderer with different colours
         for name, seed, renderers in (("a", 1, None), ("b", 2, warm), ("c", 1, warm)):
             options = RerenderOptions(looks=seed, cameras=("front",))
             rerender(filmed, tmp_path / f"{name}.mcap", options, renderers=renderers)
@@ -131,7 +131,7 @@ def test_a_camera_of_ones_own_stands_where_it_is_said(
     assert camera.name == "side"
     assert camera.mount_from_camera.position.tolist() == [0.5, 0.9, 0.5]
     assert np.degrees(camera.fov_y) == pytest.approx(50)
-    # The optical axis goes through the point that is looked at.
+    # The optical axis passes through the target point.
     seen = camera.mount_from_camera.inverse().apply(np.array([0.5, 0.0, 0.1]))
     assert seen[:2] == pytest.approx([0, 0], abs=1e-12)
     assert seen[2] == pytest.approx(np.hypot(0.9, 0.4))

@@ -1,4 +1,4 @@
-"""Every row of the robots' table: a URDF that fits its spec, and an arm that does the job."""
+"""Every robot in the table: a URDF that fits its specification, and an arm that completes a task."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def spec(request: pytest.FixtureRequest) -> RobotSpec:
 
 
 def test_it_starts_within_its_limits(spec: RobotSpec) -> None:
-    """Also where its home lies closer to one than `joint_spread` reaches."""
+    """This includes homes that are closer to a limit than `joint_spread`."""
     starts = [
         episode(i, robot=spec.name, variation="full").info.simulated.scene.robot.joint_position for i in range(20)
     ]
@@ -51,9 +51,9 @@ def test_it_starts_within_its_limits(spec: RobotSpec) -> None:
 def test_the_wrench_holds_the_weight_of_the_hand(
     spec: RobotSpec, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """At rest in a tilted pose, against statics; whichever way the axes of the hand's inertia are turned.
+    """At rest in a tilted pose, against statics; for any orientation of the hand's inertial axes.
 
-    The fingers' motion stays horizontal: docs/recording.md tells what PyBullet loses otherwise.
+    The fingers' motion stays horizontal: docs/recording.md describes PyBullet's losses otherwise.
     """
     scene = episode(0, robot=spec.name, variation="none").info.simulated.scene
     q = np.array(spec.home_q)
@@ -85,7 +85,7 @@ def test_the_wrench_holds_the_weight_of_the_hand(
         assert sorted(np.abs(expected[:3]))[1] > 0.4 * weight, "the hand is tilted"
         assert np.abs(expected[3:]).max() > 0.01 * weight
         assert np.abs(wrench[:3] - expected[:3]).max() < 0.02 * weight
-        # What turns a hand about the axis of its joint goes through the motor.
+        # A torque about the axis of the hand's joint acts on the motor.
         assert ((1 - axis) * np.abs(wrench[3:] - expected[3:])).max() < 1e-3 * weight
     assert np.allclose(found["as it is"][1], found["turned"][1], atol=0.01)
 
@@ -119,7 +119,7 @@ def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> 
 
 
 def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec: RobotSpec) -> None:
-    """Bounding boxes that Bullet tells of (its margin included), the hand pointing down along the world's axes."""
+    """Bullet's bounding boxes (margin included), the hand pointing down along the world's axes."""
     with World(spec) as world:
         world.reset(episode(robot=spec.name).info.simulated.scene)
         goal = world.arm.world_from_base.inverse() @ hand_down(spec.task_scale * np.array([0.5, 0.0, 0.2]), 0.0)

@@ -1,4 +1,4 @@
-"""`recordings/sample/` holds one recording, which this demorec reads (`make sample` makes it again)."""
+"""`recordings/sample/` holds one recording, which this version reads (`make sample` makes it again)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`--state joint_ee`: the TCP's pose behind the joints in observation.state, wherever such a dataset or policy goes."""
+"""`--state joint_ee`: the TCP's pose after the joints in observation.state, for all users of such data or policies."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SMALL = ExportOptions(verify=False, action="ee_delta", state="joint_ee", feature
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two episodes without exploration noise, so that actions are what was executed."""
+    """Two episodes without exploration noise, so that actions are the executed ones."""
     return simulate_run(tmp_path_factory.mktemp("states") / "run", 2, seed=3, variation="none")
 
 
@@ -41,7 +41,7 @@ def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def small(run: Path, tmp_path: Path) -> Path:
-    """The state is the only place of the TCP's pose."""
+    """The state alone holds the TCP's pose."""
     export_lerobot([run], tmp_path / "small", SMALL)
     return tmp_path / "small"
 

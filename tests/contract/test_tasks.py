@@ -1,4 +1,4 @@
-"""Every task of the table holds the contract that `demorec.testing` has for anybody's; and what is true of some."""
+"""Every task in the table meets the contract that `demorec.testing` has for all tasks; and properties of some tasks."""
 
 from __future__ import annotations
 

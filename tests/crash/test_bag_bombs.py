@@ -1,6 +1,6 @@
-"""Bags and mappings of less than a megabyte that claim, nest or compute without end: a sentence, in bounds.
+"""Bags and mappings of less than a megabyte that claim, nest or compute without end: one sentence, within limits.
 
-Expected is what the file itself says, by its format's definition; what it takes is measured in a process of its own.
+Expected values follow from the format's definition; a separate process measures memory and time.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def _mcap(path: Path, kind: str, encoding: str, schema: bytes, of_message: str, 
 
 
 def _nested(line: str, depth: int, last: str) -> bytes:
-    """A definition of `depth` types, each with the lines `line`, which has the next one's number at %d."""
+    """A definition of `depth` types, each with the fields `line`, in which %d is the number of the next type."""
     parts = [line.replace("%d", str(number + 1)) for number in range(depth)]
     return _SEPARATOR.join(
         [parts[0], *(f"MSG: a/T{k + 1}\n{part}" for k, part in enumerate([*parts[1:], last]))]
@@ -79,7 +79,7 @@ def messages_that_claim_64_megabytes(folder: Path) -> Path:
 
 
 def _database(folder: Path, script: str) -> Path:
-    """A .db3 of rosbag2 that was changed by a script."""
+    """A .db3 file of rosbag2, changed by a script."""
     bag = bags.write_rosbag2(bags.in_order(bags.so101(0.3)), folder / "sql", storage=StoragePlugin.SQLITE3)
     path = next(bag.glob("*.db3"))
     with closing(sqlite3.connect(path)) as database, database:
@@ -215,7 +215,7 @@ def test_a_link_out_of_the_bag_is_not_followed(tmp_path: Path, commands: Limited
 
 @pytest.mark.parametrize("codec", ["h264", "h265"])
 def test_a_keyframe_that_gives_no_image(codec: str, tmp_path: Path, commands: LimitedCommands) -> None:
-    """Parameter sets, and the head of an image without any of it."""
+    """Parameter sets and the header of an image, without its data."""
     packet = bags.video([bags.image(0, 0)], gop=1, codec={"h264": "libx264", "h265": "libx265"}[codec])[0]
     units = packet.split(b"\x00\x00\x01")
     slices = {"h264": (5,), "h265": (19, 20)}[codec]
@@ -235,7 +235,7 @@ def test_a_keyframe_that_gives_no_image(codec: str, tmp_path: Path, commands: Li
 
 
 def test_a_database_with_a_journal_beside_it(tmp_path: Path, commands: LimitedCommands) -> None:
-    """A recorder that was killed in SQLite's mode WAL has left its last messages there."""
+    """A recorder that was killed in SQLite's WAL mode has left its last messages in the journal."""
     path, copy = _database(tmp_path, ""), tmp_path / "copy" / "bag.db3"
     copy.parent.mkdir()
     with closing(sqlite3.connect(path)) as database:

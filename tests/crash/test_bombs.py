@@ -1,4 +1,4 @@
-"""Small recordings that unpack to gigabytes, hold millions of records or nest without end: one sentence in limits."""
+"""Small recordings that unpack to gigabytes, hold millions of records or nest without end: one sentence, in limits."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def one_huge_chunk(good: Path, path: Path) -> None:
-    """4 GB of zeros, as the zstd data say themselves; the chunk says that it is small."""
+    """4 GB of zeros according to the zstd data; the chunk record claims a small size."""
     compressor = zstandard.ZstdCompressor(level=1).compressobj(size=4 << 30)
     zeros = bytes(1 << 24)
     packed = b"".join(compressor.compress(zeros) for _ in range(256)) + compressor.flush()
@@ -51,14 +51,14 @@ def many_large_chunks(good: Path, path: Path) -> None:
 
 
 def empty_records(good: Path, path: Path) -> None:
-    """Millions of records of nothing."""
+    """Millions of empty records."""
     content = record(200, b"") * 3_000_000
     chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
     path.write_bytes(rewritten(good, extra_chunks=[chunk] * 7))
 
 
 def empty_messages(good: Path, path: Path) -> None:
-    """Four million messages on a topic that is there."""
+    """Four million messages on an existing topic."""
     content = message_record(2, 0, b"") * 1_300_000
     chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
     path.write_bytes(rewritten(good, extra_chunks=[chunk] * 3))
@@ -111,7 +111,7 @@ def test_a_description_of_very_many_values(good: Path, commands: LimitedCommands
 
 
 def test_files_without_checksums_are_read(good: Path, tmp_path: Path) -> None:
-    """A checksum of 0 means that there is none (MCAP specification), which rosbag2 writes."""
+    """A checksum of 0 means that there is none (MCAP specification); rosbag2 writes it."""
     path = tmp_path / "bare.mcap"
     path.write_bytes(rewritten(good, with_checksums=False))
     assert struct.unpack("<I", path.read_bytes()[-12:-8]) == (0,)

@@ -1,4 +1,4 @@
-"""Workers that are lost while a run goes on, at every moment: it never ends well with less than was asked for."""
+"""Workers lost at any moment of a run: it never succeeds with fewer episodes than requested."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 
 NUM_EPISODES = 4
-"""Eight attempts of them in all; with two at a time the executor is asked for its size about thirty times."""
+"""Total attempts; with two at a time the executor is asked for its capacity about thirty times."""
 MOMENTS = [[*range(0, 12, 2), 44], pytest.param(range(45), marks=[pytest.mark.slow, pytest.mark.long])]
 InFlight = Literal["lost", "stuck", "finished"]
 
 
 @dataclass
 class Waning(Executor):
-    """Two workers in this process; none from one question for their number on, for so many questions or for ever."""
+    """Two workers in this process; from one capacity query on there are none, for a number of queries or forever."""
 
     folder: Path
     lost_at: int

@@ -1,7 +1,7 @@
-"""Datasets and HDF5 files of less than a megabyte that claim very much: one sentence, limited memory and CPU time.
+"""Datasets and HDF5 files of less than a megabyte that claim far more: one sentence, limited memory and CPU time.
 
-Texts of HDF5's attributes are in its global heap (HDF5 File Format Specification, III.E): a reference to one is its
-length, the address of a collection, and a number in it. The library cannot refuse what is changed there.
+HDF5 stores text of attributes in its global heap (HDF5 File Format Specification, III.E). A reference has a length, the
+address of a collection and an index in it. The library cannot detect changes there.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def a_long_task_again_and_again(root: Path) -> None:
 
 
 def long_tasks_in_a_list(root: Path) -> None:
-    """One text of 10 MB, a hundred times in one row: Arrow reads no part of a row."""
+    """One text of 10 MB, a hundred times in one row: Arrow reads whole rows only."""
     _set_column(root / EPISODES, "tasks", pa.array([["x" * 10_000_000] * 100, []], pa.list_(pa.string())))
 
 
@@ -177,7 +177,7 @@ def test_an_hdf5_file_claims_very_much(
 
 
 def test_whole_numbers_are_looked_at_within_limits(commands: LimitedCommands, tmp_path: Path) -> None:
-    """A column of 64 bits is looked through, whether float64 holds it; here it is one text of 50 MB in every row."""
+    """A 64-bit column is searched for integers that float64 cannot hold; here every row has one text of 50 MB."""
     root = write_foreign(tmp_path / "dataset")
     info = json.loads((root / "meta/info.json").read_text())
     info["features"]["counted"] = {"dtype": "int64", "shape": [1], "names": None}
@@ -190,7 +190,7 @@ def test_whole_numbers_are_looked_at_within_limits(commands: LimitedCommands, tm
 
 
 _SIZE_OF_FIRST = 24
-"""Where a collection says how long its first object is: after its own head (16), number, references and reserved."""
+"""Offset of the first object's length in a collection: header (16), index, references and reserved bytes."""
 
 
 @pytest.fixture

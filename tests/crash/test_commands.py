@@ -1,7 +1,7 @@
-"""Every command that writes: killed, out of disk, surprised, interrupted twice, two at once, without streams.
+"""Every command that writes: killed, out of disk, surprised, interrupted twice, run twice at once, without streams.
 
-A new command joins by one row. Whatever happens, its sources are unchanged, what it makes is absent, old or whole, and
-the same command again gives the undisturbed result and leaves nothing else behind.
+A new command joins with one row. In every case its sources are unchanged, and its outputs are absent, old or complete.
+The same command again gives the undisturbed result and leaves nothing else behind.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threade
 
 NAMES = [pytest.param(name, marks=row.runs) for name, row in ROWS.items()]
 KILLED = [pytest.param(name, marks=LONG if row.runs and row.old else row.runs) for name, row in ROWS.items()]
-"""Replacing is killed, too, which is more."""
+"""Replacing is killed as well, which includes this case."""
 REPLACING = [pytest.param(name, marks=row.runs or SLOW) for name, row in ROWS.items() if row.old]
 
 
@@ -49,8 +49,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def sources(made: Path, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
-    """What the command reads, compared afterwards."""
-    monkeypatch.setenv(VARIABLE, "off")  # else each command forks once more
+    """The command's inputs, compared afterwards."""
+    monkeypatch.setenv(VARIABLE, "off")  # otherwise each command forks once more
     for name in ROWS[request.node.callspec.params["name"]].needs:
         if not (made / name).exists():
             MAKERS[name](made)
@@ -60,7 +60,7 @@ def sources(made: Path, request: pytest.FixtureRequest, monkeypatch: pytest.Monk
 
 
 class Case:
-    """A row in a folder of its own, with the undisturbed result."""
+    """A row in a separate folder, with its undisturbed result."""
 
     def __init__(self, name: str, sources: Path, folder: Path, *, replaces: bool) -> None:
         self.row, self.folder, self._sources = ROWS[name], folder / "work", sources
@@ -89,7 +89,7 @@ class Case:
         return self._run(self.words, self.folder, **arguments)
 
     def start_anew(self) -> None:
-        """Empty the folder, and put the old into it."""
+        """Empty the folder, and write the old output into it."""
         shutil.rmtree(self.folder, ignore_errors=True)
         shutil.copytree(self._start, self.folder)
 
@@ -98,7 +98,7 @@ class Case:
         return sorted({int(moment) for moment in np.linspace(1, self.num_changes, count)})
 
     def state(self) -> dict[str, Any]:
-        """Each target that exists -> its content."""
+        """Each existing target -> its content."""
         found = [path for target in self.row.targets for path in sorted(self.folder.glob(target))]
         return {path.relative_to(self.folder).as_posix(): comparable(path) for path in found}
 
@@ -114,7 +114,7 @@ class Case:
             assert state in (self.before, self.after), told
 
     def check_again(self, told: object) -> None:
-        """Run the same command again, unless its result is there: it gives the undisturbed one, and nothing else."""
+        """Run the same command again, unless it has finished: it gives the undisturbed result, and nothing else."""
         replaces_again = self._replaces and self.row.flag == "--overwrite"
         if self.state() != self.after or replaces_again or self.row.resumes:
             ended = self.run()
@@ -124,7 +124,7 @@ class Case:
 
 
 def comparable(path: Path) -> Any:
-    """Content of a file or folder without what differs each time."""
+    """Content of a file or folder without the parts that differ in every run."""
     if path.suffix == ".rrd":
         return sorted((chunk.entity_path, chunk.num_rows) for chunk in RrdReader(path).stream())
     if path.name == "run.json":
@@ -162,9 +162,9 @@ def test_killed_at_eight_moments_of_replacing(name: str, sources: Path, tmp_path
 
 
 def check_full(case: Case, ended: Ended) -> None:
-    """Check what a command that fails on a full disk says and leaves, and that it gives its result where there is room.
+    """Check the message and leftovers of a command on a full disk, and its result on a disk with room.
 
-    It ends well where the disk has just enough room.
+    It succeeds where the disk has just enough room.
     """
     if ended.code == 0:
         assert case.state() == case.after
