@@ -95,12 +95,13 @@ class View:
             return replace(self, paths=paths)._view()
 
     def _view(self) -> int:
+        from demorec.datasets.options import select_episodes
         from demorec.view.save import numbered, save_comparison, save_each
-        from demorec.view.sources import find_episodes, select
+        from demorec.view.sources import find_episodes
         from demorec.view.viewer import need_screen
 
         found = find_episodes(self.paths, include_failures=self.include_failures, named=self.roles.named)
-        sources = select(found, self.episodes)
+        sources = select_episodes(found, self.episodes)
         tell_unfinished(self.paths)
         tell_incomplete(self.paths)
         tell(*dict.fromkeys(note for source in sources for note in source.notes))

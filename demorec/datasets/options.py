@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.core.errors import OptionError, check_option
+from demorec.core.errors import ConfigError, OptionError, check_option
 from demorec.episode.features import ACTION, STATE, ActionKind
 
 ProgressCallback = Callable[[int, int], None]
@@ -120,6 +120,29 @@ def parse_episodes(text: str) -> Callable[[int], bool]:
     if not parts:
         return lambda index: True
     return lambda index: any(index in part for part in parts)
+
+
+def select_episodes[E](episodes: Sequence[E], text: str) -> list[E]:
+    """Select "7", "0:20" or "3,5,8:10", numbered from 0; "" for all.
+
+    Raises:
+        ConfigError: Invalid text, or numbers out of range.
+    """
+    if not text:
+        return list(episodes)
+    chosen: list[E] = []
+    for word in text.split(","):
+        first, colon, last = word.partition(":")
+        try:
+            low = int(first or 0)
+            high = (int(last) if last else len(episodes)) if colon else low + 1
+        except ValueError as error:
+            raise OptionError("episodes", f"is {text!r}, expected numbers and ranges like 7 or 0:20.") from error
+        part = episodes[low:high] if 0 <= low < high else ()
+        if not part:
+            raise ConfigError(f"--episodes {word} is out of range: choose from 0 to {len(episodes) - 1}.")
+        chosen += part
+    return chosen
 
 
 @dataclass(frozen=True, kw_only=True)

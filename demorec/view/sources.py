@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.core.errors import ConfigError, OptionError
+from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import scene_of
@@ -136,26 +136,3 @@ def _joint_curves(recording: Recording, of_frames: Mapping[str, Curves]) -> dict
         values = np.array([getattr(sample, f"joint_{quantity}") for sample in samples])
         found[name] = Curves(time_ns=time_ns, values=values[:, : len(names)], names=names)
     return found
-
-
-def select(sources: Sequence[PlaybackSource], episodes: str) -> list[PlaybackSource]:
-    """Select "7", "0:20" or "3,5,8:10", numbered from 0; "" for all.
-
-    Raises:
-        ConfigError: No such numbers.
-    """
-    if not episodes:
-        return list(sources)
-    chosen: list[PlaybackSource] = []
-    for word in episodes.split(","):
-        first, colon, last = word.partition(":")
-        try:
-            low = int(first or 0)
-            high = (int(last) if last else len(sources)) if colon else low + 1
-        except ValueError as error:
-            raise OptionError("episodes", f"is {episodes!r}, expected numbers and ranges like 7 or 0:20.") from error
-        part = list(sources[low:high]) if 0 <= low < high else []
-        if not part:
-            raise ConfigError(f"--episodes {word} is out of range: choose from 0 to {len(sources) - 1}.")
-        chosen += part
-    return chosen

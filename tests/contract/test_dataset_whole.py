@@ -286,6 +286,35 @@ def test_the_other_episodes_are_imported(
         assert mine.read_bytes() == other.read_bytes()
 
 
+def test_chosen_episodes_are_imported(
+    spoilt: tuple[Path, Path], apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root, _ = spoilt
+    assert exit_code("import", "lerobot", root, "--episodes", "3,2:", "--out", tmp_path / "run") == 0
+    assert f"2 episodes, {2 * LENGTH} frames" in capsys.readouterr().out
+    assert exit_code("import", "lerobot", apart, "--out", tmp_path / "other") == 0
+    for mine, name in zip(recordings(tmp_path / "run"), ("episode_000002.mcap", "episode_000003.mcap"), strict=True):
+        assert mine.read_bytes() == (tmp_path / "other/episodes" / name).read_bytes()
+    # The same run takes the others later, as they are then.
+    assert exit_code("import", "lerobot", root, "--episodes", "0", "--out", tmp_path / "run") == 0
+    assert [file.stem for file in recordings(tmp_path / "run")] == [f"episode_00000{number}" for number in (0, 2, 3)]
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [("9", "--episodes 9 is out of range: choose from 0 to 3."), ("2:1", "--episodes 2:1 is out of range"),
+     ("-1", "--episodes -1 is out of range"), ("first", "expected numbers and ranges like 7 or 0:20.")],
+)  # fmt: skip
+def test_episodes_that_a_dataset_lacks_are_one_sentence(
+    words: str, told: str, apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert exit_code("import", "lerobot", apart, f"--episodes={words}", "--out", tmp_path / "run") == 2
+    error = capsys.readouterr().err
+    assert told in error
+    assert error.count("\n") == 1
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_other_episodes_are_edited(spoilt: tuple[Path, Path], apart: Path, tmp_path: Path) -> None:
     root, _ = spoilt
     assert exit_code("dataset", "drop", root, "--episodes", "1", "--out", tmp_path / "new") == 0

@@ -60,6 +60,8 @@ class Import:
     """Mapping file (TOML) from topics or datasets to features; required except for formats without --suggest."""
     out: OptionalTarget = None
     """Folder of the run, new or to be continued; required without --suggest."""
+    episodes: str = ""
+    """Episodes of a dataset to import, counted from 0: 7, or 0:20, or 3,5,8:10; default: all."""
     skip_bad: bool = False
     """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and unreadable episodes of a
     dataset; list them at the end and exit with 1. Otherwise the first of them ends the import.
@@ -130,6 +132,10 @@ class Import:
             raise ConfigError(
                 "--workers is for bags, and --skip-bad for bags and episodes of datasets: leave them out."
             )
+        if form.suggester and self.episodes:
+            raise ConfigError(
+                "--episodes belongs to datasets (demorec import lerobot DATASET --out RUN); mappings have [episodes]."
+            )
         if not form.suggester and (self.suggest or self.mapping is not None):
             name = name_of(form.kind)
             raise ConfigError(f"The import of {name} needs no mapping: leave --mapping and --suggest out.")
@@ -137,7 +143,8 @@ class Import:
     def _import_frames(self, form: SourceFormat, paths: Sequence[Path], out: Path) -> int:
         options: dict[str, Any] = {"video": self.video}
         if not form.suggester:
-            options |= {"motors": self.motors.named, "named": self.roles.named, "skip_bad": self.skip_bad}
+            options |= {"motors": self.motors.named, "named": self.roles.named}
+            options |= {"episodes": self.episodes, "skip_bad": self.skip_bad}
         result = cast("FramesImport", form.read(paths, self.mapping, out, **options))
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:

@@ -23,6 +23,7 @@ from demorec.datasets.lerobot.language import PERSISTENT
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.recorded_features import NOT_HELD, why_not_recorded
 from demorec.datasets.lerobot.recording import DatasetRecording
+from demorec.datasets.options import select_episodes
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.extensions.imports.description import importing_versions
@@ -43,6 +44,7 @@ def import_lerobot(
     video: VideoConfig | None = None,
     motors: Motors | None = None,
     named: NamedRoles = NO_NAMES,
+    episodes: str = "",
     skip_bad: bool = False,
 ) -> FramesImport:
     """Import a LeRobot dataset of format v3.0, v2.1 or v2.0, from any writer, to a run.
@@ -54,11 +56,12 @@ def import_lerobot(
         video: Encoding of images with packets that cannot pass through.
         motors: Servos whose values LeRobot recorded as state and action.
         named: Features whose role the user names; the recordings keep it.
+        episodes: Episodes to import, as in `select_episodes`.
         skip_bad: Leave out episodes that cannot be read; otherwise the first of them ends the import.
 
     Raises:
-        ConfigError: This is not a dataset or not one of these servos, it has data that recordings cannot hold, or the
-        folder holds other files.
+        ConfigError: This is not a dataset, not one of these servos or none of its episodes, it has data that
+        recordings cannot hold, or the folder holds other files.
         ExportError: It is damaged, or its timestamps do not match its rate.
         RecordingError: A number is not finite, or the disk is full.
     """
@@ -66,16 +69,18 @@ def import_lerobot(
     left_out = _left_out(dataset)
     skipped: dict[int, str] = {}
     noted = skipped if skip_bad else None
-    survey = _surveyed(dataset, noted)
+    numbers = sorted(set(select_episodes(range(len(dataset.places)), episodes)))
+    chosen = [(number, dataset.places[number]) for number in numbers]
+    survey = _surveyed(dataset, [place for _, place in chosen], noted)
     for name in survey.inexact:
         dataset.leave_out(name)
         left_out[name] = "it has whole numbers that float64 cannot hold"
     cameras, fates = _cameras(dataset, survey)
     digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
     with open_external_run(out, recovers=False) as folder:
-        indices = [place.episode_index for place in dataset.places if place.episode_index not in skipped]
+        indices = [place.episode_index for _, place in chosen if place.episode_index not in skipped]
         folder.planned = [planned_episode(n) for n in indices if not episode_path(folder.path, n).exists()]
-        for number, place in enumerate(dataset.places):
+        for number, place in chosen:
             if place.episode_index in skipped:
                 continue
             with _reading(place, noted):
@@ -85,7 +90,7 @@ def import_lerobot(
                 if recording.language_left_out:
                     left_out[PERSISTENT] = recording.language_left_out
     return FramesImport(
-        num_episodes=len(dataset.places) - len(skipped),
+        num_episodes=len(chosen) - len(skipped),
         num_frames=num_frames,
         num_new=num_new,
         cameras=fates,
@@ -135,13 +140,13 @@ class _Survey:
     reasons: dict[str, str] = field(default_factory=dict)
 
 
-def _surveyed(dataset: LeRobotFolder, skipped: dict[int, str] | None) -> _Survey:
-    """Check the integers and the encoded images of every episode."""
+def _surveyed(dataset: LeRobotFolder, places: Sequence[EpisodePlace], skipped: dict[int, str] | None) -> _Survey:
+    """Check the integers and the encoded images of these episodes."""
     survey = _Survey()
     types = {feature.name: dataset.info.features[feature.name].dtype for feature in dataset.features}
     whole = [name for name, dtype in types.items() if dtype in ("int64", "uint64")]
     rows = dataset.rows(whole)
-    for place in dataset.places:
+    for place in places:
         with _reading(place, skipped):
             if place.length < 1:
                 raise ExportError(f"Episode {place.episode_index} of the dataset has no frames: {dataset.root}")
