@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -509,6 +510,31 @@ def test_the_state_of_isaac_lab_is_the_absolute_one(robot: str, tmp_path: Path) 
             np.testing.assert_array_equal(table.features["observation.ee_pose"], pose)
             names = {feature.name: feature.names for feature in info.features}
             assert names["observation.ee_pose"][3:] == ("qw", "qx", "qy", "qz")
+
+
+@pytest.mark.parametrize("layout", ["isaac", "root", "aloha", "unknown"])
+def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "demo.hdf5"
+    if layout == "unknown":
+        with h5py.File(path, "w") as file:
+            file["log/values"] = np.zeros((3, 2))
+    else:
+        {"isaac": write_isaac, "root": write_groups_at_root, "aloha": write_aloha}[layout](path)
+    with h5py.File(path) as file:
+        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "root": ("demo_0", 3, 15), "aloha": ("/", 1, 8),
+                              "unknown": ("/", None, 0)}[layout]  # fmt: skip
+        expected: dict[str, list[int]] = {}
+        file[first].visititems(
+            lambda name, item: expected.update({name: list(item.shape)}) if isinstance(item, h5py.Dataset) else None
+        )
+    assert exit_code("info", path, "--json") == 0
+    plain = json.loads(capsys.readouterr().out)
+    assert {row["dataset"]: row["shape"] for row in plain["datasets"]} == expected
+    assert (plain["episodes"], plain["rows"], plain["rate"]) == (count, rows, None)
+    assert exit_code("info", path) == 0
+    assert "unknown: write fps under [clock] in the mapping, and give it to the import by --mapping" in (
+        capsys.readouterr().out
+    )
 
 
 @pytest.mark.parametrize("action", ["action", "actions"])

@@ -260,10 +260,9 @@ def test_what_was_left_out_and_the_mapping_are_reported(
     places: dict[str, list[Path | str]], scratch: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (source,) = places["robomimic"]
-    assert exit_code("info", source, "--json") == 0
+    assert exit_code("check", source) in (0, 1)  # the small file has faults
     printed = capsys.readouterr()
-    plain = json.loads(printed.out)
-    assert plain["path"] == str(source)
+    assert printed.out.startswith(f"{source}: ")
     assert f"{source}: read by the suggested mapping (observation.state from obs/robot0_joint_pos and" in printed.err
     assert "because the mapping does not name them: dones, rewards, states, next_obs." in printed.err
 

@@ -8,6 +8,7 @@ import numpy as np
 
 from demorec.core.geometry import signs_of_course
 from demorec.episode.features import ACTION
+from demorec.extensions.imports.bag import EPOCH_S
 from demorec.extensions.imports.clock import NS, SKEW_S, Numbers, Timeline
 from demorec.extensions.imports.findings import (
     GAP,
@@ -21,10 +22,6 @@ from demorec.extensions.imports.findings import (
 )
 from demorec.extensions.imports.rows import RATE, EpisodeRows, Timelines
 
-_EPOCH_S = 1e8
-"""Difference between two clocks that implies another epoch: three years. No clock is that wrong, so one of the two
-counts from another epoch.
-"""
 _YEAR_S = 365.25 * 86_400
 _RESTS = 0.02
 """Maximum range of a resting robot's elements, relative to their whole range."""
@@ -82,7 +79,7 @@ def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
 def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
     """Return the streams with header times if all of these have another epoch than the log times."""
     known = [line for line in lines if len(line.skews_ns)]
-    return known if all(abs(np.median(line.skews_ns)) >= _EPOCH_S * NS for line in known) else []
+    return known if all(abs(np.median(line.skews_ns)) >= EPOCH_S * NS for line in known) else []
 
 
 def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:

@@ -1,4 +1,4 @@
-"""Output of `demorec info` about bags, and about the bags and episodes that an import left out of a run."""
+"""Output of `demorec info` about bags and HDF5 files, and about the bags and episodes that an import left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from demorec.extensions.imports.bag import bags_in, summarize_bag
 from demorec.extensions.imports.import_file import load_import_file
 
 _MOST_PROBLEMS = 5
-"""Maximum problems listed for a bag."""
+"""Maximum problems listed for a bag or file."""
 
 
 def describe_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
@@ -36,6 +36,27 @@ def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
         rows.append((topic["topic"], str(topic["messages"]), rate, topic["type"]))
     lines = [*aligned(facts), "", *aligned(rows)]
     return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
+
+
+def describe_hdf5(path: Path) -> tuple[dict[str, Any], list[str]]:
+    """Describe an HDF5 file by its first episode."""
+    from demorec.extensions.imports.hdf5_suggest import summarize_hdf5  # needs h5py
+
+    plain = summarize_hdf5(path)
+    suggest = f"demorec import hdf5 {path} --suggest > mapping.toml"
+    layout_is_known, rate = plain["episodes"] is not None, plain["rate"]
+    facts = [("HDF5 file", f"{path} ({size_in_words(plain['bytes'])})")]
+    length = f"{counted(plain['episodes'], 'episode')}, {plain['rows']} rows" if layout_is_known else "unknown layout"
+    facts.append(("length", length))
+    missing = "unknown: write fps under [clock] in the mapping, and give it to the import by --mapping"
+    facts.append(("rate", missing if rate is None else f"{rate:g} Hz"))
+    facts += [("problem", problem) for problem in plain["problems"][:_MOST_PROBLEMS]]
+    rows = [("dataset", "type", "shape")]
+    rows += [(one["dataset"], one["dtype"], "x".join(map(str, one["shape"]))) for one in plain["datasets"]]
+    end = (
+        f"{suggest} writes a mapping of these datasets." if layout_is_known else "docs/import.md explains the mapping."
+    )
+    return plain, [*aligned(facts), "", *aligned(rows), "", end]
 
 
 def dropped_rows(path: Path) -> list[dict[str, str]]:

@@ -34,6 +34,7 @@ HDF5 = SourceFormat(
     importer="demorec.extensions.imports.hdf5_import:import_hdf5",
     suggester="demorec.extensions.imports.hdf5_suggest:suggested_hdf5_mapping",
     reviewer="demorec.extensions.imports.formats:review_hdf5_mapping",
+    describer="demorec.extensions.imports.describe:describe_hdf5",
 )
 
 

@@ -10,6 +10,7 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -105,6 +106,40 @@ class _Contents:
         """Whether it holds rows of numbers."""
         array = self.arrays[name]
         return len(array.shape) <= 2 and not array.is_ragged and name not in self.cameras
+
+
+def summarize_hdf5(path: Path) -> dict[str, Any]:
+    """Summarise a file for `demorec info --json`: episodes, rate, and datasets of the first episode.
+
+    Of an unknown layout all datasets are listed, and the number of episodes is None.
+
+    Raises:
+        Hdf5Error: It cannot be read.
+    """
+    with ForeignFile(path) as file:
+        layout = _layout_of(file)
+        places = [""] if layout is None else episode_places(file, Episodes(group=layout.group))
+        contents = _Contents(file, places[0])
+        actions = [name for name in contents.arrays if layout is not None and name in layout.actions]
+        problems, rows = contents.unusable, 0
+        for place in places if actions else ():
+            try:
+                rows += len(file.array(f"{place}/{actions[0]}".lstrip("/")))
+            except Hdf5Error as error:
+                problems.append(without_path(error, path))
+        return {
+            "kind": "hdf5",
+            "path": str(path),
+            "bytes": path.stat().st_size,
+            "episodes": None if layout is None else len(places),
+            "rows": rows,
+            "rate": stated_rate(file, places[0]),
+            "datasets": [
+                {"dataset": name, "dtype": array.dtype.name, "shape": list(array.shape)}
+                for name, array in contents.arrays.items()
+            ],
+            "problems": problems,
+        }
 
 
 def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
