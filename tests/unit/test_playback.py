@@ -14,6 +14,7 @@ from support.recording import make_episode, write_episode
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
+from demorec.datasets.options import select_episodes
 from demorec.episode.scene import Body, Shape
 from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
@@ -25,7 +26,7 @@ from demorec.view.meshes import mesh_file
 from demorec.view.programs import viewer_environment
 from demorec.view.save import save, save_comparison
 from demorec.view.scene import differences
-from demorec.view.sources import find_episodes, select
+from demorec.view.sources import find_episodes
 
 
 @pytest.fixture(scope="module")
@@ -253,9 +254,9 @@ def test_episodes_are_chosen_by_number(tmp_path: Path) -> None:
         (folder / f"episode_{index:06d}.mcap").touch()
     sources = find_episodes([tmp_path])
     assert len(sources) == 5
-    assert select(sources, "") == sources
-    assert select(sources, "1:3") == sources[1:3]
-    assert select(sources, "4,0:2") == [sources[4], *sources[:2]]
+    assert select_episodes(sources, "") == sources
+    assert select_episodes(sources, "1:3") == sources[1:3]
+    assert select_episodes(sources, "4,0:2") == [sources[4], *sources[:2]]
     for bad in ("5", "2:2", "-1", "x", "0:2,9"):
         with pytest.raises(ConfigError):
-            select(sources, bad)
+            select_episodes(sources, bad)
