@@ -519,7 +519,9 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
         with h5py.File(path, "w") as file:
             file["log/values"] = np.zeros((3, 2))
     else:
-        {"isaac": write_isaac, "root": write_groups_at_root, "aloha": write_aloha}[layout](path)
+        writers: dict[str, Callable[[Path], Path]]
+        writers = {"isaac": write_isaac, "root": write_groups_at_root, "aloha": write_aloha}
+        writers[layout](path)
     with h5py.File(path) as file:
         first, count, rows = {"isaac": ("data/demo_0", 2, 12), "root": ("demo_0", 3, 15), "aloha": ("/", 1, 8),
                               "unknown": ("/", None, 0)}[layout]  # fmt: skip
