@@ -196,7 +196,7 @@ def test_a_full_disk(name: str, sources: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=row.runs or SLOW) for name, row in ROWS.items()])
 def test_a_full_file_system(name: str, sources: Path, tmp_path: Path) -> None:
-    """A real one, with room for nothing, for some and for most of what the command writes."""
+    """A real file system, with no room, and with room for some and for most of the output."""
 
     def work(disk: SmallDisk) -> None:
         for replaces in {False, bool(ROWS[name].old)}:
@@ -247,7 +247,7 @@ def test_a_target_that_appears_meanwhile_stays(name: str, sources: Path, tmp_pat
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 def test_two_at_once(name: str, sources: Path, tmp_path: Path) -> None:
-    """One of them wins, and the other one says why it does not."""
+    """One of them wins, and the other one reports the reason."""
     case = Case(name, sources, tmp_path, replaces=False)
     case.start_anew()
     reached, go_on = os.pipe(), os.pipe()
@@ -290,7 +290,7 @@ def test_a_second_interrupt_during_the_clean_up(name: str, sources: Path, tmp_pa
 
 @pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW if name == "split" else LONG) for name in ROWS])
 def test_closed_streams(name: str, sources: Path, tmp_path: Path) -> None:
-    """Nobody hears the answer, and nothing is half made."""
+    """The output is lost, and no target is left incomplete."""
     case = Case(name, sources, tmp_path, replaces=False)
     program = [sys.executable, "-m", "demorec", *case.words]
     for line in ('"$@" >&-', '"$@" 2>&-', '"$@" | true; exit ${PIPESTATUS[0]}'):

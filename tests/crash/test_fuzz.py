@@ -1,4 +1,4 @@
-"""Bags, datasets, HDF5 files, mappings, runs, recordings and policies, fuzzed: a sentence or success within bounds."""
+"""Fuzzed bags, datasets, HDF5 files, mappings, runs, recordings and policies: a sentence or success, within limits."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The real job killed at random moments: the same data in the end."""
+"""A complete run that is killed at random moments has the same data in the end."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module", params=[6, pytest.param(80, marks=pytest.mark.long)])
 def reference(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Made by one worker without any trouble."""
+    """A run by one undisturbed worker."""
     out = tmp_path_factory.mktemp("reference") / "run"
     subprocess.run(generation(out, request.param, workers=1), check=True, stdout=subprocess.DEVNULL)
     return out

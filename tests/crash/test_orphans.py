@@ -1,4 +1,4 @@
-"""Commands that work in several processes, killed with SIGKILL in the middle: no descendant lives on, no false end."""
+"""Commands with several processes, killed with SIGKILL: no descendant survives, and no success is reported."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ COMMANDS = ["export", "import", *(pytest.param(name, marks=pytest.mark.long) for
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run, and beside it bags to be imported."""
+    """A run and, next to it, bags to be imported."""
     run = make_run(tmp_path_factory.mktemp("orphans") / "run", [30] * 12)
     bag_mappings.write_mapping(bag_mappings.SO101, run.with_name("robot.toml"))
     run.with_name("bags").mkdir()
@@ -41,7 +41,7 @@ def command(run: Path, out: Path, name: str) -> list[str]:
 
 
 def busy(run: Path, out: Path, name: str) -> subprocess.Popen[str]:
-    """The command as soon as two of its workers are there."""
+    """Start the command and return once two of its workers run."""
     process = subprocess.Popen(
         command(run, out, name), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True, env={**os.environ}
     )
@@ -55,7 +55,7 @@ def busy(run: Path, out: Path, name: str) -> subprocess.Popen[str]:
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str) -> None:
-    """Killed as soon as two workers are there: they are starting, working or waiting for work."""
+    """The command is killed once two workers run: they are starting, working or waiting for work."""
     process = busy(run, tmp_path, name)
     descendants = psutil.Process(process.pid).children(recursive=True)
     process.kill()

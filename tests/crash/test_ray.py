@@ -1,4 +1,4 @@
-"""The Ray executor on a real cluster of two nodes: the same run as locally, also when nodes and workers are killed."""
+"""The Ray executor on a real cluster of two nodes: same run as a local one, even when nodes and workers are killed."""
 
 from __future__ import annotations
 
@@ -48,15 +48,15 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[object]:
-    """Two nodes with one CPU each, for all tests; no process of it is left behind."""
+    """Two nodes with one CPU each, for all tests; no process of the cluster survives them."""
     import ray
     from ray.cluster_utils import Cluster
 
     with pytest.MonkeyPatch.context() as patch:
-        # The nodes' workers import the stand-in makers and the package under test as this process does.
+        # The nodes' workers import the stand-in makers and the package under test like this process.
         patch.setenv("PYTHONPATH", os.pathsep.join([str(Path(__file__).parents[1]), *sys.path]))
-        patch.setenv("RAY_worker_niceness", "0")  # 15 by default, which starves beside other tests
-        # Nodes as of Ray without its dashboard: its agent takes seconds to start, and after 15 s a node gives up.
+        patch.setenv("RAY_worker_niceness", "0")  # the default of 15 is too short next to other tests
+        # Nodes without Ray's dashboard: its agent takes seconds to start, and a node gives up after 15 s.
         patch.setattr(ray._private.utils, "get_dashboard_dependency_error", lambda: "left out")
         nodes = Cluster()
         add_node(nodes, include_dashboard=False)
@@ -73,7 +73,7 @@ def cluster() -> Iterator[object]:
 
 
 def processes_of_ray(above: int | None = None) -> set[psutil.Process]:
-    """Those that descend from this process, or from the one of this number: nodes, their services, workers."""
+    """Descendants of this process, or of the one with the given PID: nodes, their services, workers."""
     found = set()
     for process in psutil.Process(above).children(recursive=True):
         with suppress(psutil.Error):
@@ -84,15 +84,15 @@ def processes_of_ray(above: int | None = None) -> set[psutil.Process]:
 
 
 def add_node(cluster: Any, **options: object) -> object:
-    """One more node, with one CPU and no services that these tests have no use for. Returns when it is ready.
+    """Add a node with one CPU and without unneeded services. Returns when it is ready.
 
-    A node gives up when its services need over 15 s to start, so a busy machine gets five tries.
+    A node gives up when its services need over 15 s to start, so a busy machine gets five attempts.
     """
     for tries_left in reversed(range(5)):
         before = processes_of_ray()
         try:
             return cluster.add_node(num_cpus=1, include_log_monitor=False, no_monitor=True, **options)
-        except Exception:  # Ray has no narrower one for this
+        except Exception:  # Ray raises no more specific error
             for process in processes_of_ray() - before:
                 with suppress(psutil.Error):
                     process.kill()
@@ -102,7 +102,7 @@ def add_node(cluster: Any, **options: object) -> object:
 
 
 def when_finished(out: Path, count: int, act: Callable[[], None]) -> threading.Thread:
-    """Do something when so many episodes are there."""
+    """Call a function once the given number of episodes exist."""
 
     def wait() -> None:
         while len(list((out / "episodes").glob("*"))) < count:
@@ -115,7 +115,7 @@ def when_finished(out: Path, count: int, act: Callable[[], None]) -> threading.T
 
 
 class Killer:
-    """SIGKILL for workers and a node, each when so many episodes of a run are there."""
+    """Kill workers and a node with SIGKILL once the run has the given numbers of episodes."""
 
     def __init__(self, out: Path) -> None:
         self.workers: list[int] = []
@@ -138,7 +138,7 @@ class Killer:
             thread.join(timeout=60)
 
     def _kill_worker(self) -> None:
-        """One that carries out a task now."""
+        """Kill a worker that is executing a task."""
         for process in psutil.process_iter(["cmdline"]):
             if (process.info["cmdline"] or [""])[0].startswith("ray::_attempt") and process.pid not in self.workers:
                 process.kill()
@@ -206,7 +206,9 @@ def test_one_digest_for_any_workers_ray_and_twelve_kills(tmp_path: Path) -> None
 
 @pytest.mark.long
 def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path: Path) -> None:
-    """A node ends with its agent (of the dashboard), which is among the first that a lack of memory takes."""
+    """A node ends with its dashboard agent, which is one of the first processes that the kernel kills when memory runs
+    out.
+    """
     number = 40
     one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=number, workers=2))
     out, entry = tmp_path / "ray", "from demorec.cli import generate_dataset_main as main; main()"
@@ -241,7 +243,7 @@ def test_a_run_begun_on_ray_goes_on_without_it(tmp_path: Path, cluster: object, 
 
 
 def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
-    # A node that an earlier test killed may still be counted.
+    # Ray may still count a node that an earlier test killed.
     with pytest.raises(ConfigError, match=r"has \d CPUs and 0 GPUs, too few for one worker with 1 CPUs and 1 GPUs"):
         run_on_ray(tmp_path / "run", maker="make", gpus_per_worker=1.0)
 
@@ -257,7 +259,7 @@ def test_an_unreachable_cluster_is_told_at_once(address: str, monkeypatch: pytes
 
 
 def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ray.is_initialized", lambda: False)  # whatever the tests before have begun
+    monkeypatch.setattr("ray.is_initialized", lambda: False)  # anything that earlier tests began
     with pytest.raises(ConfigError, match="cannot be reached"):
         run_on_ray(tmp_path / "run", maker="make", address="127.0.0.1:1")
     assert list(tmp_path.iterdir()) == []

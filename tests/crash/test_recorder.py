@@ -1,6 +1,6 @@
-"""A program that records with `Recorder`: killed, out of disk, surprised, interrupted twice, two at once.
+"""A program that records with `Recorder`: killed, out of disk, surprised, interrupted twice, run twice at once.
 
-It records episodes until there are three. Finished episodes never change, one that was cut off is made whole when the
+It records until there are three episodes. Finished episodes never change, one that was cut off is completed when the
 program runs again, and no other file is overwritten.
 """
 
@@ -31,7 +31,7 @@ pytestmark = [
 
 
 def record(words: list[str]) -> None:
-    """Record into the folder that the only word names, and end as a command does."""
+    """Record into the folder given as the only argument, and exit as a command does."""
     stamps = count(0, 1_000_000_000 // FPS)
     pixels = np.zeros((16, 16, 3), np.uint8)
     try:
@@ -73,7 +73,7 @@ def num_frames(path: Path) -> int:
 
 @pytest.fixture
 def num_changes(tmp_path: Path) -> int:
-    """Changes of the file system by a program that is not disturbed."""
+    """Number of file-system changes of an undisturbed program."""
     (tmp_path / "undisturbed").mkdir()
     ended = run(tmp_path / "undisturbed")
     assert ended.code == 0
@@ -87,7 +87,7 @@ def interrupt_twice(number: int) -> None:
 
 
 def check_again(folder: Path, told: object) -> None:
-    """Run the program again: finished episodes stay, those cut off are kept, and nothing unfinished is left."""
+    """Run the program again: finished episodes stay, those cut off are completed, and nothing unfinished is left."""
     before = finished(folder)
     ended = run(folder)
     assert ended.code == 0, (told, ended.said)

@@ -1,4 +1,4 @@
-"""Damaged files: whatever is done to a recording, reading it gives one sentence or the very data that were written."""
+"""Damaged files: reading any damaged recording gives one sentence or exactly the data that were written."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def zero_a_sector(data: bytes, rng: random.Random) -> bytes:
 
 
 def damage_the_index(data: bytes, rng: random.Random) -> bytes:
-    """A bit in the last fifth, where the summary is."""
+    """Flip a bit in the last fifth of the file, which holds the summary."""
     at = rng.randrange(len(data) * 4 // 5, len(data))
     return data[:at] + bytes([data[at] ^ (1 << rng.randrange(8))]) + data[at + 1 :]
 
@@ -47,7 +47,7 @@ DAMAGES: tuple[Damage, ...] = (
 
 
 def content(path: Path) -> tuple[Any, ...]:
-    """Everything that a recording gives, read through every method."""
+    """Everything in a recording, read through every method."""
     with Recording(path) as recording:
         statistics = tuple(
             (camera, recording.pixel_statistics(camera).counts.tobytes(), recording.pixel_statistics(camera).num_images)
@@ -67,12 +67,12 @@ def content(path: Path) -> tuple[Any, ...]:
 
 
 def is_one_sentence(message: str, path: Path) -> bool:
-    """A message of one line that ends with the path."""
+    """Whether a message is one line that ends with the path."""
     return "\n" not in message and message.endswith(str(path)) and "Traceback" not in message
 
 
 class Fuzz:
-    """One recording of each codec, and what reading damaged copies of them gave."""
+    """One recording of each codec, and the results of reading damaged copies of them."""
 
     def __init__(self, folder: Path) -> None:
         self.target = folder / "damaged.mcap"
@@ -113,7 +113,7 @@ class Fuzz:
             self.results["refused in one sentence"] += 1
 
     def try_recover(self, damage: Damage, seed: int) -> None:
-        """Recovering gives a prefix of the episode or one sentence."""
+        """Recover a file: the result must be a prefix of the episode or one sentence."""
         rng = random.Random(seed)
         original, expected = self.originals[seed % len(self.originals)]
         self.target.write_bytes(damage(original, rng))

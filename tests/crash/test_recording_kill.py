@@ -1,7 +1,8 @@
 """`kill -9` at any moment of writing loses at most the last second of the episode.
 
-Each child writes a long episode and notes in a pipe how many frames it has handed to the recorder; it is killed
-after a random number of them, a few milliseconds later, and what `recover` keeps is compared with what it had written.
+Each child writes a long episode and notes in a pipe the number of frames that it has handed to the recorder. It is
+killed a few milliseconds after a random number of them, and the frames that `recover` keeps are compared with those
+written.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ LONG = [pytest.mark.slow, pytest.mark.long]
 
 
 def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
-    """Write frames, each as soon as the one before is written, and note every one in the pipe."""
+    """Write frames, each as soon as the previous one is written, and note every one in the pipe."""
     os.write(notes, b"r")
     with EpisodeWriter(path, info, video=video) as writer:
         for frame in frames:
@@ -49,7 +50,7 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
         finally:
             os._exit(0)
     os.close(write_end)
-    written = -1  # the first note says that it has started
+    written = -1  # the first note means that it has started
     try:
         while written < after:
             noted = os.read(read_end, after - written)
@@ -68,7 +69,7 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
 def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)
     info, frames, _ = make_episode(num_frames=2 * MOST_FRAMES, fps=FPS)
-    write_episode(tmp_path / "warm.mcap", num_frames=2)  # what is compiled or loaded once is not what is killed
+    write_episode(tmp_path / "warm.mcap", num_frames=2)  # compile and load libraries first
     lost, kept_nothing, written_total = [], 0, 0
     for number in range(kills):
         part = tmp_path / f"{number}.mcap.part"

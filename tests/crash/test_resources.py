@@ -1,4 +1,4 @@
-"""Too little memory and too few files: told as such, and never as damage of what was to be read."""
+"""Too little memory and too few file descriptors: reported as such, never as damaged input."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from demorec.runs.recorded import inspect_recording
     "error",
     [
         MemoryError(),
-        zstandard.ZstdError("decompression error: Allocation error : not enough memory"),  # its words under ulimit -v
+        zstandard.ZstdError("decompression error: Allocation error : not enough memory"),  # its message under ulimit -v
         OSError("libllvmlite.so: failed to map segment from shared object"),
     ],
 )

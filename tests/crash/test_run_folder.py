@@ -1,4 +1,4 @@
-"""What lies in a run's folder: whatever it is, it is refused, set aside or left alone, and never lost."""
+"""Unexpected contents of a run's folder are refused, set aside or left alone, and never lost."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ from demorec.runs.run_file import load_run_file
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """Of 8 episodes."""
+    """A run of 8 episodes."""
     return run_fake(tmp_path_factory.mktemp("reference") / "run")
 
 
 def content_of(folder: Path) -> dict[str, bytes | None]:
-    """Everything below a folder: relative path -> bytes, None for what is no file."""
+    """Relative path below a folder -> bytes, None for folders and special files."""
     return {str(p.relative_to(folder)): p.read_bytes() if p.is_file() else None for p in folder.rglob("*")}
 
 
@@ -75,7 +75,7 @@ def test_a_refused_request_writes_nothing(
 def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path: Path) -> None:
     run, stranger = tmp_path / "run", tmp_path / "stranger"
     run_fake(run, num_episodes=1)
-    (run / ".lock").unlink()  # as after a copy that leaves such files out
+    (run / ".lock").unlink()  # as after a copy that skips such files
     stranger.mkdir()
     (stranger / "thesis.tex").write_text("mine")
     before = content_of(tmp_path)
@@ -104,7 +104,7 @@ def make_folder(path: Path) -> None:
 
 
 def make_socket(path: Path) -> None:
-    with socket.socket(socket.AF_UNIX) as made, chdir(path.parent):  # an address of a socket may have 107 bytes
+    with socket.socket(socket.AF_UNIX) as made, chdir(path.parent):  # a socket's address is limited to 107 bytes
         made.bind(path.name)
 
 
@@ -200,7 +200,7 @@ def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(
 
 
 def test_what_a_lost_worker_left_goes_when_its_episode_is_made(tmp_path: Path, reference: RunResult) -> None:
-    """Not what is being written, what is of an episode that was not made, or what somebody has put there."""
+    """Files that are being written, third-party files and files of episodes that were not made are kept."""
     out = Path(shutil.copytree(reference.folder, tmp_path / "run"))
     left = {
         "node-1-0/episode_000002.attempt_0.mcap.part": False,
@@ -222,7 +222,7 @@ def test_what_a_lost_worker_left_goes_when_its_episode_is_made(tmp_path: Path, r
 
 @pytest.mark.parametrize("there", ["a text", "another episode", "the same episode"])
 def test_a_recording_takes_the_name_of_no_other_file(tmp_path: Path, there: str) -> None:
-    """As a worker of generate-dataset or evaluate gives it."""
+    """As a worker of generate or evaluate chooses it."""
     made, target = write_episode(tmp_path / "made.mcap", num_frames=3), tmp_path / "episode.mcap"
     if there == "a text":
         target.write_text("years of work")

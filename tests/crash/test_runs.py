@@ -1,4 +1,4 @@
-"""Runs with real processes and stand-in recordings: resumed, killed, interrupted, with every fault that happens."""
+"""Runs with real processes and stand-in recordings: resumed, killed, interrupted, with every fault that occurs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from demorec.runs.run_file import load_run_file
 pytestmark = pytest.mark.slow
 
 PATIENCE_S = 120.0
-"""No measure of anything: after so long, what a test waits for will not happen on the busiest machine."""
+"""Not a measurement: an event that takes longer will not happen even on the busiest machine."""
 
 
 def driver(out: Path, maker: str, num_episodes: int, grace_s: float = GRACE_S) -> subprocess.Popen[str]:
@@ -52,14 +52,14 @@ def assert_gone(processes: list[psutil.Process]) -> None:
 
 
 def wait_until_busy(process: subprocess.Popen[str], out: Path) -> None:
-    """Until both workers have begun an episode that never ends."""
+    """Wait until both workers have begun an episode that never ends."""
     wait_for(lambda: len(list((out / "unfinished").glob("busy-*"))) == 2 or process.poll() is not None)
     assert process.poll() is None, process.communicate()
 
 
 @pytest.fixture(scope="module")
 def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
-    """Of 8 episodes, made by one worker without any trouble."""
+    """A run of 8 episodes by one undisturbed worker."""
     result = run_fake(tmp_path_factory.mktemp("reference") / "run", workers=1)
     assert attempts_of(result) == expected_attempts(8)
     assert any(not success for success in attempts_of(result).values()), "the seed must make some attempt fail"
@@ -126,7 +126,7 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
 
 @pytest.mark.long
 def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path: Path) -> None:
-    """5000 were asked for and some were made; then 3 are asked for."""
+    """The first command requested 5000 episodes and made some; the second requests 3."""
     out = tmp_path / "run"
     with pytest.raises(GenerationError):
         run_fake(out, num_episodes=5000, maker="die_always", workers=1)
@@ -294,7 +294,7 @@ def test_the_first_interrupt_lets_current_episodes_end(
 
 
 def test_a_signal_to_the_whole_group_is_left_to_the_driver(tmp_path: Path) -> None:
-    """As `timeout` sends it; the workers get it first, so that they would be lost if they listened to it."""
+    """As `timeout` sends it. The workers get it first, and would be lost if they reacted to it."""
     out = tmp_path / "run"
     process = driver(out, "make_slowly", 8, grace_s=PATIENCE_S)
     wait_for(lambda: num_finished(out) >= 1)
@@ -328,7 +328,7 @@ def test_the_second_interrupt_ends_at_once(tmp_path: Path) -> None:
     workers = psutil.Process(process.pid).children(recursive=True)
     process.send_signal(signal.SIGINT)
     assert process.stdout is not None
-    assert process.stdout.readline().startswith("Interrupted")  # two signals at once may count as one
+    assert process.stdout.readline().startswith("Interrupted")  # two simultaneous signals may count as one
     process.send_signal(signal.SIGINT)
     process.communicate(timeout=PATIENCE_S)
     assert process.returncode != 0

@@ -1,4 +1,4 @@
-"""No edit changes what was not asked for: every column, file and packet before and after, by PyArrow and libav."""
+"""Edits change only what they are asked to: every column, file and packet before and after, by PyArrow and libav."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from support.stored_episodes import StoredEpisode, is_counted, same_values, seco
 
 NEW_TASK = "sweep the table"
 Slice = tuple[int, int, int]
-"""Episode, first frame and frame behind the last one."""
+"""Episode, first frame and frame after the last one."""
 
 
 def words_of(operation: str, source: Path, out: Path, drawn: DrawnDataset) -> list[str]:
-    """The words of a command."""
+    """Arguments of a command."""
     count = len(drawn.lengths)
     flags = {
         "select": ["--episodes", "1"],
@@ -39,7 +39,7 @@ def words_of(operation: str, source: Path, out: Path, drawn: DrawnDataset) -> li
 
 
 def slices_of(operation: str, drawn: DrawnDataset) -> list[Slice]:
-    """What each episode of the result is; of shuffle and split in the source's order."""
+    """Source slice of each resulting episode; for shuffle and split in the source's order."""
     whole = [(number, 0, length) for number, length in enumerate(drawn.lengths)]
     if operation == "select":
         return whole[1:2]
@@ -59,7 +59,7 @@ OPERATIONS = (
 
 
 def compare(before: StoredEpisode, after: StoredEpisode, part: Slice, operation: str, drawn: DrawnDataset) -> None:
-    """Assert that an episode of the result is a part of one before, but for what was asked for."""
+    """Check that an episode of the result is a slice of a source episode, except for the requested change."""
     number, first, last = part
     expected = before.cut(first, last)
     if operation == "rename":
@@ -90,7 +90,7 @@ def compare(before: StoredEpisode, after: StoredEpisode, part: Slice, operation:
 
 
 def check_files(source: Path, out: Path, operation: str) -> None:
-    """Assert that features and unknown files are those of before."""
+    """Check that features and unknown files are unchanged."""
     for name in ("meta/notes of ours.txt", "extra/deep/calibration.bin"):
         assert (out / name).read_bytes() == (source / name).read_bytes()
     old, new = (json.loads((root / "meta/info.json").read_text())["features"] for root in (source, out))
@@ -102,7 +102,7 @@ def check_files(source: Path, out: Path, operation: str) -> None:
 
 
 def check_references(source: Path, out: Path, before: StoredEpisode, after: StoredEpisode, part: Slice) -> None:
-    """Assert that numbers of tasks stand for the texts of before."""
+    """Check that task numbers refer to the same texts as before."""
     _, first, last = part
     old, new = task_texts(source), task_texts(out)
     was = [old[number] for number in before.columns[REFERENCE][first:last]]
@@ -110,7 +110,7 @@ def check_references(source: Path, out: Path, before: StoredEpisode, after: Stor
 
 
 def found_slice(after: StoredEpisode, before: list[StoredEpisode], parts: list[Slice]) -> Slice:
-    """The part that an episode of the result is, by the first number of its state."""
+    """Find the source slice of a resulting episode by the first value of its state."""
     key = after.columns[STATE][0][0]
     return next(part for part in parts if before[part[0]].columns[STATE][part[1]][0] == key)
 

@@ -1,4 +1,4 @@
-"""Laws of rigid transforms, with SciPy as the independent opinion."""
+"""Properties of rigid transforms, verified with SciPy."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which message a row takes, against the plainest way to find it."""
+"""The message that a row takes, compared with a brute-force search."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which images rows hold: none is lost that a reader could show which takes the last one before each row."""
+"""Images of rows: none is lost that a reader which takes the latest image before each row could show."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ ROUNDINGS: dict[str, Callable[[Fraction], int]] = {
     "microseconds down": lambda time: 1000 * floor(time / 1000),
 }
 PATIENT: dict[str, Any] = {"suppress_health_check": [HealthCheck.too_slow]}
-"""On a busy machine."""
+"""Settings for a busy machine."""
 SOURCE = Source(topic="/joints", field="position")
 
 
 def _moments(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> list[int]:
-    """A camera's stamps: exact ticks, each off by `jitter` of a period at most, rounded."""
+    """A camera's timestamps: exact ticks, each off by at most `jitter` of a period, rounded."""
     off = np.random.default_rng(seed).uniform(-jitter, jitter, COUNT).tolist()
     return [ROUNDINGS[rounding]((100 + phase + k + Fraction(off[k])) * NS / rate) for k in range(COUNT)]
 
@@ -59,7 +59,7 @@ def _stream(part: Source | CameraSource, times: list[int]) -> Stream:
 
 
 def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, EpisodeRows]:
-    """Of a bag with these cameras and joints at a kilohertz, from before the first image to after the last."""
+    """Rows of a bag with these cameras, and with joints at 1 kHz from before the first image until after the last."""
     first, last = min(min(times) for times in cameras.values()), max(max(times) for times in cameras.values())
     joints = list(range(first - 2_000_000, last + 2 * NS // clock.fps, 1_000_000))
     mapping = SourceMapping(
@@ -75,7 +75,7 @@ def _rows(cameras: dict[str, list[int]], clock: Clock) -> tuple[Timelines, Episo
 
 
 def _numbers(rows: EpisodeRows, camera: str) -> NDArray[np.int64]:
-    """(R,) which image each row shows."""
+    """(R,) index of the image of each row."""
     return rows.cameras[camera].taken[rows.table.images[camera]]
 
 
@@ -94,7 +94,7 @@ roundings = st.sampled_from(sorted(ROUNDINGS))
 @settings(max_examples=80, **PATIENT)
 @given(rates, phases, jitters, seeds, roundings)
 def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
-    """Which the suggested fps is, rounded."""
+    """Any rate works; the suggested fps is the rounded rate."""
     times = _moments(rate, phase, jitter, seed, rounding)
     lines, rows = _rows({"front": times}, Clock(fps=round(rate), max_age_s=1.0))
     assert _numbers(rows, "front").tolist() == list(range(COUNT))
@@ -116,7 +116,7 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
     assert numbers == expected
     assert set(numbers) == set(range(COUNT))
     assert "repeats" not in _kinds(lines, rows)
-    # No later than need be: where nothing jitters, images are as good as new, but for a row after the last one.
+    # No later than necessary: without jitter images are new, except for a row after the last one.
     if not jitter:
         assert sorted(rows.table.image_age_ns("front").tolist())[COUNT - 2] <= 3_000
 
@@ -125,7 +125,9 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
 @settings(max_examples=80, **PATIENT)
 @given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
 def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:
-    """Up to a quarter of a period all can be shown: images of a pair are nearer to each other than to those after."""
+    """With an offset of up to a quarter period all images are used: those of a pair are closer together than
+    consecutive ones.
+    """
     cameras = {
         "front": _moments(Fraction(rate), phase, jitter, seed, rounding),
         "side": _moments(Fraction(rate), other, jitter, seed + 1, rounding),
@@ -134,7 +136,7 @@ def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float,
     for name, times in cameras.items():
         numbers = _numbers(rows, name)
         assert numbers.tolist() == [bisect_right(times, time) - 1 for time in rows.table.time_ns.tolist()]
-        # Not lost: all between the first and the last; of these only what one camera had before the other began.
+        # All between the first and the last image are kept; lost are only images from before the other camera began.
         assert set(numbers.tolist()) == set(range(numbers[0], numbers[-1] + 1))
         assert numbers[0] <= 1
         assert numbers[-1] >= COUNT - 2

@@ -1,4 +1,4 @@
-"""Suggested mappings are TOML whatever a bag's topics, joints and frames are called; `tomllib` judges."""
+"""Suggested mappings are valid TOML for any names of topics, joints and frames; `tomllib` verifies."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ JSON = st.recursive(
 @example([{"name": ["a"], "position": [1.0]}, {"name": [[1], {}], "position": [[1.0], [2.0, 3.0]]}], "/state")
 @example([{"position": [[1.0], [2.0, 3.0]], "points": [{"positions": [[1], []]}, 3]}], "/cmd")
 def test_messages_of_any_shape_are_suggested_or_left_out(messages: list[dict[str, object]], topic: str) -> None:
-    """JSON has any shape, and no two messages need the same."""
+    """JSON has any shape, and two messages may differ."""
     with tempfile.TemporaryDirectory() as folder:
         bag = Path(folder) / "bag.mcap"
         with bag.open("wb") as file:

@@ -1,4 +1,4 @@
-"""Motions keep to their limits whatever the goal, and end where they should."""
+"""Motions stay within their limits for every goal, and end at the goal."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIMITS = MotionLimits(
 
 
 def assert_within_limits(rows: Array, fps: int) -> None:
-    """Of velocity and acceleration, of joint targets (T, 7), one a control step."""
+    """Check velocity and acceleration of joint targets (T, 7), one each control step."""
     assert (np.abs(np.diff(rows, axis=0)) * fps <= LIMITS.joint_velocity * (1 + 1e-9)).all()
     assert (np.abs(np.diff(rows, 2, axis=0)) * fps**2 <= LIMITS.joint_acceleration * (1 + 1e-9)).all()
 
@@ -64,7 +64,7 @@ def test_velocity_and_acceleration_limits_hold(
     assert math.dist(end.position, goal.position) < 3e-4
     assert (path >= ARM.lower).all()
     assert (path <= ARM.upper).all()
-    # The peak speed of the hand is the wanted one or less (2 % for the time law's sampling).
+    # The peak speed of the hand is at most the requested one (2 % for the time law's sampling).
     hand = np.array([ARM.forward(row).position for row in rows[1:]])
     assert np.linalg.norm(np.diff(hand, axis=0), axis=1).max() * fps <= speed * 1.02 + 2e-4 * fps
 

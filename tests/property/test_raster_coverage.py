@@ -1,4 +1,4 @@
-"""Every sample of a mesh is covered exactly once, whatever its triangles."""
+"""Every sample of a mesh is covered exactly once, for any triangles."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from demorec.render.raster.kernels import layout
 from demorec.render.raster.kernels.triangles import draw_casters
 
 SIZE = 96
-"""Samples: room for triangles on both sides of what counts as narrow."""
+"""Samples: room for triangles on both sides of the limit of a narrow one."""
 
 
 def hits(corners: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """(SIZE, SIZE) whether each sample is covered by a triangle (3, 2) of 1/256 samples."""
+    """(SIZE, SIZE) whether each sample is covered by a triangle (3, 2) in units of 1/256 samples."""
     vertices = np.zeros((3, 8))
     geometry = merge([vertices], [np.array([[0, 1, 2]])])
     place = layout.addresses(3)
@@ -57,7 +57,7 @@ def test_a_mesh_covers_every_sample_once(points: list[tuple[int, int]], step: in
     middle = np.arange(SIZE) * 256 + 128
     x, y = np.meshgrid(middle, middle)
     places = np.stack([x, y], -1).reshape(-1, 2)
-    # Signed distance to the hull, in 1/256 samples; those on its border belong to one side or the other.
+    # Signed distance to the hull, in 1/256 samples; border samples belong to one side or the other.
     equations = ConvexHull(corners).equations
     distance = (places @ equations[:, :2].T + equations[:, 2]).max(1).reshape(SIZE, SIZE)
     assert (count[distance < -1e-6] == 1).all()

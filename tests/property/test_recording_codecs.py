@@ -1,4 +1,4 @@
-"""Depth, labels, CDR layouts and shapes: inverses that lose nothing, and covers that leave nothing out."""
+"""Depth, labels, CDR layouts and shapes: lossless inverses, and covers without gaps."""
 
 from __future__ import annotations
 
@@ -50,8 +50,11 @@ def test_depth_beyond_its_range_counts_as_nothing_hit() -> None:
 
 
 def test_depth_is_rvl_of_the_paper() -> None:
-    """An image small enough to be coded by hand: runs 0 and 2, pixels 5 and 3 (differences 5 and -2, zigzag 10 and 3),
-    then runs 2 and 0. Groups of three bits, the continuation bit above them: 0, 2, 10 = 010 001 -> A 1, 3, 2, 0."""
+    """An image small enough to be encoded by hand.
+
+    Runs 0 and 2, pixels 5 and 3 (differences 5 and -2, zigzag 10 and 3), then runs 2 and 0. Groups of three bits, with
+    the continuation bit above them: 0, 2, 10 = 010 001 -> A 1, 3, 2, 0.
+    """
     data = encode_depth(np.array([[0.005, 0.003, 0.0, 0.0]], dtype=np.float32))
     assert data[:12] == bytes(12)
     assert struct.unpack("<ii", data[12:20]) == (4, 1)
@@ -82,7 +85,7 @@ finite = st.floats(allow_nan=False, width=64)
 @settings(max_examples=40)
 @given(st.lists(st.text(max_size=9).filter(lambda text: "\0" not in text), max_size=5), st.data())
 def test_layouts_give_what_another_decoder_reads(names: list[str], data: st.DataObject) -> None:
-    """Joint states with names of any length, through the ROS 2 decoder of mcap-ros2-support."""
+    """Joint states with names of any length, decoded by mcap-ros2-support."""
     count = data.draw(st.integers(1, 4))
     rows = data.draw(hnp.arrays(np.float64, (count, 3 * len(names)), elements=finite))
     times = np.array(
@@ -174,7 +177,7 @@ def test_damaged_pngs_are_refused() -> None:
 
 
 def test_a_segmentation_image_owes_nothing_to_the_one_before() -> None:
-    """FFmpeg adds up images that are not said to be keyframes."""
+    """FFmpeg adds an image to the previous one unless it is marked as a keyframe."""
     decoder, table, cube = LabelDecoder((6, 8)), np.full((6, 8), 1, np.int32), np.full((6, 8), 2, np.int32)
     shown = [decoder.decode(encode_labels(image)) for image in (table, cube, cube, table)]
     for found, image in zip(shown, (table, cube, cube, table), strict=True):

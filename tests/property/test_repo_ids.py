@@ -1,4 +1,4 @@
-"""Names of datasets, judged by the library that LeRobot loads them with."""
+"""Names of datasets, verified by the library with which LeRobot loads them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ def test_what_is_accepted_is_what_the_hub_accepts(name: str) -> None:
     with contextlib.suppress(HFValidationError):
         validate_repo_id(name)
         hub = False
-    refused = hub or name.count("/") != 1  # LeRobot takes a name apart at the slash
+    refused = hub or name.count("/") != 1  # LeRobot splits a name at the slash
     try:
         check_repo_id(name)
     except ConfigError:
-        # Stricter than the Hub in one point: letters are those of ASCII, as the Hub's servers ask for.
+        # Stricter than the Hub in one point: letters must be ASCII, as the Hub's servers require.
         assert refused or not name.isascii()
     else:
         assert not refused

@@ -1,6 +1,6 @@
-"""Joint trees: whatever joints a URDF names, reading it ends, and a path leads from the root to its link.
+"""Joint trees: reading terminates for any joints of a URDF, and a path leads from the root to its link.
 
-What cannot be read is named.
+Unreadable elements are named.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def test_any_joints_are_a_tree_or_refused(pairs: list[tuple[str, str]]) -> None:
 
 @given(st.lists(st.integers(0, 10**6), max_size=20), st.randoms())
 def test_every_tree_is_read(choices: list[int], random: object) -> None:
-    """Link n hangs on one of the links before it; the joints stand in the file in any order."""
+    """Link n is a child of one of the links before it; the file lists the joints in any order."""
     names = ["root", *(f"link{n}" for n in range(len(choices)))]
     parents = {names[n + 1]: names[choice % (n + 1)] for n, choice in enumerate(choices)}
     pairs = [(parent, child) for child, parent in parents.items()]
@@ -56,9 +56,9 @@ def test_every_tree_is_read(choices: list[int], random: object) -> None:
 @pytest.mark.parametrize(
     "pairs",
     [
-        [("root", "a"), ("b", "c"), ("c", "b")],  # a circle beside the tree
-        [("root", "a"), ("b", "a"), ("a", "b")],  # a circle that hangs in the tree
-        [("root", "a"), ("root", "b"), ("a", "c"), ("b", "c")],  # a link of two joints
+        [("root", "a"), ("b", "c"), ("c", "b")],  # a cycle outside the tree
+        [("root", "a"), ("b", "a"), ("a", "b")],  # a cycle below the root
+        [("root", "a"), ("root", "b"), ("a", "c"), ("b", "c")],  # a link with two joints
         [("a", "a")],
     ],
 )

@@ -1,1 +1,1 @@
-"""What several tests share: recordings made by hand, runs and datasets, readers, commands."""
+"""Helpers for several tests: synthetic recordings, runs and datasets, readers, commands."""

@@ -1,4 +1,4 @@
-"""Faults that recorders, networks, drivers and people put into bags, each as a change of a layout's messages."""
+"""Faults that recorders, networks, drivers and people cause in bags, each as a change of a layout's messages."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ FRONT, SIDE = "/follower/cam_front/image_raw/compressed", "/static_camera/cam_si
 
 @dataclass(frozen=True, kw_only=True)
 class Fault:
-    """One of them.
+    """A fault of a bag.
 
     Attributes:
         kind: The finding that must name it.
-        hurt: Makes it, of messages in the order of recording.
-        is_refused: Whether no episode may come of it.
+        hurt: Function that makes it; messages are in the order of recording.
+        is_refused: Whether the import must refuse the episode.
     """
 
     kind: str
@@ -40,7 +40,7 @@ def _later(note: Note, seconds: float) -> Note:
 
 
 def _swapped_times(notes: Notes) -> Notes:
-    """Ten pairs of neighbours in the wrong order."""
+    """Swap the times of ten pairs of neighbours."""
     mine = [k for k, note in enumerate(notes) if note.topic == STATE][10:30]
     result = list(notes)
     for a, b in zip(mine[::2], mine[1::2], strict=True):
@@ -143,5 +143,5 @@ def _png() -> NDArray[np.uint8]:
 
 
 def hurt(notes: Notes, name: str) -> Notes:
-    """The messages with a fault, in the order of recording."""
+    """Messages with a fault, in the order of recording."""
     return FAULTS[name].hurt(in_order(notes))

@@ -91,6 +91,6 @@ topic = "/cameras/cam_wrist/image"
 
 
 def write_mapping(text: str, path: Path) -> Path:
-    """A mapping's file."""
+    """Write a mapping to a file."""
     path.write_text(text)
     return path

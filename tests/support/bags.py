@@ -1,4 +1,4 @@
-"""Bags as real recorders write them, written by libraries that are not ours: `rosbags`, `mcap`, `foxglove`.
+"""Bags as real recorders write them, written by third-party libraries: `rosbags`, `mcap`, `foxglove`.
 
 A layout makes plain messages first, so that a test can hurt them before they are written, and knows what is in the bag
 without reading it. Topics, types, joint names and rates are those of:
@@ -59,7 +59,7 @@ Notes = list[Note]
 
 
 def times(rate: float, seconds: float, *, phase: float = 0.0, jitter: float = 0.03, seed: int = 0) -> list[int]:
-    """Times of a sensor, nanoseconds: `rate` a second, each off by a part `jitter` of the period at most."""
+    """Timestamps of a sensor, nanoseconds: `rate` a second, each off by at most `jitter` of the period."""
     generator = np.random.default_rng(seed)
     period = 1.0 / rate
     count = int((seconds - phase) * rate)
@@ -68,14 +68,14 @@ def times(rate: float, seconds: float, *, phase: float = 0.0, jitter: float = 0.
 
 
 def motion(time_ns: int, count: int, *, shift: float = 0.0) -> NDArray[np.float64]:
-    """(count,) joint positions, rad: smooth, and with the noise of an encoder."""
+    """(count,) joint positions, rad: smooth, with encoder noise."""
     t = (time_ns - EPOCH_NS) / NS
     noise = np.random.default_rng(time_ns % 2**32).normal(0, 1e-5, count)
     return np.asarray(0.5 * np.sin(2 * np.pi * 0.4 * t + np.arange(count) * 0.7 + shift) + noise)
 
 
 def image(time_ns: int, camera: int) -> NDArray[np.uint8]:
-    """(HEIGHT, WIDTH, 3): of another colour for each camera, with a bar that moves."""
+    """(HEIGHT, WIDTH, 3): a different colour for each camera, with a bar that moves."""
     pixels = np.full((HEIGHT, WIDTH, 3), (40 + 60 * camera, 200 - 50 * camera, 90), np.uint8)
     x = int((time_ns - EPOCH_NS) / NS * 25) % (WIDTH - 8)
     pixels[8:40, x : x + 8] = 250
@@ -84,7 +84,7 @@ def image(time_ns: int, camera: int) -> NDArray[np.uint8]:
 
 
 def jpeg(image: NDArray[np.uint8]) -> bytes:
-    """Of an image."""
+    """Encode an image as JPEG."""
     buffer = io.BytesIO()
     Image.fromarray(image).save(buffer, format="JPEG", quality=90)
     return buffer.getvalue()
@@ -213,7 +213,7 @@ def agilex(seconds: float = 2.0) -> Notes:
 
 
 def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
-    """Trossen's arms and cameras, the images coded as H.264."""
+    """Trossen's arms and cameras, the images encoded as H.264."""
     notes: Notes = []
     for number, arm in enumerate(("leader", "follower")):
         for moment in times(200, seconds, seed=1 + number):
@@ -251,7 +251,7 @@ def video(images: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx26
     context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
     context.framerate, context.time_base = Fraction(30), Fraction(1, 30)
     context.gop_size = gop
-    context.options = {"bf": "0", "tune": "zerolatency", "sc_threshold": "0"}  # no keyframes but those of the GOP
+    context.options = {"bf": "0", "tune": "zerolatency", "sc_threshold": "0"}  # no keyframes except those of the GOP
     if codec == "libx265":
         context.options = {"tune": "zerolatency", "x265-params": "bframes=0:repeat-headers=1:log-level=none"}
     packets = []
@@ -267,7 +267,7 @@ def _store(*, is_ros1: bool = False) -> Any:
 
 
 def ros_message(note: Note, *, is_ros1: bool = False) -> Any:
-    """A message of `rosbags`."""
+    """Make a message with `rosbags`."""
     store = _store(is_ros1=is_ros1)
     return _filled(store, note.type, note.body | {"header": note}, is_ros1)
 
@@ -310,7 +310,7 @@ def write_rosbag2(
     storage: StoragePlugin = StoragePlugin.MCAP,
     compression: CompressionMode | None = None,
 ) -> Path:
-    """A folder of rosbag2, by `rosbags`."""
+    """Write a folder of rosbag2 with `rosbags`."""
     writer = Writer(path, version=9, storage_plugin=storage)
     if compression is not None:
         writer.set_compression(compression, CompressionFormat.ZSTD)
@@ -328,7 +328,7 @@ def write_rosbag2(
 
 
 def write_ros1(notes: Notes, path: Path, *, compression: Ros1Writer.CompressionFormat | None = None) -> Path:
-    """A bag of ROS 1, by `rosbags`."""
+    """Write a bag of ROS 1 with `rosbags`."""
     store = _store(is_ros1=True)
     writer = Ros1Writer(path)
     if compression is not None:
@@ -354,7 +354,7 @@ def write_mcap(
     use_chunking: bool = True,
     **options: Any,
 ) -> Path:
-    """An MCAP file of ROS messages, by `mcap`; ROS 1 ones are serialised by `rosbags`."""
+    """Write an MCAP file of ROS messages with `mcap`; `rosbags` serialises those of ROS 1."""
     from mcap.writer import CompressionType
     from mcap.writer import Writer as McapWriter
 
@@ -409,7 +409,7 @@ def _trossen_type() -> tuple[Any, bytes]:
 
 
 def write_trossen(notes: Notes, path: Path) -> Path:
-    """An MCAP file of protobuf messages, by `foxglove`."""
+    """Write an MCAP file of protobuf messages with `foxglove`."""
     import foxglove
     from foxglove.channels import CompressedVideoChannel
     from foxglove.mcap import MCAPCompression, MCAPWriteOptions
@@ -440,17 +440,17 @@ def write_trossen(notes: Notes, path: Path) -> Path:
 
 
 def in_order(notes: Notes) -> Notes:
-    """As a recorder gets them: by the time of recording."""
+    """Sort messages by recording time, as a recorder receives them."""
     return sorted(notes, key=lambda note: note.log_ns)
 
 
 def of_topic(notes: Notes, topic: str) -> Notes:
-    """Those of a topic, in the order of their headers."""
+    """Messages of a topic, in the order of their headers."""
     return sorted((note for note in notes if note.topic == topic), key=lambda note: note.header_ns)
 
 
 def changed(notes: Notes, topic: str, change: Callable[[int, Note], Note | None]) -> Notes:
-    """The same with a topic's messages changed, or left out, by their number."""
+    """Copy messages, with those of a topic changed or left out by their number."""
     result: Notes = []
     number = 0
     for note in notes:
@@ -465,5 +465,5 @@ def changed(notes: Notes, topic: str, change: Callable[[int, Note], Note | None]
 
 
 def with_body(note: Note, **fields: Any) -> Note:
-    """The same with other fields."""
+    """Copy a message with other fields."""
     return replace(note, body=note.body | fields)

@@ -1,6 +1,6 @@
-"""Good recordings, runs and datasets, and ways to spoil them one fault at a time.
+"""Good recordings, runs and datasets, and ways to damage them one fault at a time.
 
-Nothing here knows what a check looks at. Every spoiler asserts that it changed something.
+Nothing here depends on the checks. Every function that damages something asserts that it did.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def simulate(path: Path, *, episode_index: int = 0, **config: Any) -> Path:
 
 
 def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
-    """A run folder with run.json, made without worker processes."""
+    """Make a run folder with run.json, without worker processes."""
     config = {"cameras": (), "width": 96, "height": 96, **config}
     attempts = []
     for index in range(num_episodes):
@@ -85,7 +85,7 @@ def checked(
     images: bool = True,
     motors: Motors | None = None,
 ) -> SubjectReport:
-    """The report of some checks, or of all: of files' integrity, and of the doctor in the same form."""
+    """Run some checks, or all: of files' integrity, and of motion and images, in one form."""
     integrity, doctors = split_checks(only)
     subject = Subject(path=path, kind=kind)  # type: ignore[arg-type]
     found: tuple[Result, ...] = ()
@@ -97,7 +97,7 @@ def checked(
 
 
 def _of_doctor(path: Path, checks: Sequence[FaultCheck], options: ReadOptions) -> Iterator[Result]:
-    """A result for each check of the doctor that applies: its worst finding."""
+    """Convert the report of the dataset checks: the worst finding of each check that applies."""
     diagnosis, _ = examine(path, options, checks=checks)
     levels: dict[str, Level] = {"look": "warn", "broken": "fail"}
     for check in checks:
@@ -115,19 +115,19 @@ def _of_doctor(path: Path, checks: Sequence[FaultCheck], options: ReadOptions) -
 
 
 def level_of(path: Path, check: str, kind: str = "recording") -> str:
-    """What one check says."""
+    """Return the result of one check."""
     report = checked(path, kind, only=[check])
     return next(result.level for result in report.results if result.check == check)
 
 
 class Spoilt:
-    """A recording in memory, to be changed and written again.
+    """A recording in memory that can be changed and written again.
 
     Attributes:
-        info, columns, outcome: Of the recording; replace them or write into the arrays.
+        info, columns, outcome: Parts of the recording; replace them or write into the arrays.
         images: Camera name -> images of every frame, decoded; empty without cameras.
         frames: Numbers of the frames to be written, in order.
-        events: Frame -> what happened then, instead of what is recorded.
+        events: Frame -> events of that frame, in place of the recorded ones.
     """
 
     def __init__(self, path: Path) -> None:
@@ -171,12 +171,12 @@ class Spoilt:
         self.images = new
 
     def write(self, path: Path) -> Path:
-        """Record it."""
+        """Record the episode."""
         with Recording(self._source) as recording:
             frames = list(frames_of(self.columns, recording.events(), recording.joint_samples()))
         outcome = self.outcome
         assert outcome is not None
-        # As a program that checks nothing would write it: our own writer refuses some of the faults.
+        # As a program without checks would write it: demorec's own writer refuses some of the faults.
         with pytest.MonkeyPatch.context() as patch, EpisodeWriter(path, self.info) as writer:
             patch.setattr(FrameCheck, "__call__", lambda *_: None)
             for number, index in enumerate(self.frames):
@@ -209,7 +209,7 @@ def rewrite_messages(
     *,
     metadata: Callable[[str, dict[str, str]], dict[str, str] | None] = lambda name, values: values,
 ) -> Path:
-    """Copy an MCAP file message by message; `edit` returns what takes a message's place."""
+    """Copy an MCAP file message by message; `edit` returns the replacement of each message."""
     container = Container(source)
     writer = PartFile(target)
     changed = 0
@@ -232,7 +232,7 @@ def rewrite_messages(
 
 
 def flip_bits(source: Path, target: Path, *, offset: int) -> Path:
-    """Copy a file with one byte turned round; a negative offset counts from the end."""
+    """Copy a file with all bits of one byte inverted; a negative offset counts from the end."""
     data = bytearray(source.read_bytes())
     data[offset] ^= 0xFF
     assert bytes(data) != source.read_bytes()

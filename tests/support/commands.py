@@ -1,4 +1,4 @@
-"""Commands as a user types them, in this process; and the workers of those that run in one of their own."""
+"""Run commands in this process as from the command line; find the workers of commands that run in another process."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ ON_A_PATH = {
     "generate": "generate --config PATH --out NEW --workers 1 --no-check --no-export",
     "recover": "recover PATH --out NEW.mcap",
 }
-"""How every command that takes recordings, runs or datasets is called with a PATH; what it makes begins with NEW."""
+"""Calls of every command that takes recordings, runs or datasets, with a PATH; names of outputs begin with NEW."""
 ON_EVERYTHING = ("info", "check", "view", "report", "export")
-"""Those that read bags and other formats, too."""
+"""Calls of commands that also read bags and other formats."""
 OTHERS = {"import", "dataset", "evaluate", "correct", "list", "explain"}
-"""Commands that take other things."""
+"""Commands with other inputs."""
 
 
 def words_of(call: str, path: object, new: object) -> list[str]:
-    """The words of a call such as those of `ON_A_PATH`."""
+    """Return the arguments of a call such as those of `ON_A_PATH`."""
     return [word.replace("PATH", str(path)).replace("NEW", str(new)) for word in call.split()]
 
 
 def exit_code(*arguments: object, program: Callable[[list[str]], object] = main) -> int:
-    """The exit code of a command that is run in this process: `demorec ARGUMENTS...`."""
+    """Run `demorec ARGUMENTS...` in this process and return its exit code."""
     try:
         program([str(argument) for argument in arguments])
     except SystemExit as ended:
@@ -43,7 +43,7 @@ def exit_code(*arguments: object, program: Callable[[list[str]], object] = main)
 
 
 def workers_of(process: subprocess.Popen[Any]) -> list[psutil.Process]:
-    """The worker processes below a command that runs; none when it has ended."""
+    """Worker processes of a running command; empty when it has ended."""
     try:
         below = psutil.Process(process.pid).children(recursive=True)
         return [child for child in below if "spawn_main" in " ".join(child.cmdline())]

@@ -1,4 +1,4 @@
-"""LeRobot datasets under the names that other people use, by PyArrow and JSON alone: a moving arm, no images."""
+"""LeRobot datasets under the names of other projects, by PyArrow and JSON alone: a moving arm, no images."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ _COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_in
 
 @dataclass(frozen=True)
 class Convention:
-    """Names under which somebody writes the same motion.
+    """Names under which a project writes the same motion.
 
     Attributes:
         state, action: Feature -> (names in info.json, columns of `arm_motion` that it holds), in order.
         modality: GR00T's modality.json.
-        others: Feature -> number of elements of noise.
-        version: Of the format.
+        others: Feature -> number of elements; the values are noise.
+        version: Version of the format.
     """
 
     state: Mapping[str, tuple[Any, tuple[int, ...]]]
@@ -90,7 +90,7 @@ CONVENTIONS = {
         },
     ),
 }
-"""Whose names -> how a dataset of theirs is called."""
+"""Project -> its convention."""
 
 
 def arm_motion(episode: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -104,7 +104,7 @@ def arm_motion(episode: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def write_convention(root: Path, convention: Convention, *, frozen: bool = False) -> Path:
-    """A dataset of four episodes; `frozen`: the elbow of episode 2 stands still from frame 30 on."""
+    """Write a dataset of four episodes; `frozen`: the elbow of episode 2 does not move from frame 30 on."""
     episodes = [arm_motion(number) for number in range(EPISODES)]
     if frozen:
         episodes[2][0][30:, 1] = episodes[2][0][30, 1]

@@ -1,4 +1,4 @@
-"""Commands that die, in a child of this process: at any change of the file system, which is the same on any machine."""
+"""Run commands in forked children and kill them at any change of the file system, the same one on every machine."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import pytest
 from demorec.cli import main
 
 TIMEOUT_S = 600
-"""After this a child counts as hung, and is killed."""
+"""A child that takes longer counts as hung, and is killed."""
 _UNEXPECTED = 99
 """Exit code of a child whose command raised an exception."""
 _CHANGES = ("os.mkdir", "os.rmdir", "os.remove", "os.rename", "os.link", "os.truncate")
@@ -26,7 +26,7 @@ _WRITING = os.O_WRONLY | os.O_RDWR
 
 @dataclass(frozen=True, kw_only=True)
 class Ended:
-    """How a command ended: exit code (-N after signal N), its own lines of standard error, changes of files."""
+    """Result of a command: exit code (-N after signal N), its lines on standard error, number of file changes."""
 
     code: int
     said: tuple[str, ...]
@@ -66,7 +66,7 @@ class Running:
                 os.dup2(said, 2)
                 sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
                 if max_bytes:
-                    # Python would leave bytecode that is cut off.
+                    # Python would leave partial bytecode.
                     sys.dont_write_bytecode, os.environ["PYTHONDONTWRITEBYTECODE"] = True, "1"
                     resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
                 _count_changes(folder, at, act, counted)
@@ -82,7 +82,7 @@ class Running:
         os.close(counted)
 
     def wait(self) -> Ended:
-        """Wait until it has ended."""
+        """Wait until the child has ended."""
         with os.fdopen(self._said, errors="replace") as said, os.fdopen(self._counted, "rb") as counted:
             lines, num_changes = said.read().splitlines(), len(counted.read())
         code = os.waitstatus_to_exitcode(os.waitpid(self._pid, 0)[1])
@@ -120,12 +120,12 @@ class SmallDisk:
 
     @property
     def num_used(self) -> int:
-        """Bytes."""
+        """Used size, bytes."""
         status = os.statvfs(self.folder)
         return (status.f_blocks - status.f_bfree) * status.f_frsize
 
     def resize(self, num_bytes: int = 1 << 30) -> None:
-        """Change the size, in bytes (default: a gigabyte); the minimum is one page."""
+        """Change the size, in bytes (default: 1 GB); the minimum is one page."""
         self._mount(f"remount,size={num_bytes or 1}")  # 0 means unlimited
 
 
@@ -160,7 +160,7 @@ def on_small_disk(folder: Path, work: Callable[[SmallDisk], object]) -> None:
 
 
 def _count_changes(folder: Path, at: int, act: Callable[[int], object], counted: int) -> None:
-    """Note each change of the file system below a folder as a byte in a pipe, and act before one of them."""
+    """Note each change of the file system below a folder as a byte in a pipe, and call `act` before one of them."""
     count, pid = 0, os.getpid()
 
     def note(event: str, arguments: tuple[object, ...]) -> None:
@@ -185,7 +185,7 @@ def _is_change(event: str, arguments: tuple[object, ...], folder: str) -> bool:
 
 
 def _is_below(path: object, folder: str) -> bool:
-    """Whether a path is in the folder, which is the current one; not of an open descriptor."""
+    """Whether a path is in the current folder; false for open descriptors."""
     if not isinstance(path, str | bytes | os.PathLike):
         return False
     name = os.fsdecode(path)

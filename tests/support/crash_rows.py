@@ -55,14 +55,14 @@ class Row:
 
 
 def _edit(words: str) -> Row:
-    """An edit into a new dataset, or over another one."""
+    """Edit into a new dataset, and over an existing one."""
     return Row(
         call=f"dataset {words} --out new", targets=("new",), old="dataset select SOURCES/dataset --episodes 2 --out new"
     )
 
 
 def _run(words: str, *, needs: tuple[str, ...] = (), surprise: str = "new/episodes/episode_000001.mcap") -> Row:
-    """An import, which continues a run."""
+    """Import into a run, which continues it."""
     return Row(
         call=f"import {words} --out new",
         targets=("new/episodes/*.mcap",),
@@ -82,7 +82,7 @@ def with_stand_in_policy(words: list[str]) -> None:
 
 
 def with_stand_in_viewer(words: list[str]) -> None:
-    """Take a screenshot without a viewer, which is tested where there is a driver for it."""
+    """Save a screenshot without a viewer; other tests use a real one where a driver exists."""
     from PIL import Image
 
     from demorec.view import viewer
@@ -97,7 +97,7 @@ def with_stand_in_viewer(words: list[str]) -> None:
 
 
 def without_lerobot(words: list[str]) -> None:
-    """Leave out the verification by LeRobot, which takes seconds to start."""
+    """Skip the verification by LeRobot, which takes seconds to start."""
     sys.modules["lerobot"] = None  # type: ignore[assignment]
     main(words)
 
@@ -238,7 +238,7 @@ ROWS = {
 
 
 def make_base(folder: Path) -> None:
-    """A run and datasets, as small as they can be."""
+    """Make a run and datasets of minimum size."""
     make_run(folder / "run", (4, 5, 6), cameras=("front",))
     make_run(folder / "reversed", (6, 4, 5), cameras=("front",))
     export(folder / "run", folder / "dataset")

@@ -1,4 +1,4 @@
-"""Datasets that LeRobot wrote, and whether two datasets hold the same episodes."""
+"""Datasets written by LeRobot, and a comparison of episodes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,9 @@ TOP = "observation.images.top"
 
 
 def write_with_lerobot(root: Path, *, video: bool = True, episodes: int = 6, **arguments: Any) -> Path:
-    """Some episodes of 12, 13, ... frames at 10 Hz with a moving square; still at both ends; two tasks in turn."""
+    """Write episodes of 12, 13, ... frames at 10 Hz: a square that moves, except at both ends, and two alternating
+    tasks.
+    """
     from lerobot.datasets import LeRobotDataset
 
     rng = np.random.default_rng(0)
@@ -39,7 +41,7 @@ def write_with_lerobot(root: Path, *, video: bool = True, episodes: int = 6, **a
 
 
 def items(root: Path, backend: str = "pyav") -> list[list[dict[str, Any]]]:
-    """Every episode's frames as LeRobot reads them, less the counters: numbers, decoded images, task."""
+    """Frames of every episode as LeRobot reads them, without counters: numbers, decoded images, task."""
     from lerobot.datasets import LeRobotDataset
 
     dataset = LeRobotDataset("local/test", root=root, video_backend=backend, return_uint8=True)
@@ -57,7 +59,7 @@ def items(root: Path, backend: str = "pyav") -> list[list[dict[str, Any]]]:
 
 
 def same(a: list[dict[str, Any]], b: list[dict[str, Any]], *, but: tuple[str, ...] = ()) -> bool:
-    """Whether two episodes, as `items` has them, are equal bit for bit."""
+    """Whether two episodes, as returned by `items`, are equal bit for bit."""
     return len(a) == len(b) and all(
         set(x) - set(but) == set(y) - set(but)
         and all(x[name].dtype == y[name].dtype and np.array_equal(x[name], y[name]) for name in set(x) - set(but))
@@ -66,7 +68,7 @@ def same(a: list[dict[str, Any]], b: list[dict[str, Any]], *, but: tuple[str, ..
 
 
 def content(root: Path) -> tuple[Any, list[Any]]:
-    """Rows and the episodes' table, for a comparison with another dataset."""
+    """Rows and the table of episodes, for a comparison with another dataset."""
     rows = [
         {name: value for name, value in row.items() if not name.startswith(("videos/", "data/", "meta/"))}
         for row in episode_rows(root)

@@ -1,4 +1,4 @@
-"""Python examples of README.md and docs/, to be run by tests."""
+"""Run the Python examples of README.md and docs/."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ ROOT = Path(__file__).parents[2]
 
 
 def run_examples(document: str, word: str, paths: Mapping[str, Path]) -> int:
-    """Run every Python example of a document that has the word in it; returns how many there were.
+    """Run every Python example of a document that contains the word; returns the number of examples.
 
-    `paths` replaces what an example reads: each quoted text by the path of a file that is there.
+    `paths` replaces the inputs of an example: each quoted text by the path of an existing file.
     """
     examples: list[str] = re.findall(r"```python\n(.*?)```", (ROOT / document).read_text(), re.DOTALL)
     chosen = [text for text in examples if word in text]

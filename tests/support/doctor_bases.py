@@ -1,4 +1,4 @@
-"""Third-party datasets, as LeRobot's recorder and other tools make them, without demorec."""
+"""Datasets in the forms of LeRobot's recorder and other tools, made without demorec."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class DatasetBase:
 
     Attributes:
         name: Key in `BASES`.
-        version: Of LeRobot's format, "v2.1" or "v3.0".
+        version: Version of LeRobot's format, "v2.1" or "v3.0".
         state, action: Names of the features.
         robot: `robot_type` in info.json.
         arms: Arms of the robot; the second one rests.
@@ -84,7 +84,7 @@ def record(
     spoilt: Mapping[int, tuple[str, float]] | None = None,
     cameras: bool = True,
 ) -> DemoDataset:
-    """Record a dataset; `spoilt` has kind and size of those episodes that are not sound; others stay as they are."""
+    """Record a dataset; `spoilt` has kind and size of faulty episodes; the others are sound."""
     shared = np.random.default_rng((seed, len(base.name)))
     pace, table = base.pace * shared.uniform(0.85, 1.2), int(shared.integers(2**31))
     found = []

@@ -1,4 +1,4 @@
-"""Ways to spoil the rows and images of a dataset before it is written."""
+"""Damage the rows and images of a dataset before it is written."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _regular(dataset: DemoDataset, episode: DemoEpisode) -> None:
 
 
 def on(feature: str, change: Callable[[Array, DatasetBase], Array], *, whole: bool = False) -> RowFault:
-    """Change the state, the action or another feature of one episode or of all."""
+    """Change the state, the action or another feature, in one episode or in all."""
 
     def spoil(dataset: DemoDataset, number: int) -> None:
         base = dataset.base
@@ -83,7 +83,7 @@ def _is_degrees(base: DatasetBase) -> bool:
 
 
 def other_unit(values: Array, base: DatasetBase) -> Array:
-    """Degrees become radians and the other way round, -100..100 encoder ticks, metres millimetres."""
+    """Convert degrees to radians and back, -100..100 to encoder ticks, and metres to millimetres."""
     joints = slice(0, -1)
     if base.is_delta:
         values[:, :3] *= 1000
@@ -110,7 +110,7 @@ def slipped(values: Array, base: DatasetBase) -> Array:
 
 
 def beyond(values: Array, base: DatasetBase) -> Array:
-    """Reach smoothly a value that no joint has, for half a second."""
+    """Move smoothly to a value that no joint has, for half a second."""
     peak = 5.0 if base.is_delta else 8.0 if not (_is_degrees(base) or base.name == "normalised") else 420.0
     bump = np.exp(-0.5 * ((np.arange(len(values)) - len(values) / 2) / (0.25 * base.fps)) ** 2)
     values[:, 1] += peak * bump
@@ -118,7 +118,7 @@ def beyond(values: Array, base: DatasetBase) -> Array:
 
 
 def shifted(seconds: float, *, frames: int = 0) -> Callable[[Array, DatasetBase], Array]:
-    """Rows later by some time and some frames; earlier if negative."""
+    """Shift rows later by some time and some frames; earlier if negative."""
 
     def change(values: Array, base: DatasetBase) -> Array:
         later = round(seconds * base.fps) + frames
@@ -183,13 +183,13 @@ def equal_to_state(*, whole: bool) -> RowFault:
 
 
 def _fastest(state: Array, length: int) -> NDArray[np.int64]:
-    """Rows of the given number in which the arm moves farthest."""
+    """Find the consecutive rows, of the given number, that contain the fastest motion."""
     moved = np.abs(state[length:, :-1] - state[:-length, :-1]) / np.maximum(np.ptp(state[:, :-1], axis=0), 1e-6)
     return int(np.argmax(moved.max(1))) + np.arange(length)
 
 
 def dropped_rows(*, regular: bool) -> RowFault:
-    """Lose the fastest 0.6 s of motion, or single rows at many places."""
+    """Drop the fastest 0.6 s of motion, or single rows at many places."""
 
     def spoil(dataset: DemoDataset, number: int) -> None:
         episode = dataset.episodes[number]
@@ -205,7 +205,7 @@ def dropped_rows(*, regular: bool) -> RowFault:
 
 
 def idle(place: float, seconds: float) -> RowFault:
-    """Rest at a place of the episode, 0 to 1, as an operator who does nothing; sensors keep their noise."""
+    """Insert a rest at a point of the episode, 0 to 1, as by an inactive operator; sensors keep their noise."""
 
     def spoil(dataset: DemoDataset, number: int) -> None:
         episode = dataset.episodes[number]
@@ -274,7 +274,7 @@ def task(text: str) -> RowFault:
 
 
 def shown(change: Callable[[Pixels], Pixels], *, whole: bool = False) -> RowFault:
-    """Change the images of the last camera of one episode or of all."""
+    """Change the images of the last camera, in one episode or in all."""
 
     def spoil(dataset: DemoDataset, number: int) -> None:
         camera = dataset.base.cameras[-1]
@@ -285,7 +285,7 @@ def shown(change: Callable[[Pixels], Pixels], *, whole: bool = False) -> RowFaul
 
 
 def covered(images: Pixels) -> Pixels:
-    """Dark images with noise and hardly any contrast, as with a hand over the lens."""
+    """Dark images with noise and little contrast, as with a hand over the lens."""
     noise = np.random.default_rng(0).normal(0, 2, images.shape)
     return np.clip(25 + 0.02 * images + noise, 0, 255).astype(np.uint8)
 

@@ -1,6 +1,6 @@
 """Faults that the checks of datasets must find, one at a time.
 
-The words of each were chosen from the requirements, before any check existed.
+The words of each fault come from the requirements, and predate the checks.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class PlantedFault:
     """A fault and the checks that may find it.
 
     Attributes:
-        family: Of checks.
+        family: Family of checks.
         words: Parts of check names that are accepted, separated by spaces.
         rows, files: Functions that spoil an episode before or after it is written.
         is_harmful: Whether training on it is wrong or impossible.
@@ -40,7 +40,7 @@ class PlantedFault:
 
 
 def traits(base: DatasetBase) -> set[str]:
-    """Traits of a base that faults may need."""
+    """Traits of a base that faults may require."""
     found = {base.version, "delta" if base.is_delta else "absolute"}
     found |= {"camera"} if base.cameras else set()
     found |= {"two cameras"} if len(base.cameras) > 1 else set()
@@ -252,4 +252,4 @@ _SET = {
 }
 
 FAULTS: dict[str, PlantedFault] = {**_FILES, **_TIME, **_NUMBERS, **_ALIGNMENT, **_IMAGES, **_SET}
-"""The faults by their names; `leakage` between two sets is planted by `benchmarks/doctor_faults.py`."""
+"""Faults by name; `benchmarks/doctor_faults.py` plants `leakage` between two sets."""

@@ -1,4 +1,4 @@
-"""Ways to damage a dataset's files after it was written."""
+"""Damage the files of a written dataset."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ FileFault = Callable[[Path, DatasetBase, int], None]
 
 
 def data_file(root: Path, number: int) -> Path:
-    """The table that holds an episode."""
+    """Table that holds an episode."""
     files = sorted(root.glob("data/*/*.parquet"))
     return files[number] if len(files) > 1 else files[0]
 
 
 def video_file(root: Path, number: int) -> Path:
-    """A video that holds an episode."""
+    """Video that holds an episode."""
     files = sorted(root.glob("videos/*/*/*.mp4"))
     return next((path for path in files if path.stem == f"episode_{number:06d}"), files[0])
 
@@ -47,7 +47,7 @@ def noisy_video(root: Path, base: DatasetBase, number: int) -> None:
 
 
 def short_video(root: Path, base: DatasetBase, number: int) -> None:
-    """Lose the last fifth of the images, as with an encoder that is too slow."""
+    """Drop the last fifth of the images, as an encoder that is too slow does."""
     path = video_file(root, number)
     with av.open(str(path)) as source, av.open(str(path.with_suffix(".tmp.mp4")), "w") as target:
         stream = target.add_stream_from_template(source.streams.video[0])

@@ -1,4 +1,4 @@
-"""Judge the checks of datasets: plant a fault, run `demorec check --json`, and look for it in the answer."""
+"""Evaluate the checks of datasets: plant a fault, run `demorec check --json`, and search its output for the fault."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def digest(root: Path) -> str:
 
 
 def findings_of(answer: dict[str, Any]) -> list[dict[str, Any]]:
-    """The findings of every path of an answer."""
+    """Findings for every path in the output."""
     found = list(answer.get("findings", []))
     for path in answer.get("paths", []):
         found += path.get("findings", [])
@@ -67,7 +67,7 @@ def alarms_of(answer: dict[str, Any]) -> Alarms:
 
 
 def is_found(fault: PlantedFault, answer: dict[str, Any], episodes: Iterable[int], alarms: Alarms) -> bool:
-    """Whether an answer has the fault of these episodes; `alarms` are those of the sound dataset."""
+    """Whether the output reports the fault in these episodes; `alarms` are those of the sound dataset."""
     if answer.get("verdict") == "good":
         return False
     words = fault.words.split()
@@ -82,7 +82,7 @@ def is_found(fault: PlantedFault, answer: dict[str, Any], episodes: Iterable[int
 
 @dataclass(frozen=True, kw_only=True)
 class Bench:
-    """A base's sound dataset, and those with a fault, in a folder; `alarms` are those of the sound one."""
+    """A base's sound dataset and its faulty ones, in a folder; `alarms` are those of the sound one."""
 
     base: DatasetBase
     folder: Path
@@ -136,6 +136,6 @@ def leakage(made: Bench, second: str) -> dict[str, Any]:
 
 
 def episodes_of(name: str) -> range:
-    """Episodes of which a finding may name any."""
+    """Episodes that a finding may name."""
     copies = {"copy": range(PLANTED, PLANTED + 2), "four copies": range(PLANTED, PLANTED + 4)}
     return copies.get(name, range(PLANTED - 1 if name == "shared piece" else PLANTED, PLANTED + 1))

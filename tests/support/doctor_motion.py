@@ -1,7 +1,7 @@
-"""Teleoperated demonstrations: a person's reaches with corrections and rests, and an arm that follows late.
+"""Simulated teleoperation: an operator's movements with corrections and rests, and an arm that follows with a delay.
 
 The operator moves along minimum-jerk curves, corrects at the end of a reach, rests and trembles. The arm has a delay, a
-lag, a dead band, gravity sag and encoders; its gripper stops at the object. Nothing here comes from demorec.
+lag, a dead band, gravity sag and encoders; its gripper stops at the object. Nothing here uses demorec.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Motion:
         command: (T, D) readings of the leader.
         state: (T, D) readings of the arm.
         true: (T, D) values of the arm without encoders and noise.
-        thing: (T, 3) place of the object.
+        thing: (T, 3) position of the object.
     """
 
     command: Array
@@ -123,7 +123,7 @@ def sound_reaches(rng: np.random.Generator, arm: ArmModel, pace: float) -> list[
 
 
 Spoiler = Callable[[list[Reach], np.random.Generator, ArmModel, float], list[Reach]]
-"""Takes sound reaches and a size from 0, hardly noticeable, to 1."""
+"""Functions of sound reaches and of a size from 0, hardly noticeable, to 1."""
 
 
 def _before(reaches: list[Reach], name: str, *added: Reach) -> list[Reach]:
@@ -186,14 +186,14 @@ def _slow(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: f
 SPOILERS: dict[str, Spoiler] = {
     "detour": _detour,
     "hesitation": _hesitation,
-    "jerky": lambda reaches, rng, arm, size: reaches,  # `demonstrate` shakes the hand
+    "jerky": lambda reaches, rng, arm, size: reaches,  # `demonstrate` adds the tremor
     "cut off": lambda reaches, rng, arm, size: reaches[: int(rng.integers(4, len(reaches) - 3))],
     "wrong object": _wrong_object,
     "dropped": _dropped,
     "slow": _slow,
     "late gripper": _late_gripper,
 }
-"""Kinds of spoilt demonstrations."""
+"""Kinds of faulty demonstrations."""
 
 
 def demonstrate(
@@ -219,7 +219,7 @@ def demonstrate(
 
 
 def _operator(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, fps: int) -> Array:
-    """(T, D) targets: each reach ends a little off, and a second movement corrects it."""
+    """(T, D) targets: each reach ends with a small error, and a second movement corrects it."""
     length = int(sum(reach.duration_s + reach.rest_s for reach in reaches) * fps)
     targets = np.empty((length, len(arm.home)))
     now = np.append(arm.joints(reaches[0].place), reaches[0].grip)
@@ -234,7 +234,7 @@ def _operator(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, fps
             (missed, end, begin_s + reach.duration_s * share, reach.duration_s * (1 - share)),
         ):
             rows = np.arange(int(from_s * fps), length)
-            late = rng.uniform(0, 0.12, len(end))  # joints do not begin at the same time
+            late = rng.uniform(0, 0.12, len(end))  # joints start at different times
             u = np.clip((((rows / fps - from_s) / length_s)[:, None] - late) / (0.88), 0, 1)
             targets[rows] = first + (last - first) * (10 * u**3 - 15 * u**4 + 6 * u**5)
         now, begin_s = end, begin_s + reach.duration_s + reach.rest_s
@@ -273,7 +273,7 @@ def _follow(command: Array, held: NDArray[np.bool_], arm: ArmModel, fps: int) ->
 
 
 def _thing(true: Array, held: NDArray[np.bool_], reaches: list[Reach], arm: ArmModel) -> Array:
-    """(T, 3) place of the object: at rest, then in the hand, then below the place of release."""
+    """(T, 3) position of the object: at rest, then in the hand, then below the place of release."""
     hand, found = arm.place(true[:, :-1]), np.empty((len(true), 3))
     now = next((reach.place for reach in reaches if reach.name == "at"), reaches[-1].place)
     for frame in range(len(true)):

@@ -68,7 +68,7 @@ def _developed(images: Image, seed: int) -> NDArray[np.uint8]:
 
 
 def _seen(shot: Shot) -> tuple[Array, Array, Array]:
-    """Places of hand and object, and the opening of the gripper from 0 to 1, a frame late as a camera delivers them."""
+    """Image positions of hand and object, and the gripper's opening from 0 to 1, a frame late as with cameras."""
     late = np.maximum(np.arange(len(shot.motion.true)) - 1, 0)
     opened, closed, _ = shot.arm.grip
     opening = (shot.motion.true[late, -1] - closed) / (opened - closed)

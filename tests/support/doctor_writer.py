@@ -22,12 +22,12 @@ from support.doctor_bases import DemoDataset, DemoEpisode, Images
 Statistics = dict[str, NDArray[Any]]
 QUANTILES = {"q01": 0.01, "q10": 0.1, "q50": 0.5, "q90": 0.9, "q99": 0.99}
 _COUNTERS = {"timestamp": "float32", **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), "int64")}
-EPISODES_PER_VIDEO = 4  # so that the videos of v3.0 are more than one file
+EPISODES_PER_VIDEO = 4  # so that v3.0 has more than one video file
 
 
 @dataclass(frozen=True)
 class VideoStore:
-    """Videos that were encoded once, for datasets that share them: images of its episodes -> file and statistics."""
+    """Cache of encoded videos for datasets that share them: images of episodes -> file and statistics."""
 
     folder: Path
     found: dict[tuple[Images, ...], tuple[Path, list[Statistics]]] = field(default_factory=dict)
@@ -57,7 +57,7 @@ def encode(path: Path, images: Sequence[Images], fps: int) -> list[Statistics]:
 
 
 def image_statistics(images: NDArray[np.uint8]) -> Statistics:
-    """Statistics of up to 100 images, 0 to 1, (3, 1, 1) each; sums are in float32 as LeRobot's are."""
+    """Statistics of up to 100 images, 0 to 1, (3, 1, 1) each; sums are float32 like LeRobot's."""
     taken = images[np.round(np.linspace(0, len(images) - 1, min(100, len(images)))).astype(int)]
     found = {name: value / 255 for name, value in _moments(taken.reshape(-1, 3)).items()}
     for name, share in QUANTILES.items():
@@ -66,7 +66,7 @@ def image_statistics(images: NDArray[np.uint8]) -> Statistics:
 
 
 def _moments(rows: NDArray[Any]) -> Statistics:
-    """Minimum, maximum, mean and deviation of (N, D) rows in the type that LeRobot sums them in."""
+    """Minimum, maximum, mean and deviation of (N, D) rows, in the type with which LeRobot sums them."""
     rows = rows.astype(np.result_type(rows.dtype, np.float32), copy=False)
     mean = rows.mean(0)
     deviation = np.sqrt(np.maximum(0, (rows**2).mean(0) - mean**2))
@@ -181,7 +181,7 @@ def _info(dataset: DemoDataset, tasks: int, frames: int) -> dict[str, Any]:
 def _write_videos(
     dataset: DemoDataset, root: Path, store: VideoStore, stats: list[dict[str, Statistics]]
 ) -> list[dict[str, Any]]:
-    """Copy the videos, add the statistics of images, and return where v3.0 finds each episode."""
+    """Copy the videos, add the statistics of images, and return the position of each episode in v3.0's files."""
     base, episodes = dataset.base, dataset.episodes
     is_old = base.version == "v2.1"
     places: list[dict[str, Any]] = [{} for _ in episodes]

@@ -1,4 +1,4 @@
-"""LeRobot datasets as other programs write them, drawn at random and written by PyArrow, libav and JSON alone."""
+"""Random LeRobot datasets as other programs write them, by PyArrow, libav and JSON alone."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _OPTIONS = {
 
 @dataclass(frozen=True, kw_only=True)
 class DrawnDataset:
-    """What varies between datasets.
+    """Random properties of a dataset.
 
     Attributes:
         version: "v2.1" or "v3.0".
@@ -99,7 +99,7 @@ DRAWN = st.builds(
 
 
 def write_drawn(root: Path, drawn: DrawnDataset, seed: int = 0) -> Path:
-    """Write the dataset; the first number of a row's state is unique among all of a seed."""
+    """Write the dataset; the first number of a row's state is unique among all datasets of a seed."""
     random = np.random.default_rng(seed)
     columns, features = _columns(drawn, random, seed)
     for name in drawn.missing:
@@ -225,11 +225,11 @@ def _write_new(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: lis
 
 @functools.cache
 def encoded(codec: str, length: int, gop: int, is_fragmented: bool) -> bytes:
-    """An mp4 file of some frames at 10 Hz, a square that moves over a table."""
+    """An mp4 file of some frames at 10 Hz: a square that moves over a table."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.uint8)
     table = np.stack([2 * rows, 2 * columns, rows + columns], axis=-1)
     file = io.BytesIO()
-    # Of a file in fragments no list of edits says that the first image is shown at 0, should others come before it.
+    # A fragmented file has no edit list to shift the first image to 0 when it uses B-frames.
     in_order = {"bf": "0"} if is_fragmented else {}
     options = {"movflags": "frag_keyframe+empty_moov+default_base_moof"} if is_fragmented else {}
     with av.open(file, "w", format="mp4", options=options) as out:
@@ -248,5 +248,5 @@ def encoded(codec: str, length: int, gop: int, is_fragmented: bool) -> bytes:
 
 
 def like(drawn: DrawnDataset) -> DrawnDataset:
-    """A dataset that fits the other one in a merge, with other episodes."""
+    """A dataset with other episodes that can be merged with the given one."""
     return replace(drawn, lengths=drawn.lengths[::-1], clock="grid", num_files=1)

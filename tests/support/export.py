@@ -1,4 +1,4 @@
-"""Runs of made-up episodes and datasets made from them, for the tests of the export."""
+"""Runs of synthetic episodes and datasets made from them, for the tests of exports."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from support.recording import write_episode
 
 
 def recordings(run: Path) -> list[Path]:
-    """Of the episodes of a run, in order."""
+    """Recordings of the episodes of a run, in order."""
     return sorted((run / "episodes").glob("*.mcap"))
 
 
@@ -35,7 +35,7 @@ def make_run(
     video: VideoConfig | None = None,
     **arguments: object,
 ) -> Path:
-    """A run with successful episodes of the given lengths, and one failed attempt for each index of `failures`."""
+    """Write a run with successful episodes of the given lengths, and a failed attempt for each index of `failures`."""
     (folder / "episodes").mkdir(parents=True)
     (folder / "failed").mkdir()
     for index, length in enumerate(lengths):
@@ -48,12 +48,14 @@ def make_run(
 
 
 def content_of(place: Path) -> dict[str, bytes]:
-    """Relative path -> content of every file of a folder; "" -> that of a file; {} of nothing."""
+    """Relative path -> content of every file of a folder; "" -> that of a single file; empty if the path does not
+    exist.
+    """
     return {"": place.read_bytes()} if place.is_file() else files_of(place)
 
 
 def feature_of(dataset: Path, name: str, exporter: str) -> tuple[NDArray[Any], list[str]]:
-    """(T, D) of a feature in the first episode of what an exporter made, and the names of its elements."""
+    """(T, D) of a feature in the first episode of an export, and the names of its elements."""
     if exporter == "lerobot":
         rows = np.array(data_table(dataset).column(name).to_pylist(), dtype=np.float32)
         return rows.reshape(len(rows), -1), info(dataset)["features"][name]["names"]
@@ -63,7 +65,7 @@ def feature_of(dataset: Path, name: str, exporter: str) -> tuple[NDArray[Any], l
 
 
 def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot", **options: Any) -> ExportReport:
-    """An export by a row of the table; to LeRobot without the verification, unless asked for."""
+    """Export by a row of the table; exports to LeRobot are verified only on request."""
     sources = [sources] if isinstance(sources, Path) else sources
     row = EXPORTERS.load(exporter)
     defaults = {"verify": False} if exporter == "lerobot" else {}
@@ -71,7 +73,7 @@ def export(sources: Path | Sequence[Path], out: Path, exporter: str = "lerobot",
 
 
 def without_verification(patch: pytest.MonkeyPatch) -> None:
-    """As if LeRobot, which takes seconds to load, were not there to open a dataset."""
+    """Skip the verification as if LeRobot, which takes seconds to load, were not installed."""
     for module in (lerobot_export, lerobot_opens):
         patch.setattr(module, "lerobot_is_installed", lambda: False)
 
@@ -82,7 +84,7 @@ def data_table(dataset: Path) -> pa.Table:
 
 
 def episode_rows(dataset: Path) -> list[dict[str, Any]]:
-    """All rows of the episodes' table."""
+    """All rows of the table of episodes."""
     return [
         row
         for path in sorted((dataset / "meta" / "episodes").glob("*/*.parquet"))
@@ -104,7 +106,7 @@ def files_of(folder: Path) -> dict[str, bytes]:
 
 
 def recode(video: Path, change: Callable[[list[Any]], object] = lambda images: None) -> None:
-    """A video anew, each image by itself and without loss; `change` edits the list of its images."""
+    """Encode a video again, losslessly and with keyframes only; `change` edits the list of its images."""
     import av
     from av.video.stream import VideoStream
 
@@ -123,7 +125,7 @@ def recode(video: Path, change: Callable[[list[Any]], object] = lambda images: N
 
 
 def rewrite_video(dataset: Path, key: str, change: Callable[[list[Any]], list[Any]]) -> None:
-    """The images of a camera's only file, changed and coded anew at the rate of the dataset."""
+    """Change the images of a camera's only file, and encode them at the rate of the dataset."""
     import av
 
     path = next(dataset.glob(f"videos/{key}/*/*.mp4"))

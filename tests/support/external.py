@@ -1,6 +1,6 @@
-"""Made-up external episodes: a two-jointed arm with a gripper, of which two cameras send images at their own pace.
+"""Synthetic external episodes: a two-jointed arm with a gripper, and two cameras with independent rates.
 
-Nothing here needs a simulator. The time is uneven and the streams have stamps of their own.
+Nothing here needs a simulator. Frames are unevenly spaced, and each stream has separate timestamps.
 """
 
 from __future__ import annotations
@@ -42,10 +42,10 @@ START_NS = 1_700_000_000_123_456_789
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Episode:
-    """What is written.
+    """An episode to be written.
 
     Attributes:
-        info, frames, outcome: As the writer takes them.
+        info, frames, outcome: Arguments of the writer.
         images: Camera -> (stamp, pixels) in order.
     """
 
@@ -63,7 +63,9 @@ def make_external(
     episode_index: int = 0,
     success: bool | None = True,
 ) -> Episode:
-    """An episode: frames 20 to 45 ms apart; the camera `wrist` sends every second frame an image, held by two."""
+    """Make an episode: frames 20 to 45 ms apart; the camera `wrist` has an image every second frame, which is repeated
+    once.
+    """
     random = np.random.default_rng(episode_index)
     info = EpisodeInfo(
         episode_index=episode_index,
@@ -79,14 +81,14 @@ def make_external(
     times = START_NS + np.cumsum(random.integers(20_000_000, 45_000_000, num_frames))
     images: dict[str, list[tuple[int, NDArray[np.uint8]]]] = {camera.name: [] for camera in cameras}
     frames = []
-    phases = random.uniform(-np.pi, np.pi, (2, 3))  # of joints that swing, no faster than motors are
+    phases = random.uniform(-np.pi, np.pi, (2, 3))  # joints that swing, no faster than motors
     for index, time_ns in enumerate(times.tolist()):
         held = {}
         for camera in cameras:
             if camera.name == "top" or index % 2 == 1:
                 pixels = _image(camera, index)
                 images[camera.name].append((time_ns - 7_000_000, pixels))
-            if images[camera.name]:  # the wrist has none at the first frame
+            if images[camera.name]:  # the wrist camera has none at the first frame
                 held[camera.name] = len(images[camera.name]) - 1
         frames.append(
             SampledFrame(
@@ -106,7 +108,7 @@ def make_external(
 
 
 def _image(camera: Camera, index: int) -> NDArray[np.uint8]:
-    """A ramp whose brightness tells the frame."""
+    """A ramp whose brightness identifies the frame."""
     pixels = np.zeros((camera.height, camera.width, 3), dtype=np.uint8)
     pixels[..., 0] = np.linspace(0, 200, camera.width).astype(np.uint8)
     pixels[..., 1] = 5 * (index % 50)
@@ -115,7 +117,7 @@ def _image(camera: Camera, index: int) -> NDArray[np.uint8]:
 
 
 def write_images_and_frames(writer: SampledWriter, episode: Episode) -> None:
-    """Everything but the end."""
+    """Write everything except the end."""
     given = dict.fromkeys(episode.images, 0)
     for frame in episode.frames:
         for name, number in frame.images.items():
@@ -127,7 +129,7 @@ def write_images_and_frames(writer: SampledWriter, episode: Episode) -> None:
 
 
 def write_external(path: Path, episode: Episode | None = None, *, video: VideoConfig | None = None) -> Path:
-    """A recording of an external episode."""
+    """Record an external episode."""
     episode = episode or make_external()
     with SampledWriter(path, episode.info, video=video) as writer:
         write_images_and_frames(writer, episode)

@@ -1,4 +1,4 @@
-"""A LeRobot v3.0 dataset as somebody's own program may write it, by PyArrow and JSON alone: images in its rows."""
+"""A LeRobot v3.0 dataset as another program may write it, by PyArrow and JSON alone, with images in its rows."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ def write_foreign(
     size: tuple[int, int] = (64, 48),
     state: Mapping[str, Sequence[float]] | None = None,
 ) -> Path:
-    """Some episodes of `length` rows at 10 Hz, with a state, an action and a camera of `size` (width, height).
+    """Write episodes of `length` rows at 10 Hz, with a state, an action and a camera of `size` (width, height).
 
-    The state has what `state` gives for each element and row, or else noise.
+    The values of the state are those of `state` for each element and row, by default noise.
     """
     for place in (DATA, EPISODES):
         (root / place).parent.mkdir(parents=True)

@@ -30,9 +30,9 @@ from demorec.core.limited import continue_in_child
 from demorec.core.text import printable
 
 MAX_BYTES = 600_000_000
-"""Private memory for an input of less than a megabyte: 500 MB, 20 MB, and what is filled until the parent looks."""
+"""Private memory for an input of less than a megabyte: 500 MB, 20 MB, and growth until the parent measures again."""
 MAX_CPU_S = 32.0
-"""20 s, 10 s for a megabyte, and what the processes around the command take."""
+"""20 s, 10 s for a megabyte, and the processes around the command."""
 
 
 class Told(NamedTuple):
@@ -55,7 +55,7 @@ class LimitedCommands:
         self._modules = modules
 
     def __enter__(self) -> Self:
-        # -P: the modules beside this file (mcap, docs ...) must not stand before the libraries of their names.
+        # -P: the modules in this folder (mcap, docs ...) must not shadow libraries of the same name.
         command = [sys.executable, "-P", __file__, *self._modules]
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
         return self
@@ -77,7 +77,7 @@ class LimitedCommands:
         return Told(*json.loads(line))
 
     def refused(self, *arguments: str | Path) -> str:
-        """What a command says that must refuse: a sentence, within the bounds."""
+        """Check that a command refuses its input with one sentence, within the limits, and return the sentence."""
         told = self.run(*arguments)
         assert told.code in (1, 2), told
         assert problem_of(told) == "", told
@@ -85,9 +85,9 @@ class LimitedCommands:
 
 
 def problem_of(told: Told) -> str:
-    """What is wrong with an answer to an input of any kind; "" when it is within the bounds.
+    """Describe the fault of a command's reaction to any input; "" if there is none.
 
-    Success, or exit code 1 or 2 with a sentence: no traceback, no request to report it, bounded memory and time.
+    Accepted are success, and exit code 1 or 2 with a sentence: no traceback, no bug report, bounded memory and time.
     """
     if told.code not in (0, 1, 2):
         return f"exit code {told.code} after {told.seconds:.1f} s"
@@ -102,7 +102,7 @@ def problem_of(told: Told) -> str:
 
 
 def changed_bytes(data: bytes, chance: random.Random) -> bytes:
-    """The same with some bytes exchanged, taken out, doubled or cut off."""
+    """Copy with some bytes exchanged, removed, doubled or cut off."""
     changed = bytearray(data)
     for _ in range(chance.choice((1, 1, 2, 4, 16))):
         at = chance.randrange(max(1, len(changed)))
@@ -126,17 +126,17 @@ def changed_bytes(data: bytes, chance: random.Random) -> bytes:
 
 
 class Fuzzed(Protocol):
-    """Inputs by number, and what is left of a command that had one."""
+    """Numbered inputs."""
 
     def case(self, number: int) -> tuple[str, list[str]]:
-        """What was done to an input, and a command with it."""
+        """Description of the change to an input, and a command that reads it."""
 
     def clear(self) -> None:
-        """Remove what the command has written."""
+        """Remove the command's output."""
 
 
 def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
-    """Of commands in this process, below the net for unforeseen errors: any other exception fails the test."""
+    """Run commands in this process, inside the handler of unexpected errors: any other exception fails the test."""
     results: Counter[str] = Counter()
     for number in numbers:
         what, (name, *arguments) = fuzzed.case(number)
@@ -157,7 +157,7 @@ def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
 
 
 def problems_within_limits(fuzzed: Fuzzed, numbers: Iterable[int], modules: Sequence[str]) -> list[str]:
-    """Of commands in processes of their own, in little memory and time."""
+    """Run commands in separate processes with little memory and time."""
     found = []
     with LimitedCommands(modules) as commands:
         for number in numbers:

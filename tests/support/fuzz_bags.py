@@ -1,4 +1,4 @@
-"""Hostile bags, each from its number: valid in their structure, with parts exchanged, blown up or cut off."""
+"""Hostile bags, each a function of its number: structurally valid, with parts exchanged, enlarged or cut off."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _EXTRAS = (
 
 
 class FuzzedBags:
-    """Makes cases below a folder: the arguments of a command for each number, the same for the same number."""
+    """Cases in a folder: each number gives the same arguments of a command every time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -87,7 +87,7 @@ class FuzzedBags:
         shutil.rmtree(self.folder / "run", ignore_errors=True)
 
     def case(self, number: int) -> tuple[str, list[str]]:
-        """What it is, and the arguments of `demorec`."""
+        """Description of the case, and the arguments of `demorec`."""
         chance = random.Random(number)
         kinds: tuple[Callable[[random.Random, Path], tuple[Path, str]], ...] = (
             self._bytes, self._ros1_bytes, self._database_bytes, self._yaml, self._toml,

@@ -1,4 +1,4 @@
-"""Hostile datasets, HDF5 files, runs, recordings, policies, each from its number: valid ones with parts exchanged."""
+"""Hostile datasets, HDF5 files, runs, recordings and policies, each a function of its number and mostly valid."""
 
 from __future__ import annotations
 
@@ -72,16 +72,16 @@ dataset = "obs/agentview_image"
 colors = "rgb"
 """
 _CHECKS = tuple(name for name in FILE_CHECKS.names() if name.startswith("dataset_") and name != "lerobot_opens")
-"""Of datasets; LeRobot takes seconds to load."""
+"""Commands on datasets; LeRobot takes seconds to load."""
 Case = tuple[str, list[str]]
 
 
 class FuzzedData:
-    """Makes cases below a folder: the arguments of a command for each number, the same for the same number."""
+    """Cases in a folder: each number gives the same arguments of a command every time."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        warm_up()  # no command is to pay for what is compiled once
+        warm_up()  # compile once, at no command's expense
         self._good = write_episode(folder / "good.mcap", num_frames=12, cameras=("front",))
         self._external = write_external(folder / "collected.mcap")
         make_run(folder / "run", (4, 5), failures=(6,), cameras=())
@@ -93,12 +93,12 @@ class FuzzedData:
             self._metadata = {name: recording._container.metadata(name) or {} for name in names}
 
     def clear(self) -> None:
-        """Remove what a command has made."""
+        """Remove a command's output."""
         for path in self.folder.glob("out*"):
             shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def case(self, number: int) -> Case:
-        """What was changed, and the arguments of the command that meets it."""
+        """Description of the change, and the arguments of the command that reads it."""
         chance = random.Random(number)
         made: Callable[[random.Random], Case] = chance.choice(
             (self._dataset,) * 3 + (self._hdf5, self._recording) * 2 + (self._run, self._policy)
@@ -238,7 +238,7 @@ _RUNS: dict[str, dict[str, Any]] = {
 
 
 def _change(file: Path, chance: random.Random) -> str:
-    """Change a file in place; in words how."""
+    """Change a file in place; return a description."""
     if file.suffix == ".json" and chance.random() < 0.85:
         data = json.loads(file.read_text())
         what = "; ".join(_change_json(data, chance) for _ in range(chance.choice((1, 1, 1, 2, 4))))
@@ -291,7 +291,7 @@ def _change_json(data: Any, chance: random.Random) -> str:
 
 
 def _change_message(data: bytes, chance: random.Random) -> bytes:
-    """A message cut off, longer, empty, or with other numbers in it."""
+    """Make a message shorter, longer or empty, or change numbers in it."""
     kind = chance.randrange(6)
     if kind == 0:
         return data[: chance.randrange(len(data) + 1)]
@@ -333,7 +333,7 @@ def _change_table(table: pa.Table, chance: random.Random) -> tuple[pa.Table, str
 
 
 def _fitting(cells: list[Any], kind: pa.DataType) -> list[Any]:
-    """Null in place of what a column of this type cannot hold."""
+    """Replace each value that a column of this type cannot hold with null."""
     found = []
     for cell in cells:
         try:
@@ -345,7 +345,7 @@ def _fitting(cells: list[Any], kind: pa.DataType) -> list[Any]:
 
 
 def _change_hdf5(file: h5py.File, chance: random.Random) -> str:
-    """Change an open file; in words how. What the library refuses stays as it was."""
+    """Change an open file; return a description. Changes that the library refuses have no effect."""
     try:
         return _changed_hdf5(file, chance)
     except (OSError, ValueError, RuntimeError, KeyError, TypeError) as error:

@@ -1,4 +1,4 @@
-"""Runs of stand-in recordings (`support.makers`), with the real machinery around them.
+"""Runs of stand-in recordings (`support.makers`) with the real code around them.
 
 As a program (`python -m support.generate OUT MAKER NUM_EPISODES WORKERS GRACE_S`) it is a driver that tests can kill.
 """
@@ -21,16 +21,16 @@ from support.makers import line_of, succeeds
 
 
 def inspect(path: Path) -> tuple[Attempt, dict[str, Any], dict[str, str]]:
-    """Reads a stand-in recording."""
+    """Read a stand-in recording."""
     try:
         content = json.loads(read_text_limited(path, 100_000))
         return line_of(path, content, path.name), content["config"], content["versions"]
     except (ValueError, KeyError) as error:
-        raise DemorecError("it is no recording") from error
+        raise DemorecError("it is not a recording") from error
 
 
 class Remembers(RunObserver):
-    """Keeps what it was told."""
+    """Observer that keeps its messages."""
 
     def __init__(self) -> None:
         self.said: list[str] = []
@@ -40,7 +40,7 @@ class Remembers(RunObserver):
 
 
 class Tells(RunObserver):
-    """Prints what it is told."""
+    """Observer that prints its messages."""
 
     def says(self, message: str) -> None:
         print(message, flush=True)
@@ -59,7 +59,7 @@ def run_fake(
     progress: RunObserver | None = None,
     episodes: list[int] | None = None,
 ) -> RunResult:
-    """A run of stand-in recordings."""
+    """Generate a run of stand-in recordings."""
     return generate(
         GenerateConfig(seed=seed, cameras=()),
         RunOptions(
@@ -83,12 +83,12 @@ def attempts_of(result: RunResult) -> dict[tuple[int, int], bool]:
 
 
 def num_finished(out: Path) -> int:
-    """Recordings that lie in a run's episodes/ now."""
+    """Number of recordings in a run's episodes/ now."""
     return len(list((out / "episodes").glob("*.mcap")))
 
 
 def expected_attempts(num_episodes: int, *, seed: int = 0, max_attempts: int = 3) -> dict[tuple[int, int], bool]:
-    """What a run must come to, from the definition: attempts follow each other until one succeeds."""
+    """Attempts that a run must make, by definition: an episode is attempted until an attempt succeeds."""
     expected = {}
     for episode in range(num_episodes):
         for attempt in range(max_attempts):

@@ -1,4 +1,4 @@
-"""HDF5 files of other people, written by h5py alone in the layouts that robomimic's and ALOHA's sources document."""
+"""HDF5 files of other projects, written by h5py alone in the layouts that robomimic's and ALOHA's sources document."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ ALOHA_CAMERAS = ("cam_high", "cam_left_wrist")
 
 
 def images(count: int, seed: int) -> NDArray[np.uint8]:
-    """(T, H, W, 3): a ramp whose brightness tells the row, and a red corner, by which exchanged colours are seen."""
+    """(T, H, W, 3): a ramp whose brightness identifies the row, and a red corner that reveals exchanged colours."""
     shown = np.zeros((count, HEIGHT, WIDTH, 3), np.uint8)
     shown[..., 1] = np.linspace(0, 200, WIDTH).astype(np.uint8)
     shown[..., 2] = (20 * np.arange(count) + seed).astype(np.uint8)[:, np.newaxis, np.newaxis]
@@ -26,9 +26,9 @@ def images(count: int, seed: int) -> NDArray[np.uint8]:
 
 
 def write_robomimic(path: Path, *, control_freq: float | None = 20.0, compression: str | None = None) -> Path:
-    """A processed robosuite dataset: data/demo_N with actions, rewards, dones, states, obs; masks; env_args.
+    """Write a processed robosuite dataset: data/demo_N with actions, rewards, dones, states, obs; masks; env_args.
 
-    demo_10 stands where demo_2 would, so that the order of names is not that of numbers.
+    demo_10 takes the place of demo_2, so that names and numbers sort differently.
     """
     rng = np.random.default_rng(1)
     with h5py.File(path, "w") as file:
@@ -63,14 +63,14 @@ def write_robomimic(path: Path, *, control_freq: float | None = 20.0, compressio
 
 
 def jpeg(image: NDArray[np.uint8], quality: int) -> bytes:
-    """An image as a JPEG file."""
+    """Encode an image as a JPEG file."""
     stored = io.BytesIO()
     Image.fromarray(image).save(stored, "JPEG", quality=quality)
     return stored.getvalue()
 
 
 def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed: int = 0) -> Path:
-    """An episode of ALOHA: qpos, qvel, images, action; mobile ALOHA's base_action, and its JPEG files if compressed."""
+    """Write an ALOHA episode: qpos, qvel, images, action; mobile ALOHA's base_action, and JPEG images if compressed."""
     rng = np.random.default_rng(seed)
     path.parent.mkdir(exist_ok=True)
     with h5py.File(path, "w", rdcc_nbytes=2 << 20) as file:
@@ -88,7 +88,8 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
                 stored = group.create_dataset(camera, (count, width), "uint8", chunks=(1, width))
                 for number, data in enumerate(row):
                     stored[number] = np.frombuffer(data.ljust(width, b"\0"), np.uint8)
-            # As ALOHA's recorders write it: float32, cameras in the order of their own list, which is not the file's.
+            # As ALOHA's recorders write it: float32, cameras in the order of their own list, which differs from the
+            # file's.
             lengths = [[len(data) for data in coded[camera]] for camera in reversed(ALOHA_CAMERAS)]
             file.create_dataset("compress_len", data=np.array(lengths), dtype="f4")
         else:
@@ -103,7 +104,7 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
 
 
 def write_isaac(path: Path, *, robot: str = "robot", count: int = 6) -> Path:
-    """A file as Isaac Lab's recorder writes it: joint_pos relative to the default pose, quaternions with w first."""
+    """Write a file like Isaac Lab's recorder: joint_pos relative to the default pose, quaternions with w first."""
     rng = np.random.default_rng(2)
     default = rng.normal(size=9)
     with h5py.File(path, "w") as file:
@@ -126,7 +127,7 @@ def write_isaac(path: Path, *, robot: str = "robot", count: int = 6) -> Path:
 def write_groups_at_root(
     path: Path, *, action: str = "action", state: str = "observation", others: tuple[str, ...] = (), count: int = 5
 ) -> Path:
-    """A file whose groups at the root are the episodes."""
+    """Write a file whose groups at the root are the episodes."""
     rng = np.random.default_rng(3)
     with h5py.File(path, "w") as file:
         for name in ("demo_0", "demo_2", "demo_10"):

@@ -1,4 +1,4 @@
-"""generate-dataset in a separate process, killed at random moments."""
+"""generate in a separate process, killed at random moments."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from support.generate import num_finished
 
 
 def generation(out: Path, num_episodes: int, *more: str, workers: int = 2) -> list[str]:
-    """Words of a program without LeRobot, which would verify the dataset in the end, for seconds."""
+    """Arguments of a program without LeRobot, whose verification of the dataset would take seconds."""
     entry = "import sys; sys.modules['lerobot'] = None; from demorec.cli import generate_dataset_main as main; main()"
     arguments = ["--out", str(out), "--num-episodes", str(num_episodes), "--workers", str(workers), "--no-check"]
     return [sys.executable, "-c", entry, *arguments, "--cameras", "wrist", "--width", "32", "--height", "32", *more]
 
 
 def made_of(folder: Path) -> tuple[str, list[str], str]:
-    """Digest of a run, of each of its recordings, and of its dataset."""
+    """Digests of a run, of each of its recordings, and of its dataset."""
     run = load_run_file(folder)
     assert run.export is not None
     return run.digest, [attempt.sha256 for attempt in run.attempts], run.export.dataset_digest
 
 
 def run_killed(out: Path, num_episodes: int, *, num_kills: int) -> None:
-    """Generate, with SIGKILL for driver and workers in turn, at moments spread over the run, the start included.
+    """Generate, and kill driver and workers in turn, at moments spread over the run, including the start.
 
-    However slowly workers start on a busy machine, between two kills of the driver there are fewer kills of workers
+    Even if workers start slowly on a busy machine, between two kills of the driver there are fewer kills of workers
     than one episode survives (`MAX_LOSSES`).
     """
     chance, killed = random.Random(7), {"driver": 0, "worker": 0}

@@ -1,4 +1,4 @@
-"""Reading language columns and phrases without the code that wrote them."""
+"""Read language columns and phrases without the code that writes them."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def language_of(dataset: Path) -> list[list[tuple[list[Row], list[Row]]]]:
 
 
 def active(rows: Sequence[Row], style: str, time: float) -> list[Row]:
-    """All rows of a style that begin last before or at a time: one, unless something is wrong."""
+    """All rows of a style with the latest start at or before a time: one, unless there is an error."""
     begun = [row for row in rows if row["style"] == style and row["timestamp"] <= time]
     latest = max((row["timestamp"] for row in begun), default=-1.0)
     return [row for row in begun if row["timestamp"] == latest]
@@ -73,7 +73,7 @@ NOUNS: dict[str, Callable[[Body], bool]] = {
         lambda body: body.role == "target" and not body.name.endswith(("tray", "bowl", "plate")),
     ),
 }
-"""Word -> whether it is a word for a body, as a person looking at the scene would say."""
+"""Word -> whether it names a body, from the view of a person."""
 _PHRASE = re.compile(
     r"\b(the|every) ((?:(?:left|right|middle|small|large)\w* )?)"
     r"((?:red|green|blue|yellow|orange|purple|white|grey|black) )?"
@@ -87,14 +87,14 @@ def phrases(text: str) -> list[tuple[str, ...]]:
 
 
 def scene_at(scene: Scene, world_from_object: Mapping[str, Any]) -> Scene:
-    """The scene with bodies at other poses (7,): a phrase is true of the moment at which it is said."""
+    """Move the bodies of a scene to other poses (7,): a phrase refers to the moment at which it is used."""
     poses = {name: Pose(position=pose[:3], quat_xyzw=pose[3:]) for name, pose in world_from_object.items()}
     bodies = (replace(body, world_from_body=poses.get(body.name, body.world_from_body)) for body in scene.bodies)
     return replace(scene, bodies=tuple(bodies))
 
 
 def meant(phrase: tuple[str, ...], scene: Scene) -> list[str]:
-    """Names of the bodies that a phrase means, by trying all; a person's reading, without margins."""
+    """Names of the bodies that a phrase refers to, by brute force; as a person reads it, without margins."""
     _, article, order, color, noun, nearness = phrase
     fitting = [body for body in scene.bodies if body.role != "fixture" and NOUNS[noun](body)]
     fitting = [body for body in fitting if color in ("", body.color_name)]

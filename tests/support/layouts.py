@@ -1,4 +1,4 @@
-"""Topics of other people's robots, a row each, with what a suggested mapping must make of them.
+"""Topics of third-party robots, a row each, with the expected result of a suggested mapping.
 
 Types, topics, names and rates are those of public drivers: ur_robot_driver, ROBOTIS's open_manipulator, Isaac Sim's
 ROS 2 bridge, realsense2_camera, ros2_controllers, Foxglove's SDK. All are written by `rosbags`, `mcap` or `foxglove`.
@@ -34,7 +34,7 @@ class Topic:
 
 @dataclass(frozen=True, kw_only=True)
 class Part:
-    """What a feature must have of a topic: the names, and the numbers of a message, None for one of others."""
+    """Expected elements of a feature from one topic: names, and the numbers of a message (None if unrelated)."""
 
     topic: str
     names: Sequence[str]
@@ -43,11 +43,11 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """A robot's topics, and what must come of them; an empty action is that of the next row.
+    """A robot's topics, and the expected features; an empty action is that of the next row.
 
     Attributes:
         clock_ns: Time of recording minus that of the headers.
-        write: Of the bag.
+        write: Function that writes the bag.
     """
 
     topics: Sequence[Topic]
@@ -58,7 +58,7 @@ class Layout:
     write: Callable[[Notes, Path], Path] = field(default=lambda notes, path: bags.write_rosbag2(notes, path / "bag"))
 
     def notes(self) -> Notes:
-        """Its messages, in the order of recording. Images begin last, so that a row can be at each of them."""
+        """Messages in the order of recording. Images begin last, so that each of them can have a row."""
         made = []
         for topic in self.topics:
             begin = EPOCH_NS + (NS // 20 if "image" in topic.type.lower() else 0)
@@ -83,7 +83,7 @@ def joints(topic: str, names: Sequence[str], *, shift: float = 0.0, rate: int = 
 
 
 def joint_part(topic: str, names: Sequence[str]) -> Part:
-    """Of a topic of JointState, by name, whatever the order, of those messages that name them."""
+    """Expect elements of a JointState topic by name, in any order, from those messages that contain them."""
 
     def numbers(body: Body) -> Any:
         have = dict(zip(body["name"], body["position"], strict=True))
@@ -205,7 +205,7 @@ def _mcap(notes: Notes, path: Path) -> Path:
 
 
 def _foxglove(notes: Notes, path: Path) -> Path:
-    """An MCAP file of Foxglove's own protobuf messages, by its SDK."""
+    """An MCAP file of Foxglove's own protobuf messages, written by its SDK."""
     import foxglove
     from foxglove.channels import CompressedImageChannel, JointStatesChannel
     from foxglove.messages import CompressedImage, JointState, JointStates, Timestamp

@@ -1,4 +1,4 @@
-"""LeRobot's own commands with demorec's plug-ins and stand-ins for hardware, as if all of it were installed."""
+"""Run LeRobot's commands as if demorec's plug-ins and stand-ins for hardware were installed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ ROOT = Path(__file__).parents[2]
 BENCH = Path(__file__).parent / "lerobot_bench"
 PLUGINS = tuple(sorted((ROOT / "plugins").glob("*/pyproject.toml")))
 STAND_INS = ("feetech-servo-sdk", "pyserial", "deepdiff", "lerobot_teleoperator_scripted", "lerobot_camera_still")
-"""Names of distributions: by them LeRobot asks what is installed."""
+"""Names of distributions, by which LeRobot looks for installed packages."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Command:
-    """One of LeRobot's commands: its module, its flags, what else is in its environment."""
+    """One of LeRobot's commands: its module, its flags, additional environment variables."""
 
     command: str
     args: Sequence[str]
@@ -28,12 +28,12 @@ class Command:
 
 
 def plugin_names() -> list[str]:
-    """Of the distributions in `plugins/`."""
+    """Names of the distributions in `plugins/`."""
     return [tomllib.loads(path.read_text())["project"]["name"] for path in PLUGINS]
 
 
 def run_commands(commands: Sequence[Command], folder: Path) -> str:
-    """Run them in one process, offline, with a home folder in `folder`; returns what they print."""
+    """Run commands in one process, offline, with a home folder in `folder`; returns their output."""
     places = [folder / "installed", BENCH, *(path.parent for path in PLUGINS), ROOT]
     for name in (*STAND_INS, *plugin_names()):
         about = places[0] / f"{name.replace('-', '_')}-1.0.0.dist-info"

@@ -1,4 +1,4 @@
-"""Makers that stand in for the simulator: the run's machinery is tested in milliseconds, with real processes.
+"""Makers that replace the simulator: runs are tested in milliseconds, with real processes.
 
 A stand-in recording is a JSON file, a pure function of its plan. Imports little, so that workers start quickly.
 """
@@ -22,12 +22,12 @@ from demorec.runs.run_file import Attempt, recording_name
 
 
 def succeeds(seed: int, episode: int, attempt: int) -> bool:
-    """About three of four attempts do, as a coin that only depends on which attempt it is."""
+    """Whether an attempt succeeds: about three of four do, by a coin toss that depends only on the attempt."""
     return hashlib.sha256(f"{seed} {episode} {attempt}".encode()).digest()[0] >= 64
 
 
 def make(plan: EpisodePlan, folder: Path) -> Attempt:
-    """A recording, at once."""
+    """Make a recording at once."""
     success = succeeds(plan.config.seed, plan.episode_index, plan.attempt)
     name = recording_name(plan.episode_index, plan.attempt, success=success)
     content = {
@@ -46,7 +46,7 @@ def make(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def make_slowly(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Leaves a part file while it works, for a second."""
+    """Keep a part file for a second, as if working."""
     part = folder / "unfinished" / f"{os.getpid()}.part"
     part.write_text("half")
     time.sleep(1.0)
@@ -55,27 +55,27 @@ def make_slowly(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def make_quickly(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Takes long enough to be killed in the middle of."""
+    """Take long enough to be killed during the work."""
     time.sleep(0.03)
     return make(plan, folder)
 
 
 def make_for_ever(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Never ends by itself; a file named after its process tells that it has begun."""
+    """Never end; a file named after the process marks the beginning."""
     (folder / "unfinished" / f"busy-{os.getpid()}").touch()
     while True:
         time.sleep(0.05)
 
 
 def make_stubbornly(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Never ends by itself and does not listen."""
+    """Never end, and ignore signals."""
     for number in (signal.SIGTERM, signal.SIGUSR1):
         signal.signal(number, signal.SIG_IGN)
     return make_for_ever(plan, folder)
 
 
 def die_once(plan: EpisodePlan, folder: Path) -> Attempt:
-    """The first worker that is given episode 2 is killed."""
+    """Die in the first worker that gets episode 2."""
     witness = folder / "unfinished" / "witness"
     if plan.episode_index == 2 and not witness.exists():
         witness.touch()
@@ -84,14 +84,14 @@ def die_once(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def die_always(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Every worker that is given episode 2 is killed."""
+    """Die in every worker that gets episode 2."""
     if plan.episode_index == 2:
         os.kill(os.getpid(), signal.SIGKILL)
     return make(plan, folder)
 
 
 def fill_the_disk(plan: EpisodePlan, folder: Path) -> Attempt:
-    """The disk is full at episode 2; the library in between has wrapped the error."""
+    """Fail at episode 2 because the disk is full, with the error wrapped by a library."""
     if plan.episode_index == 2:
         try:
             raise OSError(errno.ENOSPC, "No space left on device")
@@ -101,7 +101,7 @@ def fill_the_disk(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def write_too_much(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Episode 2 is larger than the limit of this process (ulimit -f) allows a file to be."""
+    """Write more at episode 2 than the process's limit of file sizes (ulimit -f) allows."""
     if plan.episode_index == 2:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
         (folder / "unfinished" / "large.part").write_bytes(bytes(2000))
@@ -109,21 +109,21 @@ def write_too_much(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def break_the_disk(plan: EpisodePlan, folder: Path) -> Attempt:
-    """The disk cannot write episode 2, however often it is tried."""
+    """Fail to write episode 2, at every attempt."""
     if plan.episode_index == 2:
         raise OSError(errno.EIO, "Input/output error")
     return make(plan, folder)
 
 
 def lose_the_folder(plan: EpisodePlan, folder: Path) -> Attempt:
-    """The folder is moved away by somebody at episode 2."""
+    """Move the folder away at episode 2, as a user might."""
     if plan.episode_index == 2:
         folder.rename(folder.with_name("elsewhere"))
     return make(plan, folder)
 
 
 def flicker(plan: EpisodePlan, folder: Path) -> Attempt:
-    """The network file system has a bad moment at episode 2."""
+    """Fail once at episode 2, like an unreliable network file system."""
     witness = folder / "unfinished" / "witness"
     if plan.episode_index == 2 and not witness.exists():
         witness.touch()
@@ -132,7 +132,7 @@ def flicker(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def raise_a_bug(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Somebody's task has a bug, with an exception that cannot be pickled."""
+    """Raise an exception that cannot be pickled, as from a bug in a user's task."""
 
     class LocalError(Exception):
         pass
@@ -143,18 +143,18 @@ def raise_a_bug(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def raise_ours(plan: EpisodePlan, folder: Path) -> Attempt:
-    """A renderer that does not work here."""
+    """Raise the error of a renderer that does not work here."""
     raise RenderError("No OpenGL library was found.")
 
 
 def report_pid(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Leaves a file named after its process and the threads that it would use."""
+    """Leave a file named after the process and its number of threads."""
     (folder / "unfinished" / f"pid-{os.getpid()}-{os.environ.get('OMP_NUM_THREADS')}").touch()
     return make(plan, folder)
 
 
 def line_of(path: Path, content: dict[str, object], file: str) -> Attempt:
-    """The line of run.json of a stand-in recording."""
+    """Line of run.json for a stand-in recording."""
     return Attempt(
         episode_index=int(str(content["episode_index"])),
         attempt=int(str(content["attempt"])),

@@ -1,6 +1,6 @@
-"""MCAP files with anything in them: written record by record, as the specification has them, without the library.
+"""MCAP files with arbitrary content: written record by record by the specification, without the library.
 
-https://mcap.dev/spec names the records; numbers are little endian, strings and maps carry a length of four bytes.
+https://mcap.dev/spec lists the records; numbers are little endian, strings and maps have a length of four bytes.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def message_record(channel: int, time_ns: int, data: bytes) -> bytes:
 
 
 def chunk_record(packed: bytes, *, size: int, crc: int) -> bytes:
-    """A chunk of zstd data which says that it unpacks to `size` bytes."""
+    """A chunk of zstd data whose declared size is `size` bytes."""
     head = struct.pack("<QQQI", 0, 0, size, crc) + string("zstd") + struct.pack("<Q", len(packed))
     return record(6, head + packed)
 
@@ -47,7 +47,7 @@ def metadata_record(name: str, values: Mapping[str, str]) -> bytes:
 
 
 def sealed(values: Mapping[str, str]) -> dict[str, str]:
-    """Metadata with the checksum that our own carry (docs/recording.md)."""
+    """Metadata with the checksum that demorec's own have (docs/recording.md)."""
     content = {key: value for key, value in values.items() if key != "crc32"}
     return {**content, "crc32": f"{zlib.crc32(json.dumps(content, sort_keys=True).encode()):08x}"}
 
@@ -68,15 +68,15 @@ def rewritten(
     counts: Callable[[str, int], int] | None = None,
     with_checksums: bool = True,
 ) -> bytes:
-    """The bytes of another MCAP file with the content of `source`.
+    """Write the content of `source` as another MCAP file, returned as bytes.
 
     Args:
         source: A recording.
-        extra_chunks: Chunk records that are added; the index says that they hold messages of every topic.
+        extra_chunks: Additional chunk records; the index lists messages of every topic in them.
         change: Name -> values that replace those of metadata records, which are sealed again.
         metadata: Name -> metadata records that replace those of the source as they are.
-        messages: (topic, message) -> the message that is written in its place.
-        counts: (topic, number of messages) -> what the statistics say.
+        messages: (topic, message) -> its replacement.
+        counts: (topic, number of messages) -> number in the statistics.
         with_checksums: Whether chunks and summary get theirs.
     """
     schemas: dict[int, Schema] = {}

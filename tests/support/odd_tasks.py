@@ -1,4 +1,4 @@
-"""Tasks with one fault each, for the tests of `demorec.testing`; pick_place where nothing else is said."""
+"""Tasks with one fault each, for the tests of `demorec.testing`; otherwise like pick_place."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class OutOfReach(PickPlace):
 
 
 class FarAway(PickPlace):
-    """The cube lies beyond the arm's reach in every layout."""
+    """The cube is out of the arm's reach in every layout."""
 
     def sample_scene(self, robot: RobotSpec, sampler: Sampler) -> Scene:
         scene = super().sample_scene(robot, sampler)
@@ -70,7 +70,7 @@ class FarAway(PickPlace):
 
 
 class Wide(PickPlace):
-    """The cube lies up to 1.1 m from the base, much of which no arm reaches."""
+    """The cube is up to 1.1 m from the base, largely out of any arm's reach."""
 
     def layout(self, sampler: Sampler) -> Layout:
         start = sampler.point(Region(x=(0.4, 1.1), y=(-0.1, 0.1), max_radius=1.2))
@@ -89,14 +89,14 @@ class DoneAlready(PickPlace):
 
 
 class Idle(PickPlace):
-    """Rises a little and calls it a day."""
+    """Rise a little, then stop."""
 
     def script(self, expert: Expert) -> Iterator[Step]:
         yield from expert.move(raised(expert.tcp(), 0.02), speed=0.3)
 
 
 class HeavyHanded(PickPlace):
-    """Presses down on the cube with shut fingers."""
+    """Press down on the cube with closed fingers."""
 
     def script(self, expert: Expert) -> Iterator[Step]:
         (cube,) = expert.world.scene.movable
@@ -108,14 +108,14 @@ class HeavyHanded(PickPlace):
 
 
 class Moody(PickPlace):
-    """Rises by another height each time."""
+    """Rise by a different height each time."""
 
     def script(self, expert: Expert) -> Iterator[Step]:
         yield from expert.move(raised(expert.tcp(), 0.02 + 0.01 * next(_CALLS)), speed=0.3)
 
 
 class Hasty(PickPlace):
-    """Turns the first joint by a radian in one step."""
+    """Turn the first joint by a radian in one step."""
 
     def script(self, expert: Expert) -> Iterator[Step]:
         for step in expert.move(raised(expert.tcp(), 0.02), speed=0.3):

@@ -28,7 +28,7 @@ class Option(NamedTuple):
         return _POSITIONAL in get_args(self.type)
 
     def takes(self, *kinds: object) -> bool:
-        """Whether its values, or those of a pair or list, are of one of these types."""
+        """Whether its values, or those of a pair or list, have one of these types."""
         return any(kind in kinds for kind in parts_of(self.type))
 
     @property
@@ -70,4 +70,4 @@ def _options() -> Iterator[Option]:
 
 OPTIONS = tuple(_options())
 TARGETS = [option for option in OPTIONS if {Target, OptionalTarget} & {option.type}]
-"""Those that name a new file or folder."""
+"""Options that name a new file or folder."""

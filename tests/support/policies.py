@@ -1,4 +1,4 @@
-"""A policy that needs neither LeRobot nor PyTorch, in the workers of `demorec evaluate`."""
+"""A policy that needs neither LeRobot nor PyTorch, for workers of `demorec evaluate`."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from demorec.runs.run_file import Attempt
 
 
 class Lazy:
-    """Stays where it is."""
+    """A policy that never moves."""
 
     def __init__(self, *_: object, **__: object) -> None:
         pass

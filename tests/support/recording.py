@@ -1,4 +1,4 @@
-"""Made-up episodes: a Panda whose joints move and whose cameras see images that differ by frame and by camera.
+"""Synthetic episodes: a Panda whose joints move and whose cameras see images that differ by frame and by camera.
 
 Nothing here needs the simulator. `make_episode` is a pure function of its arguments.
 """
@@ -76,9 +76,9 @@ def make_episode(
     physics_rate_joints: bool = False,
     seed: int = 0,
 ) -> tuple[EpisodeInfo, list[Frame], Outcome]:
-    """An episode in memory: what is known before it, its frames, how it ended.
+    """Make an episode in memory: its description, its frames and its outcome.
 
-    `physics_rate_joints` adds joint samples between the frames. Camera "front" stands in the world, every other one
+    `physics_rate_joints` adds joint samples between the frames. Camera "front" is fixed in the world, every other one
     sits on the hand.
     """
     specs = tuple(_camera(name, width, height) for name in cameras)
@@ -128,7 +128,7 @@ def make_episode(
 
 
 def frame_number(image: NDArray[np.uint8]) -> int:
-    """The frame's number modulo 256, from the bar code at the bottom of its image, coded or not."""
+    """The frame's number modulo 256, from the bar code at the bottom of its image, encoded or not."""
     side = -(-image.shape[1] // 8)
     blocks = [image[-6:-2, bit * side + 1 : (bit + 1) * side - 1].mean() for bit in range(8)]
     return sum(1 << bit for bit, value in enumerate(blocks) if value > 125)

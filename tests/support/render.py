@@ -1,4 +1,4 @@
-"""Scenes for the renderers, and what a camera must see in them, worked out by casting rays in NumPy."""
+"""Scenes for the renderers, and the expected images of a camera, computed by ray casting in NumPy."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ DATA = pybullet_data.getDataPath()
 
 
 def connect() -> Any:
-    """An empty client."""
+    """Connect to an empty client."""
     client = BulletClient(pybullet.DIRECT)
     client.setAdditionalSearchPath(DATA)
     return client
@@ -70,12 +70,12 @@ class ClientWorld:
 
 
 def draw(renderer: Renderer, client: Any) -> dict[str, CameraImages]:
-    """What a renderer that was set up for a client sees in its present state."""
+    """Draw the present state of a client with a renderer that was set up for it."""
     return renderer.render(body_poses(client))
 
 
 def add(client: Any, kind: str, size: tuple[float, ...], pose: Pose | None = None, **visual: Any) -> int:
-    """A body of one visual shape that stands still (mass 0) unless a mass is given; returns its index."""
+    """Add a body of one visual shape, fixed (mass 0) unless a mass is given; returns its index."""
     pose = pose or Pose()
     mass = visual.pop("mass", 0.0)
     geometry = {
@@ -100,7 +100,7 @@ def rays(cam: SceneCamera, world_from_body: Pose) -> tuple[NDArray[np.float64], 
 
 
 def cast_sphere(radius: float, origin: Any, direction: Any, centre: Any = (0, 0, 0)) -> NDArray[np.float64]:
-    """(H, W) depth of a sphere, inf where it is missed."""
+    """(H, W) depth of a sphere, inf for rays that miss it."""
     o = np.asarray(origin) - np.asarray(centre)
     a, b, c = (direction**2).sum(-1), (direction * o).sum(-1), (o * o).sum() - radius**2
     root = b * b - a * c
@@ -144,14 +144,14 @@ def cast_capsule(radius: float, length: float, origin: Any, direction: Any) -> N
 
 
 def project(cam: SceneCamera, point: Any) -> NDArray[np.float64]:
-    """(2,) place in the image, pixels, of a point in the world."""
+    """(2,) image position, pixels, of a point in the world."""
     seen = cam.mount_from_camera.inverse().apply(np.asarray(point, dtype=np.float64))
     image = cam.intrinsics @ seen
     return np.asarray(image[:2] / image[2])
 
 
 def away_from_borders(labels: NDArray[np.int32], distance: int = 1) -> NDArray[np.bool_]:
-    """(H, W) pixels all of whose neighbours within `distance` have the same label."""
+    """(H, W) whether all neighbours of a pixel within `distance` have the same label."""
     same = np.ones(labels.shape, dtype=bool)
     for dy in range(-distance, distance + 1):
         for dx in range(-distance, distance + 1):
@@ -181,7 +181,7 @@ def panda_scene(client: Any) -> dict[str, Any]:
 
 
 def pose_panda(client: Any, bodies: dict[str, Any], t: float) -> None:
-    """Put the arm somewhere on a path, and the first cube too."""
+    """Move the arm to a point of a path, and the first cube too."""
     home = (0.0, -0.3, 0.0, -2.2, 0.0, 2.0, 0.785, 0.04, 0.04)
     for k, (joint, q) in enumerate(zip(bodies["joints"], home, strict=True)):
         client.resetJointState(bodies["panda"], joint, q + (0.25 * math.sin(t + k) if k < 7 else 0.0))
@@ -214,16 +214,16 @@ def panda_cameras(width: int, height: int) -> tuple[SceneCamera, SceneCamera]:
 
 
 def panda_mounts(bodies: dict[str, Any]) -> dict[str, Mount]:
-    """Where the wrist camera is."""
+    """Pose of the wrist camera."""
     return {"hand": Mount(body=bodies["panda"], link=8)}
 
 
 def centred_tiny_segmentation(client: Any, cam: SceneCamera, world_from_camera: Pose) -> NDArray[np.int32]:
-    """TinyRenderer's segmentation with its half pixel taken out: it samples pixels at their corner."""
+    """TinyRenderer's segmentation without its half-pixel shift: it samples pixels at their corner."""
     projection = np.array(
         client.computeProjectionMatrixFOV(math.degrees(cam.fov_y), cam.width / cam.height, cam.near, cam.far)
     )
-    # Clip coordinates move by this share of w = -z: half a pixel left and up.
+    # Clip coordinates move by this ratio of w = -z: half a pixel left and up.
     projection[8] += TINY_SHIFT[0] / cam.width
     projection[9] += TINY_SHIFT[1] / cam.height
     _, _, _, _, labels = client.getCameraImage(

@@ -1,4 +1,4 @@
-"""Running episodes in tests, without images unless asked for."""
+"""Run episodes in tests, by default without images."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ def episode(index: int = 0, *, attempt: int = 0, **config: Any) -> PreparedEpiso
 
 
 def first_frame(prepared: PreparedEpisode) -> Frame:
-    """What is seen before anything has moved; its images need no episode around them."""
+    """Observation before any motion; its images need no episode around them."""
     with make_world(prepared.info) as world, make_renderer(prepared.info) as renderer:
         return next(Session.of_episode(world, prepared, renderer).run(ScriptAgent(prepared)))
 
 
 def run(prepared: PreparedEpisode, world: World | None = None) -> tuple[list[Frame], Outcome]:
-    """All frames and the outcome, in `world` or in a fresh one."""
+    """All frames and the outcome, in `world` or in a new one."""
     if world is None:
         with make_world(prepared.info) as fresh:
             return run(prepared, fresh)
@@ -34,5 +34,5 @@ def run(prepared: PreparedEpisode, world: World | None = None) -> tuple[list[Fra
 
 
 def body_index(world: World, name: str) -> int:
-    """PyBullet's index of a body: worlds show bodies in the order of loading, which is how PyBullet numbers them."""
+    """PyBullet's index of a body: PyBullet numbers bodies in the order of loading, which is also that of the world."""
     return [body.name for body in world.visuals()].index(name)

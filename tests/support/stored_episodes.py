@@ -1,4 +1,4 @@
-"""Episodes of a LeRobot dataset as PyArrow and libav find them in its files, to compare before and after an edit."""
+"""Episodes of a LeRobot dataset as PyArrow and libav read them from its files, to compare before and after an edit."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def stored_episodes(root: Path) -> list[StoredEpisode]:
     texts, parts = task_texts(root), {}
     for path in sorted(root.glob("data/*/*.parquet")):
         rows = pq.read_table(path)
-        if "episode_index" not in rows.column_names:  # a file that is not of the dataset
+        if "episode_index" not in rows.column_names:  # a file that does not belong to the dataset
             continue
         numbers = rows["episode_index"].to_numpy()
         for number in dict.fromkeys(numbers.tolist()):
@@ -95,7 +95,7 @@ def _episode_table(root: Path, info: dict[str, Any]) -> list[dict[str, Any]]:
 
 
 def _packets(root: Path, info: dict[str, Any], row: dict[str, Any], camera: str) -> list[bytes]:
-    """The encoded images of an episode in the order in which they are shown."""
+    """Encoded images of an episode, in display order."""
     number, first = row["episode_index"], 0
     if info["codebase_version"] == "v3.0":
         chunk, file, start = (
@@ -118,11 +118,11 @@ def _packets(root: Path, info: dict[str, Any], row: dict[str, Any], camera: str)
 
 
 def same_values(before: StoredEpisode, after: StoredEpisode, but: tuple[str, ...] = ()) -> list[str]:
-    """Name what differs between two episodes beyond their place in the dataset."""
+    """Differences between two episodes, except their place in the dataset."""
     wrong = [
         name
         for name in {*before.columns, *after.columns} - {*COUNTERS, *but}
-        if repr(before.columns.get(name)) != repr(after.columns.get(name))  # NaN equals itself so
+        if repr(before.columns.get(name)) != repr(after.columns.get(name))  # so that NaN equals itself
         or before.types[name] != after.types[name]
     ]
     wrong += [camera for camera in before.packets if before.packets[camera] != after.packets.get(camera)]

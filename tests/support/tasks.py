@@ -1,4 +1,4 @@
-"""Which tasks a test over every task takes in `make test`, and which are left to .ci/run."""
+"""Tasks that tests of every task use in `make test`, and those left to .ci/run."""
 
 from __future__ import annotations
 
@@ -9,8 +9,10 @@ import pytest
 from demorec.core.tables import ROBOTS, TASKS
 
 QUICK_TASKS = ("pick_from_clutter", "tutorial")
-"""Many bodies, an own script. Most other tests take one cube (`pick_place`); `tests/contract/test_tasks.py` runs every
-task always."""
+"""Many bodies, a custom script.
+
+Most other tests use one cube (`pick_place`); `tests/contract/test_tasks.py` always runs every task.
+"""
 
 PAIRS = [
     (task, robot)
@@ -18,12 +20,11 @@ PAIRS = [
     for robot in ROBOTS.names()
     if not TASKS.load(task).refusal(ROBOTS.load(robot))
 ]
-"""Every task with every robot that does it."""
+"""Every task with every robot that supports it."""
 
 
 def tasks_with_slow_ones() -> list[Any]:
-    """Parameters: every row of the table; slow is the one that asks most of everything, and long are the others that
-    are not quick."""
+    """Parameters for every task in the table: the most demanding one is marked slow, other slow ones long."""
     slow, long = [pytest.mark.slow], [pytest.mark.slow, pytest.mark.long]
     marks: dict[str, list[Any]] = {name: [] for name in QUICK_TASKS} | {"pick_anything": slow}
     return [pytest.param(name, marks=marks.get(name, long)) for name in TASKS.names()]

@@ -1,4 +1,4 @@
-"""What may become of the process that verifies a dataset; imported there by name, so that it loads little."""
+"""Failures of the process that verifies a dataset, imported there by name; this module loads little."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from demorec.core.errors import resource_error
 
 
 def never_end(pipe: Connection[Any, Any], cache: str) -> None:
-    """As a library that is loaded with too little memory and waits for its own threads."""
+    """Hang like a library that waits for its own threads after running out of memory."""
     time.sleep(3600)
 
 
 def never_listen(pipe: Connection[Any, Any], cache: str) -> None:
-    """The same, and no signal reaches it."""
+    """Hang, and ignore signals."""
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     pipe.send("deaf")
     never_end(pipe, cache)
 
 
 def die(pipe: Connection[Any, Any], cache: str) -> None:
-    """As when the system ends it."""
+    """Die as if killed by the system."""
     os._exit(3)
 
 
 def lack_memory(pipe: Connection[Any, Any], cache: str) -> None:
-    """As when an allocation fails."""
+    """Fail to allocate memory."""
     pipe.recv()
     pipe.send(resource_error(MemoryError()))

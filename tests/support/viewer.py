@@ -1,4 +1,4 @@
-"""Driving the real viewers: what they need, why a test is skipped without it, and how an image is judged."""
+"""Drive the real viewers: their requirements, the reason for a skipped test, and the assessment of an image."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ VULKAN_DRIVERS = Path("/usr/share/vulkan/icd.d")
 
 
 def need(missing: bool, reason: str) -> None:
-    """Skip with the reason; in CI, fail: there everything is installed."""
+    """Skip with the reason; in CI, where everything is installed, fail."""
     if missing and os.environ.get("CI") == "true":
         pytest.fail(f"CI lacks what this test needs: {reason}")
     if missing:
@@ -77,7 +77,7 @@ def chromium(program: str, address: str) -> Iterator[Chromium]:
 
 
 class Chromium:
-    """A page in headless Chromium, over the DevTools protocol."""
+    """A page in headless Chromium, controlled by the DevTools protocol."""
 
     def __init__(self, profile: Path, process: subprocess.Popen[bytes]) -> None:
         from websocket import create_connection
@@ -95,7 +95,7 @@ class Chromium:
         self._number = 0
 
     def call(self, method: str, **parameters: object) -> dict[str, Any]:
-        """The answer to a command of the protocol."""
+        """Send a command of the protocol and return its result."""
         self._number += 1
         self._socket.send(json.dumps({"id": self._number, "method": method, "params": parameters}))
         while True:
@@ -106,7 +106,7 @@ class Chromium:
                 return result
 
     def value(self, expression: str) -> Any:
-        """What JavaScript gives for an expression; promises are awaited."""
+        """Evaluate a JavaScript expression, awaiting promises."""
         answer = self.call("Runtime.evaluate", expression=expression, awaitPromise=True, returnByValue=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")

@@ -1,4 +1,4 @@
-"""The decoder of actions: with limits for a policy, without them for what was recorded."""
+"""The decoder of actions: with limits for a policy, without them for recordings."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_pose_out_of_reach_keeps_the_targets_and_is_counted(
 
 
 def test_after_a_pose_out_of_reach_a_policy_goes_on_from_where_it_is(world: World) -> None:
-    """Its next delta is small again; recorded deltas add up to recorded poses, whether these are reached or not."""
+    """The policy's next delta is small again; recorded deltas add up to recorded poses, even out of reach."""
     deltas = np.array([[9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04], [-0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04]])
     for is_limited, num_unreachable in ((True, 1), (False, 2)):
         decoder = ActionDecoder(world, "ee_delta", is_limited=is_limited)

@@ -1,4 +1,4 @@
-"""demorec.api: its names load, cost nothing before, and are all that programs outside of demorec need."""
+"""demorec.api: its names load on demand, and programs outside of demorec need no others."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_every_name_loads() -> None:
 
 
 def test_types_are_those_of_the_names() -> None:
-    """Type checkers read the imports of the module; they must be those that happen."""
+    """Type checkers read the module's imports, which must equal those at run time."""
     tree = ast.parse(Path(api.__file__).read_text())
     typed = {
         name.asname: node.module

@@ -1,4 +1,4 @@
-"""Atomic writes where the file system renames by a flag, and where it does not (network file systems)."""
+"""Atomic writes on file systems with and without renaming by a flag (network file systems)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FOLDER = ReplaceableKind(name="a book", is_folder=True, recognises=lambda path: 
 
 @pytest.fixture(params=["flags", "links", "neither"], autouse=True)
 def file_system(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the file system offers."""
+    """The features of the file system."""
 
     def refuse(*arguments: object) -> None:
         raise PermissionError(1, "Operation not permitted")

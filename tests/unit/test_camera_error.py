@@ -1,4 +1,4 @@
-"""Calibration errors come back from the numbers that tell them; numbers that contradict each other tell nothing."""
+"""Calibration errors are recovered from the recorded numbers; contradictory numbers give none."""
 
 from __future__ import annotations
 

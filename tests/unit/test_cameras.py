@@ -1,4 +1,4 @@
-"""The camera presets see what they promise, for every robot: by projection, without drawing."""
+"""Camera presets see their subjects, for every robot: by projection, without drawing."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_top_sees_every_place_where_objects_go_with_the_base_below(world: World)
     near, far = (pixel(camera, camera.mount_from_camera, scaled(world, x, 0.0, 0.0)) for x in (0.35, 0.65))
     assert near[1] > far[1]
     right, left = (pixel(camera, camera.mount_from_camera, scaled(world, 0.5, y, 0.0)) for y in (-0.2, 0.2))
-    assert right[0] > left[0]  # no mirror: y is to the left
+    assert right[0] > left[0]  # not mirrored: y is to the left
 
 
 @pytest.mark.parametrize("size", [(56, 40), (224, 224), (640, 480), (640, 360)])
@@ -76,7 +76,7 @@ def test_workspace_sees_every_place_where_objects_go_in_images_of_any_shape(
         for z in (0.0, 0.06)
     ]
     assert all(inside(camera, place) for place in pixels)
-    assert (np.ptp(pixels, axis=0) / size).max() > 0.65  # and it sees little else
+    assert (np.ptp(pixels, axis=0) / size).max() > 0.65  # with a small margin
 
 
 def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
@@ -89,15 +89,15 @@ def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
     half, middle = gripper.open_width / 2, gripper.object_offset(gripper.open_width)
     for point in ([0, middle, 0], [0, middle + 0.7 * half, 0], [0, middle - 0.7 * half, 0], [0, middle, 0.1]):
         assert inside(camera, pixel(camera, pose, tuple(tcp.apply(np.array(point))))), point
-    # The hand's own x axis runs down in the image: what lies ahead of the fingers comes in from below. SO-101's mount
-    # looks from there.
+    # The hand's x axis runs down in the image: objects ahead of the fingers enter from below. SO-101's mount
+    # has the same direction.
     ahead, behind = (pixel(camera, pose, tuple(tcp.apply(np.array([x, 0, 0.05]))))[1] for x in (0.02, -0.02))
     assert turned * (ahead - behind) > 0
 
 
 @pytest.mark.parametrize("robot", ROBOTS.names())
 def test_a_camera_of_ones_own_on_the_hand_is_where_it_says(robot: str) -> None:
-    """Whatever mount for a camera the arm has."""
+    """For every camera mount of the arm."""
     preset = CameraPreset(
         summary="", mount="tcp", eye=(0.05, 0.01, -0.06), target=(0.0, 0.0, 0.02), up=(-1.0, 0.0, 0.0)
     )

@@ -1,4 +1,4 @@
-"""One cause is one finding: what could not be checked for it is counted, and the words say each thing once."""
+"""One cause is one finding: checks that it prevents are counted, and the output repeats nothing."""
 
 from __future__ import annotations
 

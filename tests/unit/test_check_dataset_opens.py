@@ -1,4 +1,4 @@
-"""What LeRobot says of a dataset that it cannot open, in words that help."""
+"""Helpful messages for datasets that LeRobot cannot open."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_data
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"
 _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_HUB_OFFLINE` environment variable."
-"""What LeRobot 0.6.1 ends with where a file of the dataset is missing: it asks the Hub for it."""
+"""LeRobot 0.6.1's last line when a file of the dataset is missing: it requests the file from the Hub."""
 
 
 def opened(dataset: Path) -> list[DiagnosedFault]:
-    """What is found when LeRobot opens it."""
+    """Findings of opening it with LeRobot."""
     evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
     return lerobot_opens.lerobot_opens.run(evidence)[0]
 
@@ -53,7 +53,7 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
 def test_too_little_memory_says_nothing_about_the_dataset(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """What LeRobot ends with under `ulimit -v`, and when the kernel takes its memory: by a LeRobot of our own."""
+    """A stand-in LeRobot fails as under `ulimit -v`, and as when the kernel kills it."""
     export(SAMPLE, tmp_path / "d")
     fake = tmp_path / "fake" / "lerobot" / "datasets"
     fake.mkdir(parents=True)

@@ -1,4 +1,4 @@
-"""The commands at the end of a run: quoted for the shell, and only those that work."""
+"""The commands printed at the end of a run: quoted for the shell, and only those that work."""
 
 from __future__ import annotations
 

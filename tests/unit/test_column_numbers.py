@@ -1,4 +1,4 @@
-"""Numbers of data columns are those that PyArrow's own Python values have, wherever in a column they begin."""
+"""Numbers of data columns equal PyArrow's own Python values, from any offset in a column."""
 
 from __future__ import annotations
 

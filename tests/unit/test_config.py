@@ -1,4 +1,4 @@
-"""Impossible configs: one clear sentence each, with what is allowed."""
+"""Impossible configs: one clear sentence each, with the allowed values."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The robot's description beside a dataset: other tools place the arm by it, checks know when it is another one's."""
+"""The robot's description in a dataset: other tools place the arm by it, and checks detect that of another robot."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def dataset(exported: Path, tmp_path: Path) -> Path:
-    """A copy to be spoilt."""
+    """A copy to be damaged."""
     return Path(shutil.copytree(exported, tmp_path / "cubes"))
 
 
@@ -55,7 +55,7 @@ def two_joints(**arguments: Any) -> Episode:
 
 
 def test_another_program_places_the_arm_as_it_was_recorded(exported: Path, tmp_path: Path) -> None:
-    """PyBullet's own reader of URDFs, given that file alone, and the element names of the JSON file."""
+    """PyBullet's own URDF reader gets that file alone, and the element names of the JSON file."""
     record_file, urdf_file = files_of(exported)
     record = json.loads(record_file.read_text())
     alone = Path(shutil.copy(urdf_file, tmp_path))
@@ -125,7 +125,7 @@ def test_no_path_of_the_machine_gets_into_a_dataset() -> None:
 
 
 def spoil_text(root: Path) -> None:
-    """A link a centimetre longer."""
+    """Make a link a centimetre longer."""
     _, urdf = files_of(root)
     text = urdf.read_text()
     changed = text.replace('xyz="0 -0.316 0"', 'xyz="0 -0.326 0"')
@@ -202,7 +202,7 @@ def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
 
 
 def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(exported: Path, tmp_path: Path) -> None:
-    """Without anything of ours beside it: numbers, outcome and instruction from LeRobot's own tables."""
+    """Without demorec's files: numbers, outcome and instruction come from LeRobot's own tables."""
     strange = tmp_path / "strange"
     shutil.copytree(exported, strange)
     with open_dataset_episode(LeRobotFolder(exported), 0) as known:

@@ -1,4 +1,4 @@
-"""Errors: what the machine lacks is kept apart from what the data are."""
+"""Errors distinguish a shortage of the machine from damaged data."""
 
 from __future__ import annotations
 

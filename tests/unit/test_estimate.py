@@ -1,4 +1,4 @@
-"""The size that a dry run tells, compared with that of a whole run and its dataset."""
+"""The size estimated by a dry run, compared with that of a whole run and its dataset."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_the_size_is_about_that_of_the_run(
     size = bytes_in(run / "episodes")
     if exports:
         export(run, tmp_path / "dataset")
-        export(files[0], tmp_path / "first")  # with what every dataset has, however many episodes
+        export(files[0], tmp_path / "first")  # including the fixed size of every dataset
         growth = bytes_in(tmp_path / "dataset") - bytes_in(tmp_path / "first")
         size += growth * len(files) // (len(files) - 1)
     told = len(LENGTHS) * (measured[-1].attempt.num_bytes + dataset_bytes)

@@ -1,4 +1,4 @@
-"""Intervals and tests against SciPy's, cells against counting by hand."""
+"""Intervals and tests against SciPy's, cells against manual counts."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The dataset card: what it says, whose it is, and that nothing foreign acts in it."""
+"""The dataset card: its content, its ownership, and that third-party text in it has no effect."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> No
     card, beside = tmp_path / "d" / "README.md", tmp_path / "d" / "demorec" / "README.md"
     export(run, tmp_path / "d")
     export(run, tmp_path / "d", episodes="0", overwrite=True)
-    assert "1 scripted demonstration by" in card.read_text()  # nobody has edited it, so it is replaced
+    assert "1 scripted demonstration by" in card.read_text()  # an unedited card is replaced
     assert not beside.exists()
     card.write_text("what I found out about these")
     export(run, tmp_path / "d", overwrite=True)
@@ -40,7 +40,7 @@ def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> No
 
 
 def test_nothing_foreign_acts_in_a_card(tmp_path: Path) -> None:
-    """Markdown's own words, HTML and what a terminal obeys, in the texts of a recording that somebody passed on."""
+    """Markdown syntax, HTML and terminal control codes in the texts of a third-party recording."""
     hostile = "# <script>alert(1)</script> ![x](http://e.org) | `y` *z* \x1b[2J \u202e"
     good = write_episode(tmp_path / "good.mcap", num_frames=6, cameras=())
     with Recording(good) as recording:

@@ -1,4 +1,4 @@
-"""What an export writes, option by option, read back without LeRobot; tests/conformance has LeRobot itself."""
+"""The result of an export, option by option, read back without LeRobot; tests/conformance uses LeRobot itself."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> Non
     }
     report = export(run, grown, episodes="2:", append=True)
     assert (report.num_episodes, report.new_episodes, report.num_frames) == (4, 2, 61)
-    assert kept.items() <= files_of(grown).items()  # what was there is there still
+    assert kept.items() <= files_of(grown).items()  # existing files are kept
     assert report.digest == dataset_digest(whole)
     assert data_table(grown).equals(data_table(whole))
     a, b = (json.loads((folder / "meta/stats.json").read_text()) for folder in (whole, grown))
@@ -160,7 +160,7 @@ def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> Non
         for what in ("min", "max", "mean", "std"):
             assert np.allclose(a[name][what], b[name][what], rtol=1e-9), (name, what)
         assert a[name]["count"] == b[name]["count"]
-        if not name.startswith("observation.images"):  # of images LeRobot's own rule is used, an average
+        if not name.startswith("observation.images"):  # image statistics are averaged, as LeRobot does
             assert all(a[name][q] == b[name][q] for q in ("q01", "q10", "q50", "q90", "q99"))
     assert attempt_counts(LeRobotFolder(grown)) == attempt_counts(LeRobotFolder(whole)) == (4, 5)
     rows = episode_rows(grown)
@@ -237,7 +237,7 @@ def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -
     assert camera["mount_from_camera"] == frames[0].images["front"].world_from_camera.vector().tolist()  # in the world
     assert json.loads(row["episode_info"])["simulation"]["scene"]["bodies"][1]["name"] == "cube"
     poses = pq.read_table(out / "demorec/camera_poses/chunk-000/file-000.parquet")
-    assert poses.column_names == ["episode_index", "frame_index", "wrist"]  # the front camera stands still
+    assert poses.column_names == ["episode_index", "frame_index", "wrist"]  # the front camera does not move
     assert poses.num_rows == 61
     assert poses.column("wrist")[20 + 7].as_py() == frames[7].images["wrist"].world_from_camera.vector().tolist()
     assert json.loads((out / "demorec/configs.json").read_text()) == {
@@ -253,7 +253,7 @@ def test_episodes_without_cameras(tmp_path: Path) -> None:
 
 
 def test_append_refuses_episodes_that_are_there_already(run: Path, tmp_path: Path) -> None:
-    """By their content: neither the name of the recording nor its place matters."""
+    """Episodes are compared by content: neither the recording's name nor its place matters."""
     out, copies = tmp_path / "d", tmp_path / "copies"
     export(run, out, episodes=":3")
     before = files_of(out)

@@ -1,4 +1,4 @@
-"""External episodes as datasets: numbers and packets are those of the recordings, nothing is filled in."""
+"""External episodes as datasets: numbers and packets equal those of the recordings, and gaps are not filled."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_numbers_are_those_of_the_recordings(tmp_path: Path) -> None:
 
 
 def test_numbers_that_float32_does_not_hold_are_refused_where_it_is_written(tmp_path: Path) -> None:
-    """LeRobot's datasets have float32, robomimic's files whatever was recorded."""
+    """LeRobot's datasets have float32; robomimic's files keep the recorded type."""
     given = complete(num_frames=5)
     given.frames[2].samples["observation.force"].vector[1] = 1e300
     run = run_of(tmp_path / "run", given)
@@ -104,7 +104,7 @@ def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("exporter", EXPORTERS.names())
 def test_a_failure_that_stays_out_blocks_nothing(tmp_path: Path, exporter: str) -> None:
-    """Failed episodes without an image, of other cameras and features, and of another rate."""
+    """Failed episodes that lack an image, or have other cameras and features, or another rate."""
     failed: dict[str, Any] = {"episode_index": 1, "num_frames": 5, "success": False}
     without = complete(**failed)
     without = replace(without, frames=[replace(frame, images={}) for frame in without.frames], images={"top": []})

@@ -1,4 +1,4 @@
-"""The HDF5 export: what h5py reads in it is what the recordings say."""
+"""The HDF5 export: h5py reads the same values as in the recordings."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
 
     import demorec.extensions.policies.gym_env  # noqa: F401  (registers the environments)
 
-    # Environments have images of one size, the recordings of this run have two.
+    # An environment has images of one size, the recordings of this run have two.
     features = ("observation.velocity", "observation.images.wrist")
     export(run, tmp_path / "d.hdf5", "hdf5", features=features, action="ee")
     with h5py.File(tmp_path / "d.hdf5") as file:
@@ -117,7 +117,7 @@ def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
 
 
 def test_the_file_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) -> None:
-    """Of another layout, and of robomimic's, but not by demorec."""
+    """A file of another layout, and a robomimic file that demorec did not write."""
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["thesis"] = np.arange(5)
     with h5py.File(tmp_path / "b.hdf5", "w") as file:
@@ -137,7 +137,7 @@ def test_the_file_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) ->
 def test_a_file_that_somebody_has_added_to_is_not_replaced(run: Path, tmp_path: Path, addition: str) -> None:
     target = tmp_path / "d.hdf5"
     options = {"privileged": True, "depth": True, "valid_share": 0.5, "overwrite": True}
-    for _ in range(2):  # one of ours is, with all that an export can write
+    for _ in range(2):  # a demorec file with everything that an export can write is replaced
         export(run, target, "hdf5", **options)
     with h5py.File(target, "a") as file:
         file[addition] = np.arange(5)
@@ -165,7 +165,7 @@ def test_a_file_with_a_note_or_a_link_of_somebody_is_not_replaced(run: Path, tmp
 
 @pytest.mark.slow
 def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
-    """HDF5 knows whole seconds; where it keeps times, as in the last two files, a second later is another file."""
+    """HDF5 stores whole seconds; with times, as in the last two files, a second later gives a different file."""
 
     def make(name: str) -> None:
         export(run, tmp_path / f"{name}.hdf5", "hdf5", episodes="0")
@@ -180,7 +180,7 @@ def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
 
 
 def test_robomimic_reads_it(run: Path, tmp_path: Path) -> None:
-    """robomimic's own reader, where it is installed: its dependencies need a compiler, so it is none of ours."""
+    """robomimic's own reader, where installed; it is not a dependency, since its own dependencies need a compiler."""
     dataset = pytest.importorskip("robomimic.utils.dataset", reason="robomimic is not installed")
     from robomimic.utils import file_utils, obs_utils
 

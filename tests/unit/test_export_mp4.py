@@ -61,7 +61,7 @@ def test_every_image_and_time_comes_back(tmp_path: Path, codec: str, fps: int) -
     writer = Mp4Writer(tmp_path / "a.mp4", first, fps=fps)
     writer.add(first)
     writer.add(second)
-    assert not (tmp_path / "a.mp4").exists()  # nothing half written under the final name
+    assert not (tmp_path / "a.mp4").exists()  # no partial file under the final name
     writer.close()
     writer.close()
     assert [path.name for path in tmp_path.iterdir()] == ["a.mp4"]
@@ -178,7 +178,7 @@ LONG, SHORT = b"\x00\x00\x00\x01", b"\x00\x00\x01"
     [
         ([(LONG, "sps", SHORT, "idr"), (SHORT, "slice")], [("sps", "idr"), ("slice",)], [True, False]),
         ([(LONG, "sei", LONG, "slice"), (LONG, "slice", SHORT, "slice")], [("sei", "slice"), ("slice",) * 2], [0, 0]),
-        # Zeros beyond need: after a unit, and more than one in front of the first start code.
+        # Superfluous zeros: after a unit, and several before the first start code.
         ([(SHORT, "idr", b"\0\0\0"), (SHORT, "slice", b"\0")], [("idr",), ("slice",)], [1, 0]),
         ([(b"\0\0\0", SHORT, "idr"), (SHORT, "slice")], [("idr",), ("slice",)], [1, 0]),
     ],
@@ -186,7 +186,9 @@ LONG, SHORT = b"\x00\x00\x00\x01", b"\x00\x00\x01"
 def test_every_way_to_put_start_codes(
     units: list[tuple[str | bytes, ...]], expected: list[tuple[str, ...]], keyframes: list[int]
 ) -> None:
-    """By hand, from ITU-T H.264 annex B: byte_stream_nal_unit with leading_zero_8bits and trailing_zero_8bits."""
+    """Expected values are built by hand from ITU-T H.264 annex B: byte_stream_nal_unit with leading_zero_8bits and
+    trailing_zero_8bits.
+    """
     coded_units = [b"".join(NAL[part] if isinstance(part, str) else part for part in unit) for unit in units]
     video = video_of("h264", coded_units)
     wanted = [b"".join(len(NAL[name]).to_bytes(4, "big") + NAL[name] for name in names) for names in expected]
@@ -196,7 +198,7 @@ def test_every_way_to_put_start_codes(
 
 @pytest.mark.parametrize("unit", [b"", b"no video at all", b"\x01" + NAL["slice"], NAL["slice"] + SHORT + NAL["slice"]])
 def test_a_packet_without_its_start_code_is_refused(unit: bytes) -> None:
-    """Also where the packet before ends in what would make one together."""
+    """This includes a previous packet whose end would complete a start code."""
     for before in (SHORT + NAL["idr"], SHORT + NAL["idr"] + b"\0\0"):
         with pytest.raises(ExportError, match="start code"):
             video_of("h264", [before, unit])

@@ -1,4 +1,4 @@
-"""The dataset of a run: made once, made again when it is damaged, deleted only with a proof that it is the run's."""
+"""A run's dataset: made once, made again when damaged, deleted only if it is proven to be the run's."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_a_dataset_that_was_appended_to_is_not_deleted(run: Path, tmp_path: Path
 
 @pytest.mark.parametrize("is_ours", [True, False])
 def test_after_a_kill_in_the_export_only_the_runs_own_dataset_is_replaced(run: Path, is_ours: bool) -> None:
-    """run.json knows that an export was begun, and not what came of it."""
+    """run.json records the beginning of the export, but not its result."""
     plain = json.loads((run / "run.json").read_text())
     plain["export"]["dataset_digest"] = ""
     (run / "run.json").write_text(json.dumps(plain))
@@ -94,7 +94,7 @@ def test_a_dataset_with_files_of_somebody_is_set_aside_when_the_run_has_changed(
     note.parent.mkdir(exist_ok=True)
     note.write_text("years of work")
     before = files_of(run / "dataset")
-    assert export_run(run, repo_id="me/cubes")[1] is None  # as long as there is nothing to do it stays
+    assert export_run(run, repo_id="me/cubes")[1] is None  # kept as long as there is nothing to do
     assert files_of(run / "dataset") == before
     said: list[str] = []
     assert export_run(run, repo_id="me/other", says=said.append)[1] is not None

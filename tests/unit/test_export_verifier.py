@@ -1,4 +1,4 @@
-"""The process that verifies a dataset: whatever becomes of it, the export ends, with a sentence."""
+"""Whatever happens to the process that verifies a dataset, the export ends, with a sentence."""
 
 from __future__ import annotations
 

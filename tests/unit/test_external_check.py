@@ -1,4 +1,4 @@
-"""What is wrong with an external episode is named by the check meant for it; a good one passes them all."""
+"""Each fault of an external episode is found by its own check; a good episode passes them all."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def shifted(frame: SampledFrame, *, by: int) -> SampledFrame:
 
 
 def moved(offset: Callable[[int], int]) -> Callable[[Episode], Episode]:
-    """Frames and their images later by so much."""
+    """Shift frames and their images to later times."""
 
     def change(episode: Episode) -> Episode:
         images = {
@@ -70,7 +70,7 @@ def state(value: Callable[[int, Any], Any]) -> Callable[[Episode], Episode]:
 
 
 def held(frame: SampledFrame, name: str) -> Sample:
-    """The sample at one value."""
+    """Hold a sample at one value."""
     return replace(frame.samples[name], vector=np.ones_like(frame.samples[name].vector))
 
 

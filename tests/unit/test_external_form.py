@@ -1,4 +1,4 @@
-"""The form of external episodes: what is written is what is read, to the bit; what cannot be written is refused."""
+"""External episodes: bit-exact writing and reading; invalid values are refused."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog:
         for chunk in RrdReader(tmp_path / "a.rrd").stream()
         if "Mesh3D:vertex_positions" in chunk.to_record_batch().schema.names
     }
-    assert drawn == {"base", "upper", "lower"}  # rods to the joints that two carry, and the third's own shape
+    assert drawn == {"base", "upper", "lower"}  # rods to the joints of two links, and the third link's own shape
 
 
 def test_two_of_them_are_not_laid_over_each_other(tmp_path: Path) -> None:

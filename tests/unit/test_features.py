@@ -1,4 +1,4 @@
-"""Feature vectors against SciPy, one frame against many, and actions integrated back."""
+"""Feature vectors against SciPy, one frame against many, and actions integrated to poses."""
 
 from __future__ import annotations
 
@@ -193,7 +193,7 @@ def test_pose_deltas_compose_to_the_absolute_poses(rows: slice | np.ndarray[Any,
 
 @pytest.mark.parametrize("fps", [30, 10])
 def test_increments_lead_back_from_noise_as_the_noise_lets_go(fps: int) -> None:
-    """Where the executed command returns to the clean one by itself, the increments are those of the executed one."""
+    """Where the executed command returns to the clean one, increments are those of the executed one."""
     rng = np.random.default_rng(11)
     count, step = 12, 30 // fps
     columns = columns_of(rng, count * step)
@@ -201,7 +201,7 @@ def test_increments_lead_back_from_noise_as_the_noise_lets_go(fps: int) -> None:
     noise = 0.7 ** time[:, None] * rng.normal(0, 0.02, 7)
     shift = 0.7 ** time[:, None] * rng.normal(0, 0.01, 3)
     poses = columns.action_base_from_tcp
-    # Turned about the vertical by an angle that fades, from the left.
+    # Turned about the vertical by a decaying angle, from the left.
     turn = Rotation.from_rotvec(np.outer(0.7**time * 0.05, [0.0, 0.0, 1.0]))
     still = Rotation.from_quat(np.broadcast_to(poses[0, 3:], (len(time), 4)))
     clean = np.concatenate([poses[:, :3], still.as_quat()], axis=1)

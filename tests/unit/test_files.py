@@ -1,4 +1,4 @@
-"""Files of unknown origin: nothing is waited for, nothing is read without bounds."""
+"""Files of unknown origin: reading never blocks and is always bounded."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def open_files() -> list[int]:
 
 
 def test_no_file_stays_open_after_a_refusal(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Exchanged for a FIFO between the look and the opening."""
+    """The file is replaced by a FIFO between inspection and opening."""
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "file").touch()
     before = open_files()

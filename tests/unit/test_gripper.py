@@ -1,4 +1,4 @@
-"""What an opening means is told by the gripper alone: to and fro, in files, and by everybody who asks."""
+"""The gripper alone defines the meaning of an opening: in both directions, in files, and for all callers."""
 
 from __future__ import annotations
 

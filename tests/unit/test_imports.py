@@ -1,4 +1,4 @@
-"""The import rules of pyproject.toml hold in every folder, and no modules import each other in a circle."""
+"""The import rules of pyproject.toml cover every folder, and modules do not import each other in cycles."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _rules() -> list[dict[str, Any]]:
 
 
 def _is_broken(rule: dict[str, Any], *extra: tuple[str, str]) -> bool:
-    """Whether import-linter finds a rule broken once these (importer, imported) are added to the imports there are."""
+    """Whether import-linter reports a broken rule after adding these (importer, imported) to the existing imports."""
     configure()
     options = import_linter.read_user_options(str(PROJECT))
     import_linter._register_contract_types(options)
@@ -67,7 +67,7 @@ def _one_home_rules() -> list[dict[str, Any]]:
 
 
 def _folders() -> list[str]:
-    """Every folder and loose module of the package, and one that somebody makes tomorrow."""
+    """Every folder and loose module of the package, and one that does not exist yet."""
     return [*sorted(_graph(with_type_checking=False).find_children("demorec")), NEW_FOLDER]
 
 
@@ -79,7 +79,7 @@ def test_no_modules_import_each_other() -> None:
 
 @pytest.mark.parametrize("library", HOMES)
 def test_a_library_is_imported_at_home_alone(library: str) -> None:
-    """A module that is added to any folder, a new folder's first one too, may not import it."""
+    """A module that is added to any folder, even the first one in a new folder, may not import it."""
     (rule,) = (rule for rule in _one_home_rules() if library in rule["forbidden_modules"])
     assert not _is_broken(rule)
     for folder in _folders():
@@ -88,7 +88,7 @@ def test_a_library_is_imported_at_home_alone(library: str) -> None:
 
 
 def test_every_folder_stands_in_a_rule_of_its_own() -> None:
-    """Whoever makes a folder says which way its imports run."""
+    """The author of a new folder must specify the direction of its imports."""
     placed: set[str] = set()
     for rule in _rules():
         placed |= {f"demorec.{layer.strip('()')}" for layer in rule.get("layers", ())}

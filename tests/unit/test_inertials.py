@@ -1,4 +1,4 @@
-"""What the links of a robot weigh: said by its URDF, never made up by the simulator."""
+"""The mass of a robot's links comes from its URDF, never from the simulator's defaults."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def inertial(mass: str = "2", moments: tuple[str, str, str] = ("0.01", "0.01", "
 
 
 def arm(*, arm: str = BOX + inertial(), tool: str = "", base: str = "", ground: str = "") -> str:
-    """A root with something fixed to it, an arm that turns on it, and a tool that is fixed to the arm."""
+    """A root with a fixed child, an arm that turns on the root, and a tool that is fixed to the arm."""
     return f"""<robot name="r">
       <link name="base">{base}</link><link name="ground">{ground}</link><link name="arm">{arm}</link>
       <link name="tool">{tool}</link>
@@ -47,7 +47,7 @@ def test_models_of_pybullet_and_ours_say_what_they_weigh(model: str) -> None:
     "text",
     [
         arm(),
-        arm(base=BOX, ground=BOX),  # of what stands on the ground the mass does not matter
+        arm(base=BOX, ground=BOX),  # the mass of fixed bodies does not matter
         arm(base=BOX + inertial(mass="0"), ground=BOX + inertial(mass="0")),  # as in kuka_iiwa/model.urdf
         arm(tool=inertial(mass="0")),  # as in franka_panda/panda.urdf
         arm(tool=inertial(mass="0", moments=("0", "0", "0"))),

@@ -1,4 +1,4 @@
-"""Mappings: what they may say, and how all that is wrong with one is told at once."""
+"""Mappings: their valid content, and that all errors of one are reported at once."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ WRONG = [
 def test_a_wrong_mapping_is_refused(
     old: str, new: str, told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """By itself, or for the bag."""
+    """A mapping that is invalid by itself, or for the bag."""
     text = bag_mappings.SO101.replace(old, new, 1)
     assert text != bag_mappings.SO101
     bag = bags.write_mcap(bags.in_order(bags.so101(0.3)), tmp_path / "bag.mcap")
@@ -91,7 +91,7 @@ def test_paths_of_fields() -> None:
 
 
 def test_a_publisher_of_velocities_alone_is_another_one() -> None:
-    """Wheels have no positions, and are no reason to refuse the arm whose messages come later."""
+    """Wheels have no positions, which is no reason to refuse the arm whose messages follow."""
     source = Source(topic="/j", field="position", joints=("a",))
     with pytest.raises(OtherPublisherError):
         reader_of(source, {"name": ["wheel"], "position": np.empty(0), "velocity": np.array([1.0])})

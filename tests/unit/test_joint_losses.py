@@ -109,7 +109,7 @@ def expert_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arm: str, fin
 
 @pytest.mark.slow
 def test_motors_give_what_the_joints_lose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same motion costs damping times speed and friction more, and no force is made up."""
+    """The same motion needs additional torque for damping and friction, and no other force."""
     plain = expert_frames(tmp_path, monkeypatch, "", "")
     lossy = expert_frames(tmp_path, monkeypatch, 'damping="2" friction="0.5"', 'damping="10" friction="4"')
     pairs = list(zip(plain, lossy, strict=True))

@@ -1,4 +1,4 @@
-"""Our kinematics against PyBullet's own link states, Jacobian and against SciPy's slerp, for every robot."""
+"""demorec's kinematics against PyBullet's link states and Jacobian, and against SciPy's slerp, for every robot."""
 
 from __future__ import annotations
 

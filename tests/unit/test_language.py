@@ -1,4 +1,4 @@
-"""Words for objects and attempts, on scenes and episodes that are made up."""
+"""Words for objects and attempts, on synthetic scenes and episodes."""
 
 from __future__ import annotations
 

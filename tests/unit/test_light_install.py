@@ -1,4 +1,4 @@
-"""demorec without LeRobot and PyTorch: everything runs but their own work, and what they would do is named."""
+"""demorec without LeRobot and PyTorch: everything else works, and commands name the missing package."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ ABSENT = ("lerobot", "torch", "torchvision", "torchcodec", "datasets", "pandas",
 
 
 LEFT_OUT = {LEROBOT, "torch>=2.7", "huggingface-hub>=1.6,<2"}
-"""LeRobot, and what is imported for training, evaluation and uploading alone."""
+"""LeRobot, and packages that only training, evaluation and uploading import."""
 
 
 @pytest.fixture
 def light(monkeypatch: pytest.MonkeyPatch) -> None:
-    """As if these packages were not installed: importing them fails, and none is found."""
-    for name in ("lerobot", "datasets", "huggingface_hub", "accelerate"):  # others are looked for by tyro and pyarrow
+    """Hide these packages: importing them fails, and they cannot be found."""
+    for name in ("lerobot", "datasets", "huggingface_hub", "accelerate"):  # tyro and pyarrow look for others
         monkeypatch.setitem(sys.modules, name, None)
 
 
@@ -77,7 +77,7 @@ def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pyt
 
 @pytest.mark.slow
 def test_no_module_needs_them() -> None:
-    """In a fresh process, every module of the package imports without them."""
+    """Every module of the package imports without them, in a new process."""
     code = f"""
 import importlib, pkgutil, sys
 sys.modules.update(dict.fromkeys({ABSENT!r}))

@@ -1,4 +1,4 @@
-"""The child process in which files are read: what kills it, and what it passes on."""
+"""The child process in which files are read: its limits, and the state that it passes on."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ import pytest
 from demorec.core import limited
 from demorec.core.limited import Limits
 
-# The peak is told by a small program between: a child that Python starts by vfork inherits the peak of the process that
-# starts it, which is pytest's own.
+# A small program in between measures the peak: a child that Python starts by vfork inherits the peak of its parent,
+# here pytest's own.
 MEASURE = """
 import resource, subprocess, sys
 code = subprocess.run(sys.argv[2:]).returncode
@@ -76,7 +76,7 @@ def run(work: str, *words: object, environment: Mapping[str, str] | None = None)
 
 
 def started(work: str, *words: object) -> tuple[subprocess.Popen[str], psutil.Process]:
-    """A program that has said that it is ready, and its child."""
+    """Start a program that reports readiness, and find its child."""
     command = [sys.executable, "-c", START + work, *map(str, words)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, start_new_session=True)
     assert process.stdout is not None
@@ -106,11 +106,11 @@ def test_too_much_memory_is_one_sentence(work: str, file: Path) -> None:
         "demorec info: Reading this takes more than 508 MB of memory, far more than its 0.4 MB justify. It is damaged "
         f"or made to exhaust this machine; DEMOREC_LIMITS=off reads it anyway: {file}\n"
     )
-    assert 500_000_000 < ended.peak_bytes < 2_000_000_000  # of 4 GB; a busy machine looks later
+    assert 500_000_000 < ended.peak_bytes < 2_000_000_000  # of 4 GB; a busy machine measures later
 
 
 def test_memory_is_reserved_within_bounds(file: Path) -> None:
-    """Reservations beyond all that libraries make fail in the child itself."""
+    """Reservations beyond those of libraries fail in the child itself."""
     assert "Cannot allocate memory" in run(RESERVE, "info", file).errors
     assert run(RESERVE, "info", file, environment={"DEMOREC_LIMITS": "off"}).code == 0
 

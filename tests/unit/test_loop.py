@@ -30,7 +30,7 @@ def test_an_episode_succeeds_strictly(ran: tuple[PreparedEpisode, list[Frame], O
     assert outcome.failure_phase == outcome.failure_reason == ""
     assert outcome.num_frames == len(frames)
     assert all(check.passed for check in outcome.checks)
-    # The cube's last seen pose, against the goal, without our checks.
+    # The cube's last observed pose, compared with the goal without demorec's checks.
     last = frames[-1].observation.object_poses["red_cube"]
     goal = prepared.info.simulated.scene.goals[0].onto_from_goal
     assert np.hypot(*(last.position - goal.position)[:2]) < 0.02
@@ -56,14 +56,14 @@ def test_noise_is_on_the_command_only_and_only_in_free_motion(
         noise[frame.phase].append(np.abs(frame.command.joint_target - frame.action.joint_target).max())
     assert np.mean(noise["approach"]) > 0.005
     assert np.mean(noise["transport"]) > 0.003
-    # Gated with a ramp: what is left of it dies away within a few frames.
+    # Switched off by a ramp: the remaining noise decays within a few frames.
     for phase in ("close", "lift", "release"):
         assert max(noise[phase]) < 0.001, phase
 
 
 def test_no_frame_is_idle(ran: tuple[PreparedEpisode, list[Frame], Outcome]) -> None:
     _, frames, _ = ran
-    # Neither the label nor what is executed moves.
+    # Neither the label nor the executed command moves.
     labels = np.array([[*f.action.joint_target, *f.command.joint_target, f.action.gripper_target] for f in frames])
     still = np.abs(np.diff(labels, axis=0)).max(axis=1) < 1e-12
     outside_of_gripping = [

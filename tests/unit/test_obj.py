@@ -1,4 +1,4 @@
-"""OBJ files, judged by trimesh and by what the format's description says."""
+"""OBJ files, verified by trimesh and by the description of the format."""
 
 from __future__ import annotations
 
@@ -52,5 +52,5 @@ def test_a_face_of_points_that_are_not_there_is_refused(tmp_path: Path, face: st
     with pytest.raises(ValueError, match=r"a face names vertex \d+ of 4"):
         read_obj(tmp_path / "x.obj")
     mesh = "<visual><geometry><mesh filename='x.obj'/></geometry></visual>"
-    with pytest.raises(SceneError, match="A mesh of the scene cannot be read"):  # what describes it says so, too
+    with pytest.raises(SceneError, match="A mesh of the scene cannot be read"):  # its error message agrees
         self_contained(f"<robot name='x'><link name='l'>{mesh}</link></robot>", tmp_path)

@@ -1,4 +1,4 @@
-"""Shelves of things, the meshes that recordings hold, how things rest and where they are grasped."""
+"""Object sets, meshes in recordings, resting poses of objects and their grasps."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_a_box_is_grasped_across_the_side_that_fits_and_not_by_its_edges() -> No
 
 
 def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
-    """A post is grasped, but not below a plate on it that is nearly as wide as the hand opens."""
+    """A post can be grasped, but not below a plate on it that is nearly as wide as the open hand."""
     post, plate = trimesh.creation.box(extents=(0.03, 0.03, 0.04)), trimesh.creation.box(extents=(0.076, 0.076, 0.01))
     plate.apply_translation((0.0, 0.0, 0.025))
     both = SolidMesh(
@@ -178,7 +178,7 @@ def test_distractors_are_of_the_same_shelves_and_grey_or_black() -> None:
 
 @pytest.mark.parametrize("target", ["white_bowl", "white_plate"])
 def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> None:
-    """Judged by PyBullet's contacts and by the thing's points, which are all inside of the rim."""
+    """Verified with PyBullet's contacts and with the object's points, all inside the rim."""
     made = next(
         made
         for made in (episode(number, task="pick_anything") for number in range(100, 140))
@@ -222,10 +222,10 @@ def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
         painter = Painter(renderer, scene.cameras, depth=True, segmentation=True)
         painter.setup(world)
         seen = painter.images()[camera.name]
-        assert (present(seen.segmentation) >= 0).all()  # no sky is left
+        assert (present(seen.segmentation) >= 0).all()  # no sky is visible
         assert body_index(world, "wall_back") in present(seen.segmentation)
         farthest = float(present(seen.depth).max())
-        # Nothing that the arm could reach: the walls are farther from its base than it is long.
+        # The arm cannot reach the walls: they are farther from its base than its length.
         for body in walls:
             closest = np.abs(body.world_from_body.inverse().position)[0] - 0.01
             assert 1.2 < closest < farthest
@@ -292,7 +292,7 @@ def test_a_mesh_that_cannot_be_handled_is_refused_in_one_sentence(
 
 
 def test_a_glb_file_is_turned_upright_and_a_broken_one_is_refused(tmp_path: Path) -> None:
-    """glTF is in metres and has y up; two boxes at different places of its scene are one solid."""
+    """glTF uses metres and has y up; two boxes at different places of its scene are one solid."""
     both = trimesh.Scene()
     both.add_geometry(trimesh.creation.box(extents=(0.03, 0.05, 0.04)))
     lid = trimesh.transformations.translation_matrix((0.0, 0.03, 0.0))

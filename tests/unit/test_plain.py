@@ -1,4 +1,4 @@
-"""Plain data keeps every bit and refuses what it does not know."""
+"""Plain data keeps every bit, and unknown fields are refused."""
 
 from __future__ import annotations
 

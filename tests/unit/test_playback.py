@@ -51,7 +51,7 @@ def _chunks(path: Path) -> dict[str, list[Any]]:
 
 
 def _column(chunks: list[Any], component: str) -> list[Any]:
-    """(seconds in ns, value) of every row, in order of time."""
+    """(time in ns, value) of every row, in order of time."""
     rows: list[tuple[int, Any]] = []
     for chunk in chunks:
         batch = chunk.to_record_batch()
@@ -107,7 +107,7 @@ def test_the_recorded_description_stands_in_for_a_model_with_other_joints(record
         description = source.description()
     moved = description.replace('xyz="0 0 0.333"', 'xyz="0 0 0.444"')
     assert moved != description
-    other, _ = robot_model("franka_panda/panda.urdf", 1.0, moved)  # another robot than the installed one
+    other, _ = robot_model("franka_panda/panda.urdf", 1.0, moved)  # a different robot from the installed one
     assert next(joint for joint in other.joints if joint.name == "panda_joint1").parent_from_joint.position[2] == 0.444
 
 
@@ -218,7 +218,7 @@ def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> 
         expected = np.max(
             [np.abs(joint[:12] - b.motion.joint_position[name]) for name, joint in a.motion.joint_position.items()], 0
         )
-    assert len(result["distance"].time_ns) == 12  # as long as both last
+    assert len(result["distance"].time_ns) == 12  # for the length of the shorter one
     assert expected.min() > 0.001
     np.testing.assert_array_equal(result["joints"].values[:, 0], expected)
     np.testing.assert_allclose(result["distance"].values, 0.0, atol=1e-9)  # the same gripper and cube

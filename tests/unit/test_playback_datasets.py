@@ -1,4 +1,4 @@
-"""Objects in the playback of a dataset, judged by the recording that it was exported from."""
+"""Objects in the playback of a dataset, compared with the recording that it was exported from."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path
     [
         # Millimetres. Closed around 50 mm, then opened.
         ([80, 75, 68, 60, 52, 50, 50, 50, 50, 60], [80] + [0] * 7 + [80] * 2, [0, 0, 0, 0, 0, 0, 1, 1, 0, 0]),
-        # Closed beside the object: nothing stops the fingers before they are where they shall be.
+        # Closed next to the object: the fingers reach their target unobstructed.
         ([80, 50, 20, 0, 0, 0], [80] + [0] * 5, [0] * 6),
-        # Something that gives way is held, something lost is not.
+        # A soft object counts as held, a lost one does not.
         ([80, 60, 50, 50, 49, 48, 40, 30, 20, 10], [80] + [0] * 9, [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]),
     ],
 )
@@ -96,7 +96,7 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
 
 
 def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> None:
-    """A dataset of LeRobot's may have another range, and even steps."""
+    """Datasets of LeRobot may have another range, and a linear scale."""
     write_episode(tmp_path / "e.mcap", num_frames=3, depth=True, cameras=("front",))
     export(tmp_path / "e.mcap", tmp_path / "d", depth=True)
     info = tmp_path / "d" / "meta" / "info.json"
@@ -110,7 +110,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
     with Recording(tmp_path / "e.mcap") as recording:
         measured = list(recording.depth("front"))[2]
     low, high = np.log(3.51), np.log(13.5)
-    codes = np.rint((np.log(measured + 3.5) - low) / (high - low) * 4095).clip(0)  # as docs/dataset-format.md has them
+    codes = np.rint((np.log(measured + 3.5) - low) / (high - low) * 4095).clip(0)  # as in docs/dataset-format.md
     np.testing.assert_allclose(shown / 1000, np.where(codes > 0, 0.5 + codes / 1000, 0), atol=6e-4)
     for spoilt in (scale | {"video.depth_max": 0.1}, scale | {"video.shift": "far"}):
         written["features"]["observation.images.front_depth"]["info"] = spoilt

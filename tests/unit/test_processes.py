@@ -1,4 +1,4 @@
-"""Our processes do not run the user's script again, and find what they carry out by name."""
+"""Processes of demorec do not run the user's script again, and find their functions by name."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
 
 
 def test_python_itself_would_run_the_script_again(tmp_path: Path) -> None:
-    """Else the test above would prove nothing."""
+    """Otherwise the test above would prove nothing."""
     plain = "from multiprocessing import get_context; SPAWN = get_context('spawn')"
     (tmp_path / "script.py").write_text(SCRIPT.replace("from demorec.core.processes import SPAWN", plain))
     done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
@@ -114,7 +114,7 @@ except KeyboardInterrupt:
 
 @pytest.mark.slow
 def test_a_second_ctrl_c_ends_what_the_first_waits_for(tmp_path: Path) -> None:
-    """It is of the parent alone, so that nothing but the second one can end the workers."""
+    """Only the parent receives it, so that nothing but the second one can end the workers."""
     (tmp_path / "work.py").write_text(SLEEPS)
     parent = subprocess.Popen(
         [sys.executable, "-c", WAITS], cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -143,7 +143,7 @@ def test_a_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None
     assert parent.stdout is not None
     assert parent.stdout.readline() == "ready\n"
     descendants = psutil.Process(parent.pid).children(recursive=True)
-    assert len(descendants) == 2  # the program, and ours in between
+    assert len(descendants) == 2  # the program, and demorec's process in between
     parent.kill()
     parent.wait()
     _, alive = psutil.wait_procs(descendants, timeout=20)
@@ -166,7 +166,7 @@ def test_a_program_ends_when_it_is_asked_to_and_tells_how_it_ended() -> None:
 
 
 def test_a_process_that_is_asked_to_end_while_it_ends_prints_no_traceback() -> None:
-    """SIGTERM while Python runs the callbacks of atexit, as the verifier of an export may get it."""
+    """SIGTERM arrives while Python runs atexit callbacks, as the verifier of an export may receive it."""
     code = (
         "import atexit, os, signal, sys; from demorec.core.processes import exit_silently;"
         "atexit.register(lambda: os.kill(os.getpid(), signal.SIGTERM));"

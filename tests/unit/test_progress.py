@@ -1,4 +1,4 @@
-"""Progress in a log file: lines that come rarely and say how long it will take, none in what is over soon."""
+"""Progress in a log file: infrequent lines with the time left, and none for short jobs."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from demorec.cli.shared.progress import ProgressBar
 
 
 class Clock:
-    """A clock that stands still until it is told."""
+    """A clock that moves only on request."""
 
     def __init__(self) -> None:
         self.now = 1000.0
@@ -23,7 +23,7 @@ class Clock:
 def lines_of(
     capsys: pytest.CaptureFixture[str], *, total: int, seconds_each: float, done: int = 0, note: str = ""
 ) -> list[str]:
-    """What a job prints whose things take so long each."""
+    """Progress lines of a job whose items take the given times."""
     clock = Clock()
     with ProgressBar("generating", total=total, done=done, is_terminal=False, clock=clock) as bar:
         bar.note(note)
@@ -48,7 +48,7 @@ def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys: pytest.Capt
 def test_the_start_does_not_count_for_the_time_that_is_left(
     capsys: pytest.CaptureFixture[str], workers: int, is_terminal: bool
 ) -> None:
-    """Workers that all start for two minutes, and then end an episode each minute, a second after one another."""
+    """All workers start for two minutes, and then each finishes an episode a minute, one second apart."""
     total, clock = 100_000, Clock()
     with ProgressBar("generating", total=total, at_once=workers, is_terminal=is_terminal, clock=clock) as bar:
         clock.now += 120
@@ -84,7 +84,7 @@ def test_there_is_neither_a_flood_nor_a_silence(
 def test_lines_come_by_themselves_until_the_end(capsys: pytest.CaptureFixture[str]) -> None:
     told = ""
     with ProgressBar("generating", total=3, is_terminal=False, quiet=0.01):
-        while not told:  # the limit of the tests' time ends it
+        while not told:  # the tests' time limit ends it
             time.sleep(0.01)
             told = capsys.readouterr().err
     assert re.match(r"generating: 0 of 3 episodes \(0 %\), \d+ s passed\n", told)

@@ -1,4 +1,4 @@
-"""The rasteriser: cached images, shadows, textures, light, levels of detail, changes that it must notice."""
+"""The rasteriser: cached images, shadows, textures, light, levels of detail, detection of changes."""
 
 from __future__ import annotations
 
@@ -93,12 +93,12 @@ def test_each_face_of_a_solid_wears_the_texture_as_seen_along_its_axis(client: A
         inside = np.abs(cells - np.round(cells))[..., sides].min(axis=-1) > 0.15
         shown = (faced == axis) & inside & (seen.segmentation == body)
         assert shown.sum() > 300
-        dark = np.floor(cells)[..., sides].sum(axis=-1) % 2 == 0  # the first row of its pixels is above
+        dark = np.floor(cells)[..., sides].sum(axis=-1) % 2 == 0  # the first row of its pixels is at the top
         assert np.array_equal(seen.color[shown].max(axis=-1) < 20, dark[shown])
 
 
 def test_distant_textures_turn_to_their_mean(client: Any) -> None:
-    # Without mip maps a far checkerboard flickers between its colours.
+    # Without mipmaps a distant checkerboard flickers between its colours.
     texture = Texture(pattern="checker", colors=((1.0, 1.0, 1.0), (0.0, 0.0, 0.0)), scale=128.0)
     body = scenes.add(client, "box", (1.0, 1.0, 0.02), rgbaColor=[1, 1, 1, 1])
     camera = scenes.camera(192, 192, mount_from_camera=look_at((2.7, -1.35, 2.25), (0.0, 0.0, 0.0)))
@@ -135,7 +135,7 @@ def test_a_shadow_lies_where_the_light_puts_it(client: Any) -> None:
     core, free = on_floor & (distance < radius - 0.02), on_floor & (distance > radius + 0.02)
     assert core.sum() > 50
     assert ratio[core].max() < 0.8
-    # Nowhere else is anything darker: no acne.
+    # No other pixel is darker: no shadow acne.
     assert ratio[free].min() > 0.995
     assert images.color[free].std(0).max() < 2
 

@@ -1,4 +1,4 @@
-"""Mesh files: read as they are meant, named when they are broken; decimation and cache keep what they must."""
+"""Mesh files: correct reading, and errors for broken ones; decimation and cache keep the essential parts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_stl_is_read_as_trimesh_reads_it(tmp_path: Path) -> None:
         mesh = load_mesh(path)
         assert mesh.num_faces == len(shape.faces)
         assert np.allclose(mesh.points.min(0), shape.bounds[0], atol=1e-6)
-        # Smooth shading although the file has no shared corners: normals of a sphere point outward.
+        # Shading is smooth although the file has no shared corners: normals of a sphere point outward.
         corners = mesh.points[mesh.faces]
         outward = corners / np.sqrt((corners**2).sum(-1, keepdims=True))
         assert (mesh.normals * outward).sum(-1).min() > 0.98

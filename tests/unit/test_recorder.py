@@ -1,4 +1,4 @@
-"""The recorder of somebody's own loop: what was given is what is recorded, in real time, whatever ends it."""
+"""The recorder in a user's loop: it records its inputs in real time, however the loop ends."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
     buffer = PIXELS.copy()
     with recorder(tmp_path / "run", cameras=TOP) as run, run.episode() as episode:
         for index in range(40):
-            buffer[:] = 5 * index  # the program's own memory may be used again at once
+            buffer[:] = 5 * index  # the program may reuse its memory at once
             episode.write({"state": states[index], "force": forces[index]}, actions[index], {"top": buffer})
         episode.success = True
     with recording_of(tmp_path / "run") as found:
@@ -118,7 +118,7 @@ def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
                 with run.episode(task) as episode:
                     episode.write([0.0])
             with run.episode():
-                pass  # nothing came, so there is no episode
+                pass  # nothing was recorded, so there is no episode
             with run.episode() as episode:
                 episode.write([0.0])
                 episode.discard()
@@ -254,7 +254,7 @@ def test_an_episode_that_was_opened_and_killed_leaves_no_gap(tmp_path: Path) -> 
     with recorder(tmp_path / "run", robot="arm", cameras=TOP, fps=50) as run:
         assert run.recovered == ()
         with run.episode() as episode, pytest.raises(RecordingError, match="nan"):
-            episode.write([float("nan")])  # nothing was taken, so there is no episode
+            episode.write([float("nan")])  # nothing was recorded, so there is no episode
         with run.episode() as episode:
             episode.write([0.0])
     assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap"]
@@ -284,12 +284,12 @@ def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
 
 
 def held_up(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
-    """The encoder waits for this."""
+    """The encoder waits for this event."""
     go_on, write = threading.Event(), BackgroundEncoder._write
 
     def waits(self: BackgroundEncoder, *waiting: Any) -> None:
         if not go_on.wait(30):
-            go_on.set()  # a test that fails shall not wait once more for every frame
+            go_on.set()  # so that a failing test does not wait again for every frame
         write(self, *waiting)
 
     monkeypatch.setattr(BackgroundEncoder, "_write", waits)

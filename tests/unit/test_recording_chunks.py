@@ -1,4 +1,4 @@
-"""Whole topics at once, against the mcap library's own reader; and chunks that are not what they seem."""
+"""Whole topics at once, compared with the mcap library's own reader; and chunks with misleading headers."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Reading and writing take as much memory for ten minutes as for one."""
+"""Reading and writing ten minutes needs no more memory than one minute."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
 
 
 def write_long(path: Path, num_frames: int) -> None:
-    """The same 60 frames again and again."""
+    """Write the same 60 frames repeatedly."""
     info, frames, outcome = make_episode(
         num_frames=60, width=64, height=64, cameras=("front",), depth=True, segmentation=True
     )
@@ -59,7 +59,7 @@ def test_memory_does_not_grow_with_length(
     tmp_path: Path, num_frames: tuple[int, int], capsys: pytest.CaptureFixture[str]
 ) -> None:
     peaks: dict[str, list[int]] = {"writing": [], **{name: [] for name in READERS}}
-    for count in (10, *num_frames):  # the first loads and compiles what is loaded and compiled once
+    for count in (10, *num_frames):  # the first call loads and compiles
         path = tmp_path / f"{count}.mcap"
         peaks["writing"].append(peak_bytes(partial(write_long, path, count)))
         with Recording(path) as recording:
@@ -77,7 +77,7 @@ def test_memory_does_not_grow_with_length(
 def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_are(tmp_path: Path) -> None:
     short = make_external(cameras=(), num_frames=60)
     peaks, num_bytes = [], []
-    for count in (60, 1500, 6000):  # the first loads what is loaded once
+    for count in (60, 1500, 6000):  # the first call loads libraries
         with SampledWriter(tmp_path / f"{count}.mcap", short.info) as writer:
             for index in range(count):
                 frame = short.frames[index % 60]
@@ -106,7 +106,7 @@ def test_numbers_of_a_external_episode_are_read_without_its_images(tmp_path: Pat
             writer.write(frame)
         writer.finish(given.outcome)
     with Recording(tmp_path / "a.mcap") as recording:
-        # A chunk has the images of a second, and is there compressed and unpacked.
+        # A chunk has the images of a second, both compressed and unpacked.
         assert peak_bytes(recording.table) < num_bytes * 0.7
         stamps = recording.table().image_stamps["top"].tolist()
     assert stamps == [frame.time_ns for frame in given.frames]

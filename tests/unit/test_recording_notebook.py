@@ -1,4 +1,4 @@
-"""A recording in a notebook: a sequence of frames with images, a table, a page, and the examples of the documents."""
+"""A recording in a notebook: a sequence of frames with images, a table, a page, and the examples in the docs."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
 
 
 class Page(HTMLParser):
-    """Collects the text of a page and its images; knows which elements were opened and closed."""
+    """Collects the text and images of a page, and the elements that were opened and closed."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -135,7 +135,7 @@ def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Pat
 
 
 def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> None:
-    """On a recording of the demo's task, since the examples name what lies on its table."""
+    """On a recording of the demo's task, since the examples name the objects on its table."""
     sample = Path(__file__).parents[2] / "recordings/sample/pick_place.mcap"
     recording = {"recordings/demo/episodes/episode_000000.mcap": sample}
     assert run_examples("docs/recording.md", "import open_recording", recording) == 2

@@ -1,4 +1,4 @@
-"""What is written is what is read, to the bit."""
+"""Writing and reading is bit-exact."""
 
 from __future__ import annotations
 
@@ -116,7 +116,7 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
                 assert np.array_equal(labels, present(frame.images[camera].segmentation))
         names = recording.segment_names()
     assert names[-1] == "background"
-    assert (names[0], names[1], names[3]) == ("table", "target", "cube")  # what stands still, the robot, what moves
+    assert (names[0], names[1], names[3]) == ("table", "target", "cube")  # fixed bodies, the robot, movable objects
     assert names[2 + (1 << 24)] == "panda/panda_link1"
 
 
@@ -134,7 +134,7 @@ def test_without_depth_it_says_so(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(("width", "height", "step"), [(64, 48, 1), (640, 480, 4)])
 def test_statistics_are_of_every_other_image(tmp_path: Path, width: int, height: int, step: int) -> None:
-    """Every fourth row of it, each quarter in turn; large images thinned as LeRobot thins them."""
+    """Every fourth row of an image, shifted each time; large images are thinned as LeRobot does."""
     info, frames, outcome = make_episode(num_frames=7, width=width, height=height)
     path = record(tmp_path / "a.mcap", frames, info, outcome)
     with Recording(path) as recording:

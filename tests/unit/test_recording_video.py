@@ -1,4 +1,4 @@
-"""The encoder: what it is told, that it does not depend on what the process did before, and that it holds nothing."""
+"""The encoder: its settings, its independence of the process's past, and that it releases its memory."""
 
 from __future__ import annotations
 
@@ -31,8 +31,10 @@ for codec in ("h264", "av1", "jpeg"):
 
 @pytest.mark.slow
 def test_packets_do_not_depend_on_what_was_in_the_memory() -> None:
-    """glibc fills fresh memory with a pattern of our choice: an encoder that reads it before setting it gives itself
-    away (x264 with its macroblock tree does)."""
+    """glibc fills new memory with a chosen pattern.
+
+    An encoder that reads memory before setting it is thus detected (x264 with its macroblock tree is).
+    """
     results = []
     for pattern in ("0", "1", "170"):
         environment = {**os.environ, "MALLOC_PERTURB_": pattern, "PYTHONPATH": str(Path(__file__).parents[1])}
@@ -46,7 +48,7 @@ def test_packets_do_not_depend_on_what_was_in_the_memory() -> None:
 
 @pytest.mark.parametrize("codec", ["h264", "av1", "jpeg"])
 def test_the_delay_is_short(codec: Codec) -> None:
-    """What an encoder holds back is lost in a crash."""
+    """Frames that an encoder buffers are lost in a crash."""
     _, frames, _ = make_episode(num_frames=40, cameras=("front",))
     encoder = make_encoder(video=VideoConfig(codec=codec, gop=30), width=64, height=48, fps=30)
     out = 0
@@ -83,7 +85,7 @@ def test_another_size_than_the_settings_say() -> None:
 
 
 def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
-    """x264 without any vector instruction codes the same bits as with all that this machine has."""
+    """x264 without vector instructions encodes the same bits as with all of this machine's."""
     from fractions import Fraction
 
     import av
@@ -124,7 +126,7 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
 
 @pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
 def test_a_stream_says_how_its_colours_are_meant(codec: Codec, decoder: str) -> None:
-    """And it is true: the luma and chroma in it give the image back by the matrix and range that it names."""
+    """Its luma and chroma give the image back by the matrix and range in its metadata."""
     import av
 
     colours = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [200, 200, 40]], dtype=np.uint8)

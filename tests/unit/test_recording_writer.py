@@ -1,4 +1,4 @@
-"""What the writer refuses, and what it leaves behind when something goes wrong."""
+"""Input that the writer refuses, and the files that it leaves after an error."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def test_a_disk_that_fills_up_in_the_middle(tmp_path: Path, capfd: pytest.Captur
 
 
 def leftover(folder: Path, origin: str) -> bytes:
-    """What a kill leaves of a derived recording after its first second."""
+    """Leftover of a derived recording that was killed after its first second."""
     info, frames, _ = make_episode(num_frames=40, cameras=())
     with EpisodeWriter(folder / "a.mcap", replace(info, origin=origin)) as writer:
         write_all(writer, frames)
@@ -155,7 +155,7 @@ def test_a_writer_killed_before_its_first_frame_leaves_nothing_to_keep(tmp_path:
     info, frames, outcome = make_episode(num_frames=5, cameras=())
     EpisodeWriter(tmp_path / "a.mcap", info).__exit__(None, None, None)
     part = tmp_path / "a.mcap.part"
-    part.write_bytes(part.read_bytes()[:8])  # MCAP's magic alone
+    part.write_bytes(part.read_bytes()[:8])  # MCAP's magic bytes alone
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         write_all(writer, frames, outcome)
     assert names(tmp_path) == ["a.mcap"]

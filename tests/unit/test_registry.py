@@ -1,4 +1,4 @@
-"""Names, nearest matches and somebody else's modules."""
+"""Names, nearest matches and third-party modules."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`demorec report`: read by an HTML parser that is not ours, its images by Pillow."""
+"""`demorec report`, read by an independent HTML parser; Pillow reads its images."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ VOID = ("img", "meta", "input", "br")
 
 @dataclass
 class Page(HTMLParser):
-    """What a parser finds in a page.
+    """Content of a page.
 
     Attributes:
         tags: (name, attributes) of every element.
@@ -129,7 +129,7 @@ def test_nothing_is_loaded_from_elsewhere(run: Path) -> None:
 
 
 def test_a_filmstrip_shows_the_frames_that_it_names(run: Path) -> None:
-    """Each image carries its frame's number as a bar code."""
+    """Each image shows its frame's number as a bar code."""
     found = report_on(run)
     assert len(list(found.all("img"))) == 4
     for image, words in zip(found.all("img"), found.articles, strict=True):
@@ -168,7 +168,7 @@ def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path)
     shutil.rmtree(other / "demorec")
     found = report_on(other)
     assert "no folder demorec/, which exports of demorec have" in found.words
-    assert "3 of 3 attempts succeeded" in found.words  # the column next.success tells
+    assert "3 of 3 attempts succeeded" in found.words  # from the column next.success
     assert len(list(found.all("img"))) == 3
     file = other / "meta" / "info.json"
     plain = json.loads(file.read_text())
@@ -189,7 +189,7 @@ def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path)
 
 
 def test_images_in_rows_are_shown(tmp_path: Path) -> None:
-    """Frame t of episode e is as bright as 10 + 20 t + 40 e."""
+    """Frame t of episode e has the brightness 10 + 20 t + 40 e."""
     root = write_foreign(tmp_path / "rows")
     files = [io.BytesIO() for _ in range(16)]
     for row, file in enumerate(files):
@@ -208,7 +208,7 @@ def test_images_in_rows_are_shown(tmp_path: Path) -> None:
 
 
 def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
-    """Whatever a recording says is text: the page has the same elements as without it."""
+    """Text in a recording is escaped: the page has the same elements as without it."""
     good = run / "episodes" / "episode_000000.mcap"
     with Recording(good) as recording:
         episode, outcome = (recording._container.metadata(f"demorec.{name}") for name in ("episode", "outcome"))
@@ -240,7 +240,7 @@ def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("count", [1000, 9000])
 def test_a_large_run_stays_small(run: Path, count: int) -> None:
-    """As many episodes, each with a filmstrip that takes all that it may."""
+    """As many episodes, each with a filmstrip of maximum size."""
     strip = Filmstrip(jpeg=bytes(strip_budget(count)), camera="front", moments=8, width=800, height=100)
     report = gathered(run)
     many = tuple(replace(report.episodes[number % 4], filmstrip=strip) for number in range(count))
@@ -252,7 +252,7 @@ def test_a_large_run_stays_small(run: Path, count: int) -> None:
 
 
 def test_distributions_are_drawn_from_frames_and_extremes() -> None:
-    """Of 1,000 values every fifth, the extremes, and nothing that is not finite."""
+    """Every fifth of 1,000 values, the extremes, and no value that is not finite."""
     values = np.stack([np.arange(1000.0), np.full(1000, 7.0)], axis=1)
     values[500, 0] = np.nan
     found = motion_components(

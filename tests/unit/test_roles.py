@@ -1,4 +1,4 @@
-"""Roles and names: the same motion under anybody's names is read alike, and written back as it was named."""
+"""Roles and names: the same motion is read alike under any names, and keeps its names when written."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from demorec.view.sources import find_episodes
 
 Capture = pytest.CaptureFixture[str]
 UNKNOWN = Convention({"measured": (None, (0, 1, 2, 3))}, {"wanted": (None, (0, 1, 2, 3))})
-"""Names that nobody uses: state and action must be named by the user."""
+"""Names outside of all conventions: the user must name state and action."""
 NAMED = ("--state", "measured", "--action", "wanted")
 
 
 def diagnosis(capsys: Capture, *words: object) -> dict[str, Any]:
-    """Give what `demorec check` finds."""
+    """Return the findings of `demorec check`."""
     capsys.readouterr()
     exit_code("check", *words, "--no-images", "--json")
     found: dict[str, Any] = json.loads(capsys.readouterr().out)

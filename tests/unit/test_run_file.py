@@ -1,4 +1,4 @@
-"""run.json: what is written is what is read, every way of breaking it is told, and only content decides the digest."""
+"""run.json: exact round trip, a message for every kind of damage, and a digest of content alone."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_every_damage_is_told_as_such(tmp_path: Path, damage: Callable[[str], st
 
 
 def edit(path: Path, change: Callable[[Any], object]) -> None:
-    """Change run.json as JSON, and be sure that it is another one then."""
+    """Edit run.json as JSON, and check that it changed."""
     plain = json.loads(path.read_text())
     before = json.dumps(plain)
     change(plain)

@@ -1,4 +1,4 @@
-"""The doctor's scores on a small dataset of somebody else's in which single episodes are spoilt on purpose."""
+"""Scores of episodes on a small third-party dataset in which single episodes are damaged on purpose."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ Rows = dict[str, NDArray[Any]]
 
 
 def demonstration(number: int) -> Rows:
-    """An arm goes from a place to another one and back, smoothly, with something in its hand from frame 20 to 42."""
+    """An arm moves smoothly from one place to another and back, with an object in its hand from frame 20 to 42."""
     rng = np.random.default_rng(number)
     bounds = (0, CLOSES, OPENS, LENGTH - 1)
     places = np.array([[0, 0], [1, 0.2], [-1, 0.6], [0, 0]]) + rng.uniform(-0.1, 0.1, (4, 2))
@@ -43,7 +43,7 @@ def demonstration(number: int) -> Rows:
 
 
 def write(root: Path, episodes: list[Rows]) -> Path:
-    """As the dataset of `support.foreign_dataset`, with other rows."""
+    """Write the dataset of `support.foreign_dataset` with other rows."""
     write_foreign(root, length=LENGTH, episodes=len(episodes), size=SIZE)
     lengths = [len(rows["state"]) for rows in episodes]
     kinds = {field.name: field.type for field in pq.read_schema(root / DATA)}
@@ -115,7 +115,7 @@ def lacks_numbers(rows: Rows) -> Rows:
 
 @pytest.fixture
 def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Callable[[Rows], Rows] | None], Any]:
-    """What is found of a dataset in which one episode is changed by a function."""
+    """Findings for a dataset in which a function changed one episode."""
 
     def run(spoil: Callable[[Rows], Rows] | None) -> Any:
         episodes = [demonstration(number) for number in range(EPISODES_IN_ALL)]

@@ -10,7 +10,7 @@ from demorec.core.seeding import PURPOSES, generator
 
 
 def test_the_first_purposes_keep_their_place() -> None:
-    """Recorded seeds depend on the position: this list may only grow at its end."""
+    """Recorded seeds depend on the position: new purposes may only be appended."""
     assert PURPOSES[:8] == ("scene", "expert", "noise", "looks", "perception", "cameras", "physics", "sampling")
 
 

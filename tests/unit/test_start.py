@@ -1,4 +1,4 @@
-"""The first moments of a program: Ctrl-C while it loads is an exit code and no traceback."""
+"""Ctrl-C while a program loads: an exit code and no traceback."""
 
 from __future__ import annotations
 

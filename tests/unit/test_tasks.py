@@ -1,4 +1,4 @@
-"""Layouts, grasps and checks: each condition of success fails when, and only when, it is broken."""
+"""Layouts, grasps and checks: each condition of success fails if, and only if, it is violated."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def body(size: tuple[float, ...], symmetry: int = 1, kind: ShapeKind = "box") ->
 
 
 def rolled(degrees: float) -> Pose:
-    """A turn about x."""
+    """A rotation about x."""
     half = math.radians(degrees) / 2
     return Pose(quat_xyzw=np.array([math.sin(half), 0, 0, math.cos(half)]))
 
@@ -41,7 +41,7 @@ def shifted(pose: Pose, x: float = 0.0, z: float = 0.0) -> Pose:
 
 @pytest.fixture(scope="module")
 def finished() -> Iterator[tuple[PreparedEpisode, World]]:
-    """A world in which the episode has just ended well."""
+    """A world in which the episode has just succeeded."""
     prepared = episode(0)
     with make_world(prepared.info) as world:
         _, outcome = run(prepared, world)
@@ -96,7 +96,7 @@ def test_a_cube_that_floats_moves_or_is_held_fails(finished: tuple[PreparedEpiso
 
 
 def test_into_a_tray_is_anywhere_in_it() -> None:
-    """The floor of tray.urdf is 0.26 x 0.20 m; a cube on the table beside it, or on its wall, is not in it."""
+    """The floor of tray.urdf is 0.26 x 0.20 m; a cube on the table next to it, or on its wall, is not in it."""
     prepared = episode(0, task="place_in_tray")
     with make_world(prepared.info) as world:
         _, outcome = run(prepared, world)
@@ -138,14 +138,14 @@ def test_a_deliberate_miss_is_flagged_and_mended() -> None:
     [
         pytest.param(0, "pick_place", 0.0, marks=pytest.mark.slow),
         pytest.param(1, "pick_place", 0.005, marks=pytest.mark.slow),
-        (2, "pick_place", -0.015),  # against the miss, as far as is allowed
+        (2, "pick_place", -0.015),  # opposite to the miss, by the maximum
         pytest.param(3, "pick_place", -0.005, marks=pytest.mark.slow),
         (4, "pick_shapes", 0.005),
         (6, "pick_from_clutter", -0.005),
     ],
 )
 def test_a_deliberate_miss_touches_nothing(robot: str, task: str, index: int, offset: float) -> None:
-    """Fast, with bodies of all sizes: no finger lands on one, and no opening finger pushes one."""
+    """Many layouts with bodies of all sizes: no finger lands on one, and no opening finger pushes one."""
     prepared = episode(index, robot=robot, task=task)
     side = 1.0 if index % 2 == 0 else -1.0
     frames, outcome = run(behave(prepared, speed=1.5, miss_x=0.03 * side, miss_y=0.012, grasp_offset=offset))
@@ -155,7 +155,7 @@ def test_a_deliberate_miss_touches_nothing(robot: str, task: str, index: int, of
     last = max(frame.frame_index for frame in frames if frame.is_deliberate_miss)
     opened = next(f for f in frames[last:] if f.phase != "close" and f.observation.gripper_width > 0.078)
     assert max(frame.observation.contact_force for frame in frames[: opened.frame_index]) == 0.0
-    for name, start in frames[5].observation.object_poses.items():  # all lie still by then
+    for name, start in frames[5].observation.object_poses.items():  # all are at rest by then
         assert np.abs(opened.observation.object_poses[name].position - start.position).max() < 3e-4, name
 
 

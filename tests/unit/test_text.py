@@ -1,4 +1,4 @@
-"""Nothing foreign acts on a terminal."""
+"""Third-party text has no effect on a terminal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Variation: presets, ranges, stratified layouts, held-out split; what is drawn is recorded and nothing else moves."""
+"""Variation: presets, ranges, stratified layouts, held-out split; drawn values are recorded and change nothing else."""
 
 from __future__ import annotations
 
@@ -83,14 +83,14 @@ def test_full_varies_everything_within_its_ranges_and_records_it() -> None:
     assert 1 <= misses <= 15
     assert 20 < sum(scene.body("table").texture is not None for scene in scenes) < 50
     assert all(p.info.simulated.behaviour["perception_x"] == 0 for p in episodes)
-    # Red stays the strongest channel of what an instruction calls red.
+    # Red stays the strongest channel of objects that an instruction calls red.
     assert all(np.argmax(scene.body("red_cube").rgba[:3]) == 0 for scene in scenes)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["place_in_tray", "sort_by_color"])
 def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
-    """Points all over a distractor lie outside the rectangle of every tray."""
+    """Points around a distractor are outside the rectangle of every tray."""
     count = 0
     for index in range(60):
         scene = episode(index, task=task, variation="full").info.simulated.scene
@@ -111,7 +111,7 @@ def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
 
 @pytest.mark.slow
 def test_looks_do_not_touch_the_physics() -> None:
-    """Another preset of looks alone gives the same bits of state."""
+    """A preset that changes only the appearance gives the same bits of state."""
     plain = run(episode(3))[1].final_state_digest
     looks = Ranges(
         light_turn=(1.0, 1.0), light_ambient=(0.4, 0.4), surface_color=1.0, texture_probability=1.0, object_shade=0.3
@@ -141,14 +141,14 @@ def test_calibration_error_is_between_truth_and_record() -> None:
         assert error != Pose()
         shift = [prepared.info.simulated.behaviour[f"calibration_{name}_{axis}"] for axis in "xyz"]
         assert np.allclose(error.position, shift, atol=1e-9)
-        # The image is drawn from where the camera truly is.
+        # The image is drawn from the camera's true pose.
         assert np.array_equal(frame.images[name].color, reference.images[name].color)
 
 
 def test_stratified_points_are_the_known_sequences() -> None:
     points = np.array([stratified_point("lhs", root_seed=1, episode_index=i, block=10) for i in range(20)])
     for cube in (points[:10], points[10:]):
-        # Each number's ten values fall into ten different tenths.
+        # The ten values of each number are in ten different tenths of its range.
         assert (np.sort(np.floor(cube * 10), axis=0) == np.arange(10)[:, None]).all()
     assert not np.array_equal(points[:10], points[10:])
     sobol = np.array([stratified_point("sobol", root_seed=1, episode_index=i, block=10) for i in range(16)])

@@ -1,4 +1,4 @@
-"""Models as vendors ship them: ROS packages, COLLADA, global materials; drawn where their meshes are found."""
+"""Models in the form of vendors: ROS packages, COLLADA, global materials; drawn where their meshes are found."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from demorec.view.sources import find_episodes
 
 WHITE, ORANGE = (242, 242, 242, 255), (255, 128, 0, 255)
 BOX_CORNERS = 24
-"""Of a box, each of its faces shaded flat."""
+"""Colours of a box, with flat shading."""
 CORNERS = [(0, 0, 0), (0.1, 0, 0), (0, 0.2, 0), (0, 0, 0.3)]
 FACES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
 COLLADA = """<?xml version="1.0"?>
@@ -40,7 +40,7 @@ COLLADA = """<?xml version="1.0"?>
 
 
 def urdf_text(mesh: str) -> str:
-    """An arm of two links with one mesh each; the second one has a colour of its own, the first a global material."""
+    """An arm of two links with one mesh each; the second has its own colour, the first a global material."""
     visual = f"<geometry><mesh scale='1 1 1' filename='{mesh}'/></geometry>"
     return f"""<robot name="vendor">
       <material name="arm_white"><color rgba="0.95 0.95 0.95 1"/></material>
@@ -143,7 +143,7 @@ def record(folder: Path, robot: Path | str) -> Path:
 
 
 def drawn(recording: Path, out: Path) -> dict[str, tuple[int, set[int]]]:
-    """Link -> how many corners its mesh has in a file of `view --save`, and their colours."""
+    """Link -> number of corners of its mesh in a file of `view --save`, and their colours."""
     save(find_episodes([recording])[0], out)
     found = {}
     for chunk in RrdReader(out).stream():
@@ -178,7 +178,7 @@ def test_a_model_that_has_other_joints_by_now_is_not_drawn(package: Path, tmp_pa
 def test_a_described_arm_is_drawn_with_its_meshes_where_ros_finds_them(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """As imported from a bag with /robot_description."""
+    """The arm is imported from a bag with /robot_description."""
     recording = record(tmp_path / "run", (package / "urdf" / "vendor.urdf").read_text())
     drawn(recording, tmp_path / "a.rrd")
     assert "drawn as rods" in caplog.text

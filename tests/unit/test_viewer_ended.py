@@ -1,4 +1,4 @@
-"""What is said when Rerun's viewer without a screen ends by itself."""
+"""Messages when Rerun's headless viewer ends by itself."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> No
     assert np.abs(seen.base_from_tcp.position - state[4]).max() < 1e-6
     assert abs(seen.gripper_width - 0.08) < 1e-3
     assert seen.joint_position.shape == seen.joint_velocity.shape == seen.joint_effort.shape == (9,)
-    # At rest the motors hold the arm's weight, as the inverse dynamics say.
+    # At rest the motors hold the arm's weight, in agreement with inverse dynamics.
     at_rest = world.client.calculateInverseDynamics(world.arm.body, seen.joint_position.tolist(), [0.0] * 9, [0.0] * 9)
     assert np.abs(seen.joint_effort[:7] - at_rest[:7]).max() < 0.01
     assert np.abs(at_rest[:7]).max() > 10

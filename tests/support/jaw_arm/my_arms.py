@@ -1,4 +1,4 @@
-"""A small arm of five joints with a turning jaw, of the proportions of an SO-101, made of boxes for tests."""
+"""A small arm of five joints with a turning jaw, with the proportions of an SO-101, made of boxes for tests."""
 
 from __future__ import annotations
 
@@ -7,11 +7,13 @@ import math
 from demorec.robots.robot import JawGripper, RobotSpec
 
 PIVOT_Y, INNER_Y, TIP_Z = 0.030, -0.005, 0.068
-"""Of the jaw's axis in the TCP's frame, and of its inner face at the tip in the jaw's own, metres (jaw_arm.urdf)."""
+"""Position of the jaw's axis in the TCP's frame, and of its inner face at the tip in the jaw's frame, metres
+(jaw_arm.urdf).
+"""
 
 
 def opening(q: float) -> float:
-    """From the inner face of the fixed finger to the tip of the jaw, metres, along the TCP's y."""
+    """Distance from the inner face of the fixed finger to the tip of the jaw, metres, along the TCP's y."""
     return PIVOT_Y + INNER_Y * math.cos(q) + TIP_Z * math.sin(q)
 
 

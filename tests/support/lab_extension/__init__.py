@@ -1,4 +1,4 @@
-"""A package of somebody else that brings one of everything to demorec."""
+"""A third-party package that adds one item of every kind to demorec."""
 
 from demorec.api import CommandRow, Extension, ReaderRow
 

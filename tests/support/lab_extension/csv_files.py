@@ -30,7 +30,7 @@ FPS = 30
 
 @dataclass(frozen=True, kw_only=True)
 class LabOptions(CommonOptions):
-    """How a recording becomes a CSV file."""
+    """Options of an export to a CSV file."""
 
     digits: int = 9
     """Digits of each number."""
@@ -61,7 +61,7 @@ def export(sources: Sequence[Path], out: Path, options: LabOptions, progress: Pr
 
 @dataclass(frozen=True, kw_only=True)
 class Imported:
-    """What was imported."""
+    """Result of an import."""
 
     num_episodes: int
     num_frames: int
@@ -70,7 +70,7 @@ class Imported:
     skipped: Mapping[str, str] = field(default_factory=dict)
 
     def left_out_lines(self) -> Iterator[str]:
-        """Nothing is left out."""
+        """Return no lines: an import keeps everything."""
         yield from ()
 
 

@@ -1,1 +1,1 @@
-"""What LeRobot's commands find installed in tests: stand-ins for hardware, and demorec's own plug-ins."""
+"""Packages that LeRobot's commands find in tests: stand-ins for hardware, and demorec's own plug-ins."""

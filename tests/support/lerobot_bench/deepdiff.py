@@ -1,4 +1,4 @@
-"""In place of the package deepdiff, by which LeRobot's bus asks whether its servos have the same registers."""
+"""Stand-in for the package deepdiff, with which LeRobot's bus compares the registers of its servos."""
 
 
 def DeepDiff(one: object, other: object) -> dict[str, object]:

@@ -1,4 +1,4 @@
-"""A teleoperator that says what a file has: {"names": [...], "rows": [[...], ...]}, the last row for ever."""
+"""A teleoperator that reads actions from a file: {"names": [...], "rows": [[...], ...]}; the last row is repeated."""
 
 from __future__ import annotations
 

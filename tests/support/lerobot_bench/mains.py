@@ -1,4 +1,4 @@
-"""Runs LeRobot's commands one after the other in one process, each by its `main`, as its program does.
+"""Run LeRobot's commands one after the other in one process, each by its `main`, as its program does.
 
 Argument: a JSON list of {"command": "lerobot_record", "args": [...], "env": {...}}.
 """

@@ -1,4 +1,4 @@
-"""In place of Feetech's library: six servos that are at once where they are sent, and write down where that is.
+"""Stand-in for Feetech's library: six servos that reach their goals instantly, and log them.
 
 STUB_CALIBRATION names a file in LeRobot's form, which their registers hold; STUB_LOG the file of goals, one line each.
 """

@@ -1,4 +1,4 @@
-"""In place of pyserial, of which LeRobot's bus knows the error alone."""
+"""Stand-in for pyserial, of which LeRobot's bus needs only the error."""
 
 
 class SerialException(Exception):
