@@ -244,11 +244,13 @@ def trossen(seconds: float = 2.0, *, gop: int = 10) -> Notes:
     return notes
 
 
-def video(images: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx264") -> list[bytes]:
+def video(
+    images: Sequence[NDArray[np.uint8]], *, gop: int, codec: str = "libx264", pixels: str = "yuv420p"
+) -> list[bytes]:
     """One packet an image, parameter sets before each keyframe."""
     context = av.CodecContext.create(codec, "w")
     assert isinstance(context, av.VideoCodecContext)
-    context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+    context.width, context.height, context.pix_fmt = WIDTH, HEIGHT, pixels
     context.framerate, context.time_base = Fraction(30), Fraction(1, 30)
     context.gop_size = gop
     context.options = {"bf": "0", "tune": "zerolatency", "sc_threshold": "0"}  # no keyframes except those of the GOP

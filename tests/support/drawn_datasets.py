@@ -21,7 +21,7 @@ STATE, ACTION, TOP = "observation.state", "action", "observation.images.top"
 REFERENCE = "annotation.human.task"
 TASKS = ("open the drawer", "close the drawer", "valid", "push it")
 WIDTH, HEIGHT = 64, 64
-ENCODERS = {"h264": "libx264", "hevc": "libx265", "av1": "libsvtav1", "mpeg4": "mpeg4"}
+ENCODERS = {"h264": "libx264", "hevc": "libx265", "av1": "libsvtav1", "mpeg4": "mpeg4", "png": "png"}
 _OPTIONS = {
     "libx264": {"bf": "2", "preset": "ultrafast"},
     "libx265": {"preset": "ultrafast", "x265-params": "log-level=none:bframes=0:pools=1:frame-threads=1"},
@@ -43,6 +43,7 @@ class DrawnDataset:
         is_variable: Whether vectors are lists of any length in the data files.
         clock: "grid", "jitter" or "late".
         time_type: NumPy's type of timestamps.
+        pixels: Pixel format of videos.
         camera: A codec, "image" (structs in rows), "binary" (plain bytes in rows) or "" for none.
         gop: Frames from one keyframe to the next.
         is_fragmented: Whether videos are in fragments.
@@ -69,6 +70,7 @@ class DrawnDataset:
     num_files: int
     extra: tuple[str, ...]
     has_unlisted: bool
+    pixels: str = "yuv420p"
     fps: int = 10
 
     @property
@@ -87,7 +89,7 @@ DRAWN = st.builds(
     is_variable=st.booleans(),
     clock=st.sampled_from(["grid", "jitter", "late"]),
     time_type=st.sampled_from(["float32", "float64"]),
-    camera=st.sampled_from(["", "image", "binary", *ENCODERS]),
+    camera=st.sampled_from(["", "image", "binary", "h264", "hevc", "av1", "mpeg4"]),
     gop=st.sampled_from([1, 3, 100]),
     is_fragmented=st.booleans(),
     reference=st.sampled_from(["", "int64", "int32"]),
@@ -188,7 +190,7 @@ def _write_old(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: lis
         if drawn.camera in ENCODERS:
             path = root / f"videos/chunk-000/{TOP}/episode_{number:06d}.mp4"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encoded(drawn.camera, len(part), drawn.gop, drawn.is_fragmented))
+            path.write_bytes(encoded(drawn.camera, len(part), drawn.gop, drawn.is_fragmented, drawn.pixels))
         episodes.append({"episode_index": number, "tasks": [TASKS[number % 2]], "length": len(part)})
     lines = "".join(json.dumps(row) + "\n" for row in episodes)
     (root / "meta/episodes.jsonl").write_text(lines)
@@ -213,7 +215,7 @@ def _write_new(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: lis
     }  # fmt: skip
     if drawn.camera in ENCODERS:
         path = root / f"videos/{TOP}/chunk-000/file-000.mp4"
-        path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.is_fragmented))
+        path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.is_fragmented, drawn.pixels))
         table |= {f"videos/{TOP}/{name}": [0] * len(parts) for name in ("chunk_index", "file_index")}
         table |= {
             f"videos/{TOP}/{name}_timestamp": [number / drawn.fps for number in numbers]
@@ -224,7 +226,7 @@ def _write_new(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: lis
 
 
 @functools.cache
-def encoded(codec: str, length: int, gop: int, is_fragmented: bool) -> bytes:
+def encoded(codec: str, length: int, gop: int, is_fragmented: bool, pixels: str = "yuv420p") -> bytes:
     """An mp4 file of some frames at 10 Hz: a square that moves over a table."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH].astype(np.uint8)
     table = np.stack([2 * rows, 2 * columns, rows + columns], axis=-1)
@@ -234,9 +236,9 @@ def encoded(codec: str, length: int, gop: int, is_fragmented: bool) -> bytes:
     options = {"movflags": "frag_keyframe+empty_moov+default_base_moof"} if is_fragmented else {}
     with av.open(file, "w", format="mp4", options=options) as out:
         name = ENCODERS[codec]
-        stream = out.add_stream(name, rate=10, options={"g": str(gop), **_OPTIONS[name], **in_order})
+        stream = out.add_stream(name, rate=10, options={"g": str(gop), **_OPTIONS.get(name, {}), **in_order})
         assert isinstance(stream, VideoStream)
-        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, "yuv420p"
+        stream.width, stream.height, stream.pix_fmt = WIDTH, HEIGHT, pixels
         for number in range(length):
             image = table.copy()
             image[number : number + 20, 5:25] = (200, 90, 7 * number)

@@ -79,6 +79,7 @@ class VideoFile:
         order: (N,) indices that sort `frames`.
         keys: (K,) frame numbers of the keyframes.
         size, pixels: (width, height) and pixel format, as libav describes them.
+        parameters: Parameter sets of the codec.
         has_long_lengths: Whether H.264 and HEVC units have four-byte lengths, as from all common writers.
 
     Raises:
@@ -94,8 +95,8 @@ class VideoFile:
         with opened_video(path) as (_, stream):
             context = stream.codec_context
             self._codec = context.name
-            self.size, self.pixels = (context.width, context.height), context.pix_fmt
-            extra = context.extradata or b""
+            self.size, self.pixels = (context.width, context.height), context.pix_fmt or ""
+            self.parameters = extra = context.extradata or b""
             length_size = extra[4] if self._codec == "h264" else extra[21] if len(extra) > 21 else 3
             self.has_long_lengths = self._codec not in ("h264", "hevc") or (length_size & 3) == 3
         self._head = b""

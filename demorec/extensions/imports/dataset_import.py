@@ -28,6 +28,7 @@ from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.extensions.imports.description import importing_versions
 from demorec.extensions.imports.episode_writer import FramesImport, Image, add_episode
+from demorec.extensions.imports.gray_video import deep_gray
 from demorec.robots.motors import Motors
 from demorec.runs.external import ExternalFolder, episode_path, open_external_run, planned_episode
 from demorec.runs.find import expect
@@ -155,6 +156,12 @@ def _surveyed(dataset: LeRobotFolder, places: Sequence[EpisodePlace], skipped: d
                 feature = dataset.info.features[key]
                 if feature.is_video and not feature.is_depth:
                     video = dataset.video(key, place)
+                    if measurement := deep_gray(video.file.codec, video.file.pixels, video.file.parameters):
+                        raise ConfigError(
+                            f"The video of {key} holds {measurement}, which is depth or another measurement and "
+                            f"not colour, and {INFO_PATH} has no scale of it: leave it out (demorec dataset "
+                            f"drop-features DATASET {key} --out NEW): {video.path}"
+                        )
                     survey.formats.setdefault(name, set()).add((video.file.codec_name, video.file.size))
                     survey.reasons[name] = survey.reasons.get(name) or video.why_transcoded()
             survey.inexact |= {name for name in whole if (abs(numbers[name]) > _MAX_EXACT).any()}

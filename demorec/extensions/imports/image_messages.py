@@ -6,7 +6,6 @@ implementations agree on: bilinear interpolation, and ITU-R BT.601 with limited 
 from __future__ import annotations
 
 import io
-import re
 from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -20,6 +19,7 @@ from PIL import Image, UnidentifiedImageError
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import describe_error
 from demorec.extensions.imports.fields import FieldError, image_bytes, whole
+from demorec.extensions.imports.gray_video import deep_gray
 from demorec.mcap.cdr import Values
 from demorec.mcap.lossless import decode_millimetres
 from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
@@ -282,9 +282,7 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
 
 
 _shapes: dict[tuple[str, bytes], tuple[int, int, str]] = {}
-"""(codec, parameter sets) -> width, height and pixel format of the keyframes, from one decoded keyframe."""
-_DEEP_GRAY = re.compile(r"gray(9|1\d|f32)")
-"""FFmpeg's single-channel pixel formats over 8 bits: depth or another measurement."""
+"""(codec, parameter sets) -> width, height and `deep_gray` of the keyframes, from one decoded keyframe."""
 
 
 class NoColorError(FieldError):
@@ -303,11 +301,11 @@ def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
         frame = next(_frames(codec, [data]), None)
         if frame is None:
             raise FieldError(f"its {codec} keyframe cannot be decoded")
-        _shapes[key] = (frame.width, frame.height, frame.format.name)
-    width, height, pixel_format = _shapes[key]
-    if _DEEP_GRAY.match(pixel_format):
+        _shapes[key] = (frame.width, frame.height, deep_gray(codec, frame.format.name, key[1]))
+    width, height, measurement = _shapes[key]
+    if measurement:
         raise NoColorError(
-            f"its {codec} video holds {pixel_format}, which is depth or another measurement and not colour: leave the "
+            f"its {codec} video holds {measurement}, which is depth or another measurement and not colour: leave the "
             "topic out, or record the distances as 16UC1 or 32FC1 images"
         )
     return width, height

@@ -309,7 +309,8 @@ class BagStreams:
                     f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
                 )
             if stream.heads and not stream.heads.are_keyframes.any():
-                problems.append(f"{stream.topic} has no keyframe with its parameter sets, so it cannot be decoded")
+                reason = stream.first_problem or "it has no keyframe with its parameter sets"
+                problems.append(f"{stream.topic} cannot be decoded: {reason}")
         if problems:
             raise BagError(f"The mapping does not fit the bag: {listed(problems)}: {bag.path}")
 

@@ -1,0 +1,101 @@
+"""Kinds of other people's data, drawn at random: what an import cannot keep is refused or named, and the rest stays."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import replace
+from pathlib import Path
+
+import av
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+from support import bag_mappings, bags
+from support.commands import exit_code
+from support.drawn_datasets import HEIGHT, TOP, WIDTH, DrawnDataset, write_drawn
+from support.export import recordings
+
+from demorec.mcap import Recording
+
+FEW: dict[str, object] = {
+    "deadline": None, "phases": [Phase.generate], "suppress_health_check": list(HealthCheck),
+}  # fmt: skip
+PIXELS = {
+    "h264": ("yuv420p", "yuv422p", "yuv420p10le", "gray", "gray10le"),
+    "hevc": ("yuv420p", "yuv420p10le", "yuv420p12le", "gray", "gray10le", "gray12le"),
+    "png": ("rgb24", "gray", "gray16be"),
+}
+"""Codec -> pixel formats: colour, and single channels of 8 to 16 bits."""
+MEASURED = ("gray10le", "gray12le", "gray16be")
+"""Formats of depth or another measurement, which 8-bit colour would not hold."""
+KINDS = st.sampled_from([(codec, pixels) for codec, formats in PIXELS.items() for pixels in formats])
+PLAIN = DrawnDataset(
+    version="v3.0", lengths=(5, 4), names="list", stored="float32", claimed="float32", is_variable=False, clock="grid",
+    time_type="float32", camera="h264", gop=3, is_fragmented=False, reference="", missing=(), num_files=1, extra=(),
+    has_unlisted=False,
+)  # fmt: skip
+
+
+def command(*words: object) -> tuple[int, str, str]:
+    """Run a command; return exit code, output and errors."""
+    out, errors = io.StringIO(), io.StringIO()
+    with redirect_stdout(out), redirect_stderr(errors):
+        code = exit_code(*words)
+    return code, out.getvalue(), errors.getvalue()
+
+
+@pytest.mark.slow
+@settings(max_examples=14, **FEW)  # type: ignore[arg-type]
+@given(kind=KINDS, version=st.sampled_from(["v2.1", "v3.0"]), gop=st.sampled_from([1, 3]), is_fragmented=st.booleans())
+def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
+    kind: tuple[str, str], version: str, gop: int, is_fragmented: bool
+) -> None:
+    codec, pixels = kind
+    drawn = replace(PLAIN, camera=codec, pixels=pixels, version=version, gop=gop, is_fragmented=is_fragmented)
+    with tempfile.TemporaryDirectory() as folder:
+        source, run = write_drawn(Path(folder) / "set", drawn), Path(folder) / "run"
+        with av.open(str(next(source.rglob("*.mp4")))) as file:
+            seen = file.streams.video[0].codec_context.pix_fmt
+            assert seen == pixels or (codec == "h264" and "gray" in pixels)  # which libav takes for colour
+        code, _, error = command("import", "lerobot", source, "--out", run)
+        if pixels in MEASURED:
+            assert (code, recordings(run)) == (2, [])
+            assert f"The video of {TOP} holds {pixels}, which is depth or another measurement and not colour" in error
+            assert command("dataset", "drop-features", source, TOP, "--out", Path(folder) / "rest")[0] == 0
+            assert command("import", "lerobot", Path(folder) / "rest", "--out", run)[0] == 0
+            return
+        assert code == 0, error
+        for path, length in zip(recordings(run), drawn.lengths, strict=True):
+            with Recording(path) as recording:
+                assert (recording.cameras, recording.num_frames) == (("top",), length)
+                assert {image.shape for image in recording.images("top")} == {(HEIGHT, WIDTH, 3)}
+
+
+@pytest.mark.slow
+@settings(max_examples=10, **FEW)  # type: ignore[arg-type]
+@given(kind=KINDS.filter(lambda kind: kind[0] != "png"), gop=st.sampled_from([1, 5]))
+def test_the_pixel_format_decides_what_a_video_of_a_bag_holds(kind: tuple[str, str], gop: int) -> None:
+    codec, pixels = kind
+    notes = bags.trossen(1.0)
+    deep = bags.of_topic(notes, "/cameras/cam_wrist/image")
+    images = [bags.image(note.header_ns, 1) for note in deep]
+    packets = bags.video(images, gop=gop, codec={"h264": "libx264", "hevc": "libx265"}[codec], pixels=pixels)
+    name = {"h264": "h264", "hevc": "h265"}[codec]
+    body = iter([{"format": name, "data": packet} for packet in packets])
+    notes = [replace(note, body=next(body)) if note.topic == deep[0].topic else note for note in bags.in_order(notes)]
+    with tempfile.TemporaryDirectory() as folder:
+        bag, run = bags.write_trossen(notes, Path(folder) / "bag.mcap"), Path(folder) / "run"
+        mapping = bag_mappings.write_mapping(bag_mappings.TROSSEN, Path(folder) / "robot.toml")
+        code, _, error = command("import", bag, "--mapping", mapping, "--out", run)
+        suggestion = command("import", bag, "--suggest")[1]
+        is_mapped = f'[cameras.wrist]\ntopic = "{deep[0].topic}"' in suggestion
+        if pixels in MEASURED:
+            assert (code, recordings(run), is_mapped) == (1, [], False)
+            assert f"holds {pixels}, which is depth or another measurement" in error
+            assert f"holds {pixels}, which is depth or another measurement" in suggestion
+            return
+        assert (code, is_mapped) == (0, True), error
+        with Recording(recordings(run)[0]) as recording:
+            assert set(recording.cameras) == {"high", "wrist"}
