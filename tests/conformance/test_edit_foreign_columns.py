@@ -103,6 +103,21 @@ def test_columns_that_may_be_references_are_refused_where_numbers_change(
     assert not (tmp_path / "new").exists()
 
 
+@pytest.mark.parametrize(
+    ("name", "dtype"), [("annotation.human.task", "int64"), ("annotation", "uint8"), ("subtask_id", "int32")]
+)
+def test_an_import_leaves_references_out_by_name(
+    name: str, dtype: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    numbers = pa.array((np.arange(COUNT * LENGTH) % len(TEXTS)).astype(dtype))
+    source = foreign(tmp_path / "a", {name: numbers, "extra.count": numbers}, dtype=dtype)
+    assert exit_code("import", "lerobot", source, "--out", tmp_path / "run") == 0
+    assert f"{name} is left out: it may refer to tasks by number, and an export" in capsys.readouterr().out
+    with Recording(recordings(tmp_path / "run")[0]) as recording:
+        assert [feature.name for feature in recording.info.features] == ["observation.state", "action", "extra.count"]
+        assert recording.table().features["extra.count"][:, 0].tolist() == numbers.to_pylist()[:LENGTH]
+
+
 def measured(jitter_s: float, start_s: float) -> NDArray[np.float32]:
     """Timestamps of four episodes that a clock has measured, or that begin late."""
     random = np.random.default_rng(1)

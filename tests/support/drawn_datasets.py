@@ -92,7 +92,7 @@ DRAWN = st.builds(
     camera=st.sampled_from(["", "image", "binary", "h264", "hevc", "av1", "mpeg4"]),
     gop=st.sampled_from([1, 3, 100]),
     is_fragmented=st.booleans(),
-    reference=st.sampled_from(["", "int64", "int32"]),
+    reference=st.sampled_from(["", "int64", "int32", "uint8"]),
     missing=st.sampled_from([(), ("frame_index",), ("index", "task_index"), ("timestamp",)]),
     num_files=st.integers(1, 3),
     extra=st.lists(st.sampled_from(["int32", "uint8", "bool", "bool[]", "string", "float64"]), max_size=3).map(tuple),

@@ -182,6 +182,15 @@ AUTOMATIC_FEATURES: dict[str, DatasetFeature] = {
     **dict.fromkeys(("frame_index", "episode_index", "index", "task_index"), DatasetFeature(dtype="int64", shape=(1,))),
 }
 """Automatic features: last in every dataset, filled in by the writer."""
+_TASK_WORD = re.compile(r"(^|[._])(annotations?|tasks?|subtasks?)([._]|$)")
+
+
+def is_task_reference(name: str, feature: DatasetFeature) -> bool:
+    """Whether a feature may refer to tasks by number: an integer column with a name like GR00T's `annotation.*`."""
+    is_number = feature.dtype.startswith(("int", "uint")) and feature.shape == (1,)
+    return is_number and name not in AUTOMATIC_FEATURES and _TASK_WORD.search(name) is not None
+
+
 LANGUAGE_FEATURE = DatasetFeature(dtype="language", shape=(1,))
 """Feature of each of LeRobot's language columns."""
 

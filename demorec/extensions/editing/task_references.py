@@ -2,30 +2,20 @@
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetInfo
+from demorec.datasets.lerobot.layout import DatasetInfo, is_task_reference
 from demorec.extensions.editing.plan import Plan
 
 _KNOWN = "annotation."
 """Prefix of GR00T's columns with task numbers."""
-_TASK_WORD = re.compile(r"(^|[._])(annotations?|tasks?|subtasks?)([._]|$)")
 
 
 def reference_columns(info: DatasetInfo) -> tuple[str, ...]:
-    """Find the integer columns whose names suggest task numbers."""
-    return tuple(
-        name
-        for name, feature in info.features.items()
-        if name not in AUTOMATIC_FEATURES
-        and feature.dtype.startswith("int")
-        and feature.shape == (1,)
-        and _TASK_WORD.search(name)
-    )
+    """Find the columns that may hold task numbers."""
+    return tuple(name for name, feature in info.features.items() if is_task_reference(name, feature))
 
 
 def kept_tasks(plan: Plan) -> tuple[str, ...]:

@@ -20,6 +20,7 @@ from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import PERSISTENT
+from demorec.datasets.lerobot.layout import is_task_reference
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.recorded_features import NOT_HELD, why_not_recorded
 from demorec.datasets.lerobot.recording import DatasetRecording
@@ -73,9 +74,15 @@ def import_lerobot(
     numbers = sorted(set(select_episodes(range(len(dataset.places)), episodes)))
     chosen = [(number, dataset.places[number]) for number in numbers]
     survey = _surveyed(dataset, [place for _, place in chosen], noted)
-    for name in survey.inexact:
+    unkept = dict.fromkeys(survey.inexact, "it has whole numbers that float64 cannot hold")
+    unkept |= {
+        name: "it may refer to tasks by number, and an export of the run numbers them again"
+        for name, feature in dataset.info.features.items()
+        if is_task_reference(name, feature)
+    }
+    for name, reason in unkept.items():
         dataset.leave_out(name)
-        left_out[name] = "it has whole numbers that float64 cannot hold"
+        left_out[name] = reason
     cameras, fates = _cameras(dataset, survey)
     digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
     with open_external_run(out, recovers=False) as folder:
