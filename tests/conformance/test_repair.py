@@ -199,6 +199,23 @@ def test_float64_rows_stay_float64(whole: Path, tmp_path: Path, capsys: pytest.C
     items(tmp_path / "new")
 
 
+@pytest.mark.parametrize(
+    "names", [[["x", "y", "z"]], {"motors": ["x", "y", "z"]}, {"axes": ["x", "y", "z"]}, ["x", "y"]]
+)
+@pytest.mark.parametrize("shape", [[3], [5]])
+def test_names_keep_the_form_that_was_read(
+    names: Any, shape: list[int], whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    root = Path(shutil.copytree(whole, tmp_path / "d"))
+    as_double(root)
+    feature("observation.state", names=names, shape=shape)(root)
+    fits = names != ["x", "y"]
+    assert repair(root, "--out", tmp_path / "new") == 0
+    assert ("The names of observation.state are left out" in capsys.readouterr().out) != fits
+    found = json.loads((tmp_path / "new/meta/info.json").read_text())["features"]["observation.state"]
+    assert (found["dtype"], found["shape"], found["names"]) == ("float64", [3], names if fits else None)
+
+
 def test_possible_splits_stay(whole: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(whole, tmp_path / "d"))
     splits = {"train": "0:3", "val": "3:4"}

@@ -92,8 +92,9 @@ def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequenc
                 f"{name} is {found.dtype} of shape {found.shape} in the rows; info.json says {feature.dtype} of shape "
                 f"{feature.shape}."
             )
-            names = feature.names if feature.names and (len(feature.names),) == found.shape else None
-            features[name] = replace(feature, dtype=found.dtype, shape=found.shape, names=names, written_names=names)
+            features[name] = DatasetFeature.from_json(
+                {**feature.to_json(), "dtype": found.dtype, "shape": list(found.shape)}
+            )
         if found.shape == (1,) and pa.types.is_nested(schemas[0].field(name).type):
             changes.append(f"{name} is a list of one value in the rows, and becomes that value.")
     shown = {path.parent.name for path in videos} | {path.parent.parent.name for path in videos}
