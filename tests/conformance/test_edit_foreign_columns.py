@@ -303,3 +303,20 @@ def test_what_an_edit_leaves_out_is_named(tmp_path: Path, capsys: pytest.Capture
     assert "Left out: is_pad (meta/info.json does not list this column of the data files)" in printed
     assert "data/chunk-000/episode_000009.parquet (no episode of the dataset is in this file)" in printed
     assert "Copied, but unknown: extra/deep/calibration.bin, meta/notes of ours.txt." in printed
+
+
+def test_a_merge_keeps_the_files_that_are_the_same_in_all(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sources = [write_drawn(tmp_path / name, PLAIN, seed) for seed, name in enumerate("ab")]
+    kept = {"extra/arm.urdf": b"<robot/>", "meta/modality.json": b"{}", "README.md": b"# Cups"}
+    for name, content in kept.items():
+        for source in sources:
+            (source / name).write_bytes(content)
+    (sources[1] / "extra/only here.txt").write_text("x")
+    for flags in (("--dry-run",), ()):
+        assert exit_code("dataset", "merge", *sources, "--out", tmp_path / "new", *flags) == 0
+        printed = capsys.readouterr().out
+        assert "Copied, but unknown: extra/arm.urdf. Check that they still apply." in printed
+        different = "extra/deep/calibration.bin, extra/only here.txt, meta/notes of ours.txt"
+        assert f"eft out: {different} (not the same in all datasets: copy it if it still applies)." in printed
+    assert {name: (tmp_path / "new" / name).read_bytes() for name in kept} == kept
+    assert not (tmp_path / "new/meta/notes of ours.txt").exists()

@@ -6,7 +6,8 @@ written.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import filecmp
+from collections.abc import Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "epi
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
 _ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
-"""Files that are copied if there is only one source."""
+"""Files that are copied if all sources have the same."""
 _OF_OTHER_TOOLS = (".cache/", ".git/")
 """Folders created by downloading a dataset."""
 MAX_NAMES = 5
@@ -201,8 +202,9 @@ def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any
 def left_out(plan: Plan) -> tuple[str, ...]:
     """One phrase for each omission with its reason in brackets, except the user's choices."""
     found: dict[str, set[str]] = {}
+    copied = copied_files(plan)
     for number, source in enumerate(plan.sources):
-        for name, reason in _files(plan, number, source.root):
+        for name, reason in _files(plan, number, source.root, copied):
             found.setdefault(reason, set()).add(name)
     phrases = []
     for reason, names in found.items():
@@ -212,15 +214,24 @@ def left_out(plan: Plan) -> tuple[str, ...]:
 
 
 def copied_files(plan: Plan) -> tuple[str, ...]:
-    """List the files that are copied unchanged: those about a whole dataset, and unknown ones."""
-    if len(plan.sources) > 1:
-        return ()
-    root = plan.sources[0].root
-    known = [name for name in _ABOUT_THE_WHOLE if (root / name).is_file()]
-    return (*known, *unknown_files(plan.sources[0]))
+    """List the files that are copied unchanged: those about a whole dataset and unknown ones, equal in all sources."""
+    first, *others = plan.sources
+    known = [name for name in _ABOUT_THE_WHOLE if (first.root / name).is_file()]
+    names = (*known, *_unknown_files(first))
+    return tuple(name for name in names if all(_is_equal(name, first.root, other.root) for other in others))
 
 
-def unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
+def copied_unknown_files(plan: Plan) -> tuple[str, ...]:
+    """List the copied files whose purpose is unknown."""
+    return tuple(name for name in copied_files(plan) if name not in _ABOUT_THE_WHOLE)
+
+
+def _is_equal(name: str, first: Path, other: Path) -> bool:
+    path = other / name
+    return path.is_file() and not path.is_symlink() and filecmp.cmp(first / name, path, shallow=False)
+
+
+def _unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
     """List the files, except links, that a dataset does not use and whose purpose is unknown from their names.
 
     Unused tables in the folders of rows and episodes are left out: LeRobot would read a copy as part of the dataset.
@@ -246,7 +257,7 @@ def _files_below(root: Path) -> list[str]:
     return [name for name in names if not name.startswith(_OF_OTHER_TOOLS)]
 
 
-def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
+def _files(plan: Plan, number: int, root: Path, copied: Collection[str]) -> Iterator[tuple[str, str]]:
     for path in plan.sources[number].data_tables:
         for name in open_table(path).schema_arrow.names:
             if name not in plan.sources[number].info.features:
@@ -254,17 +265,17 @@ def _files(plan: Plan, number: int, root: Path) -> Iterator[tuple[str, str]]:
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
     used = _used_files(plan.sources[number])
-    copied = copied_files(plan)
     for name in _files_below(root):
         path = root / name
         if name in copied or path in used:
             continue
         if not is_dataset_file(name):
-            yield name, "unknown to demorec: copy it if it still applies"
+            differs = "not the same in all datasets" if len(plan.sources) > 1 else "unknown to demorec"
+            yield name, f"{differs}: copy it if it still applies"
         elif name.startswith(("data/", "videos/")):
             yield name, "no episode of the dataset is in this file"
         elif name in _ABOUT_THE_WHOLE and len(plan.sources) > 1:
-            yield name, "each of the datasets may have its own"
+            yield name, "not the same in all datasets"
         elif name.startswith("images/"):
             yield name, "no row has it"
         elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
