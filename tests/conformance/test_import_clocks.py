@@ -251,6 +251,17 @@ def test_a_robot_that_moves_a_little_is_not_still(imports: Imports) -> None:
     assert "  still: " not in told
 
 
+@pytest.mark.parametrize("years", [-55, 5])
+def test_a_clock_that_was_never_set(years: int, imports: Imports) -> None:
+    """All headers agree among each other, and are years from the times of recording."""
+    shift = years * 365 * 24 * 3600 * bags.NS
+    notes = [replace(note, header_ns=note.header_ns + shift) for note in real() if note.topic != GRIPPER]
+    code, told, _ = imports(notes, MAPPING)
+    assert code == 0
+    assert f"all headers are {abs(years) * 365 / 365.25:.1f} years {'behind' if years < 0 else 'ahead of'}" in told
+    assert "No findings." not in told
+
+
 @pytest.mark.parametrize("size", [0.0, 5e-4])
 def test_a_bag_in_which_nothing_moves(size: float, imports: Imports) -> None:
     """A robot that was never switched on, with and without encoder noise."""

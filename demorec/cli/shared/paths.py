@@ -50,7 +50,8 @@ def tell_incomplete(paths: Iterable[Path]) -> None:
     for path in paths:
         if json_object(path / RUN_NAME).get("complete") is False:
             with suppress(DemorecError):  # reported when the run is read
-                tell(f"Note: {load_any_run_file(path).unfinished}: {path}")
+                if unfinished := load_any_run_file(path).unfinished:
+                    tell(f"Note: {unfinished}: {path}")
 
 
 def places_read(paths: Sequence[Path]) -> list[Path]:
