@@ -49,7 +49,7 @@ lint: $(STAMP)
 
 # The pages that are made from the code.
 docs: $(STAMP)
-	$(BIN)/python tools/api_page.py > docs/api.md
+	$(BIN)/python tools/names_page.py > docs/api.md
 
 setup: $(STAMP)
 

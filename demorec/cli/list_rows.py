@@ -45,19 +45,23 @@ class ListRows:
     def run(self) -> int:
         """Print one line per row."""
         check_choice("list", self.what, _NAMES)
-        if self.what in LISTS.rows:
-            rows = list(LISTS.load(self.what)())
-        elif self.what == "extensions":
-            rows = [(each.name, each.summary) for each in extensions().found]
-        else:
-            registry = _TABLES[self.what]
-            describe = _DESCRIBED.get(self.what, lambda row: str(row.summary))
-            rows = [(name, describe(registry.load(name))) for name in registry.names()]
+        rows = rows_of(self.what)
         if self.json:
             say_json([{"name": name, "summary": summary} for name, summary in rows])
         else:
             say(*aligned(rows))
         return 0
+
+
+def rows_of(what: str) -> list[tuple[str, str]]:
+    """Return (name, description in one line) of every row of a list."""
+    if what in LISTS.rows:
+        return list(LISTS.load(what)())
+    if what == "extensions":
+        return [(each.name, each.summary) for each in extensions().found]
+    registry = _TABLES[what]
+    describe = _DESCRIBED.get(what, lambda row: str(row.summary))
+    return [(name, describe(registry.load(name))) for name in registry.names()]
 
 
 def _robot(robot: RobotSpec) -> str:

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import re
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from numpy.typing import NDArray
 from support.sim import body_index, episode, run
 
 from demorec.core.geometry import Pose
-from demorec.core.tables import TASKS
 from demorec.episode.episode import Frame
 from demorec.episode.scene import Body, Shape, ShapeKind
 from demorec.episode.simulated import with_simulation
@@ -203,9 +200,3 @@ def test_a_cube_that_slips_is_dropped_and_fails_after_three_tries() -> None:
     assert outcome.num_retries == 2
     assert outcome.failure_phase in ("lift", "close", "transport")
     assert outcome.failure_reason
-
-
-def test_the_documented_table_has_every_task_in_its_own_words() -> None:
-    text = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
-    rows = re.findall(r"^\| `(\w+)` \| (.+?) \|", text, re.MULTILINE)
-    assert rows == [(name, TASKS.load(name).summary) for name in TASKS.names()]
