@@ -3,9 +3,9 @@
     python benchmarks/check.py --episodes 5
     git worktree add /tmp/before HEAD~1 && python benchmarks/check.py --against /tmp/before
 
-Two runs are made: without cameras, and with two, depth and labels. A process for each version checks the same
-recordings, run folder and dataset by turns, so that both meet the same load. The first recording of a process is
-listed apart: libraries are loaded for it. LeRobot is not started.
+The script makes two runs: without cameras, and with two, depth and labels. A process for each version alternately
+checks the same recordings, run folder and dataset, so that both have the same load. The first recording of a process is
+listed separately, because libraries are loaded for it. LeRobot is not started.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ def serve() -> None:
 
 
 class Checker:
-    """A process that checks with the program in a folder.
+    """A process that runs the checks of one version.
 
     Args:
-        folder: That holds demorec/.
+        folder: Folder that contains demorec/.
     """
 
     def __init__(self, folder: Path) -> None:

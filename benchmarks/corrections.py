@@ -1,15 +1,15 @@
-"""What corrections do for a policy, against equally many new plain demonstrations.
+"""Benefit of corrections for a policy, compared with the same number of new plain demonstrations.
 
     python benchmarks/corrections.py --out outputs/corrections
     python benchmarks/corrections.py --seeds 1 --scenes 50 --rounds 1     # a first look
 
-A policy learns from --episodes plain demonstrations. Then, in --rounds, it acts in scenes of the training's part of the
-table, the expert takes over where it strays, and the policy is trained anew on everything, until --corrected episodes
-have been corrected; only the expert's frames are learned from. Beside it a policy learns from as many plain
-demonstrations in all. Every training seed has its own policies, and so its own corrections. Trainings are those of
-benchmarks/learning.py: LeRobot's ACT from numbers in memory, one thread; --steps updates for --episodes episodes, in
-proportion more for more of them. Scenes are held out. What is in --out already (runs, corrections, datasets, policies,
-evaluations) is used again, so that the same command goes on.
+A policy is trained on --episodes plain demonstrations. Then, in --rounds, it acts in scenes of the training region of
+the table, the expert takes over when it deviates, and the policy is trained again on all data, until --corrected
+episodes have been corrected; only the expert's frames are used. For comparison, another policy is trained on the same
+total number of plain demonstrations. Every training seed has separate policies and corrections. Trainings are those of
+benchmarks/learning.py: LeRobot's ACT from numbers in memory, one thread; --steps updates for --episodes episodes,
+proportionally more for larger datasets. Scenes are held out. Existing runs, corrections, datasets, policies and
+evaluations in --out are reused, so the same command continues.
 """
 
 from __future__ import annotations
@@ -39,25 +39,27 @@ from demorec.mcap import Recording
 
 INTERVENTION = "intervention"
 CORRECTION_SEED = 1
-"""Root of the scenes that are corrected; those of the demonstrations have 0."""
+"""Root seed of the corrected scenes; demonstrations use 0."""
 _ABSOLUTE = re.compile(r"tcp\.[xy]|\w+(\.goal)?\.[xy]|.*\.pose\..*|\w+\.pos")
-"""Components that say where on the table something is, or how the arm stands. A hundred demonstrations are too few to
-learn that these do not matter, so that the policy is not shown them."""
+"""Components that describe absolute positions on the table, or the arm's pose.
+
+A hundred demonstrations are too few to learn that these do not matter, so they are hidden from the policy.
+"""
 _VELOCITIES = re.compile(r"\w+\.vel")
 
 
 @dataclass(frozen=True, kw_only=True)
 class Stage:
-    """One policy of one training seed, tried.
+    """One policy of one training seed, with its evaluation.
 
     Attributes:
         arm: "plain", "corrected" or, before both, "start".
         corrected: Episodes that the expert has corrected so far.
-        demonstrations: Plain ones.
-        frames: Learned from.
-        updates: Of the training.
-        evaluation: On the held-out scenes.
-        cpu_seconds: Of the training.
+        demonstrations: Number of plain demonstrations.
+        frames: Number of training frames.
+        updates: Number of updates in the training.
+        evaluation: Result on the held-out scenes.
+        cpu_seconds: CPU time of the training.
     """
 
     arm: str
@@ -70,7 +72,7 @@ class Stage:
 
     @property
     def row(self) -> tuple[str, int, int]:
-        """Which row of the table it belongs to."""
+        """Row of the table that it belongs to."""
         return self.arm, self.demonstrations, self.corrected
 
 
@@ -88,7 +90,7 @@ def demonstrations(args: argparse.Namespace, count: int) -> Path:
 
 
 def export(run: Path, dataset: Path, args: argparse.Namespace, episodes: str) -> None:
-    """To LeRobot, numbers alone."""
+    """Export to LeRobot, numbers only."""
     dataset.parent.mkdir(parents=True, exist_ok=True)
     command(
         *("demorec", "export", "lerobot", run, "--out", dataset, "--action", args.action, "--episodes", episodes),
@@ -97,7 +99,7 @@ def export(run: Path, dataset: Path, args: argparse.Namespace, episodes: str) ->
 
 
 def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Namespace, out: Path) -> Path:
-    """Dataset of `wanted` corrected episodes: new scenes until the expert has taken over in so many."""
+    """Dataset of `wanted` corrected episodes: new scenes until the expert has taken over in that many."""
     dataset = out.with_name(f"{out.name}_{args.action}")
     if dataset.exists():
         return dataset
@@ -126,13 +128,13 @@ def corrected_episodes(corrections: Path) -> list[int]:
 
 
 def load(datasets: list[Path], *, hidden: tuple[re.Pattern[str], ...]) -> Data:
-    """All frames in which the expert acts; a stretch of them ends where it hands back."""
+    """Load all frames in which the expert acts; a segment ends when the expert hands back."""
     parts: dict[str, list[np.ndarray[Any, Any]]] = defaultdict(list)
     for number, dataset in enumerate(datasets):
         tables = [pq.read_table(path) for path in sorted((dataset / "data").rglob("*.parquet"))]
         episode = np.concatenate([t["episode_index"].to_numpy() for t in tables])
         acts = np.concatenate([t[INTERVENTION].to_numpy(zero_copy_only=False) for t in tables]).astype(bool)
-        acts |= ~np.isin(episode, episode[acts])  # of a plain demonstration all frames are the expert's
+        acts |= ~np.isin(episode, episode[acts])  # in a plain demonstration all frames are the expert's
         begins = np.diff(episode, prepend=-1) != 0
         begins[1:] |= acts[1:] != acts[:-1]
         parts["stretch"].append((np.cumsum(begins) + 1_000_000 * number)[acts])
@@ -151,7 +153,7 @@ def load(datasets: list[Path], *, hidden: tuple[re.Pattern[str], ...]) -> Data:
 
 
 def stage(arm: str, datasets: list[Path], corrected: int, seed: int, args: argparse.Namespace) -> tuple[Stage, Path]:
-    """Train on datasets and try what came out; the policy's folder, too."""
+    """Train on datasets and evaluate the policy; returns its folder, too."""
     count = args.episodes + (args.corrected if arm == "plain" else 0)
     updates = round(args.steps * (count + corrected) / args.episodes)
     label = f"{args.label}_{args.rules}" if arm == "corrected" else args.label
@@ -198,25 +200,25 @@ def stages(seed: int, args: argparse.Namespace) -> Iterator[Stage]:
 
 
 def rate(found: list[Stage]) -> Rate:
-    """Of all trainings of a row together."""
+    """Success rate of all trainings of a row together."""
     rates = [s.evaluation.rate for s in found]
     return Rate(successes=sum(r.successes for r in rates), trials=sum(r.trials for r in rates))
 
 
 def main() -> None:
-    """Make what is missing and print the table."""
+    """Make the missing parts and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--task", default="pick_place")
     parser.add_argument("--episodes", type=int, default=100, help="plain demonstrations at the start")
     parser.add_argument("--corrected", type=int, default=100, help="corrected episodes in all")
     parser.add_argument("--rounds", type=int, default=2)
-    parser.add_argument("--seeds", type=int, default=3, help="trainings, each with corrections of its own")
+    parser.add_argument("--seeds", type=int, default=3, help="trainings, each with separate corrections")
     parser.add_argument("--first-seed", type=int, default=0, help="number of the first training")
     parser.add_argument("--workers", type=int, default=1, help="processes that run episodes")
     parser.add_argument("--scenes", type=int, default=150, help="held-out scenes of each policy")
     parser.add_argument("--action", default="ee_delta")
     parser.add_argument("--execute", type=int, default=16, help="actions of the chunk of 16 that are executed")
-    parser.add_argument("--relative", action="store_true", help="hide where on the table things are")
+    parser.add_argument("--relative", action="store_true", help="hide absolute positions on the table")
     parser.add_argument("--no-velocities", dest="velocities", action="store_false", help="hide them: weaker policies")
     parser.add_argument("--steps", type=int, default=3000, help="updates for --episodes, in proportion for more")
     parser.add_argument("--batch-size", type=int, default=128)

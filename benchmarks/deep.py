@@ -1,9 +1,9 @@
-"""What `demorec check --deep` costs against generating and checking, in CPU time, and whether it finds nothing.
+"""CPU time of `demorec check --deep` compared with generating and checking, and whether it reports no difference.
 
     python benchmarks/deep.py --episodes 20
 
-Each episode is generated, checked with its images and made again, one after the other in one process that is warm,
-so that the ratios hold whatever else the machine does.
+Each episode is generated, checked with its images and made again, one after the other in one warm process, so that the
+ratios hold under any load.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def main() -> None:
             makes, checks = (
                 SimulatorCache(),
                 SimulatorCache(),
-            )  # two, as the processes of generate-dataset and check have
+            )  # two, as in the processes of generate and check
             for index in range(-1, arguments.episodes):  # the first one warms up
                 path = Path(folder) / f"{name}_{index}.mcap"
                 starts = [time.process_time()]

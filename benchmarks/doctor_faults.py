@@ -136,7 +136,7 @@ def report_scores(bases: Sequence[str], count: int, seed: int, folder: Path) -> 
 
 
 def auc(good: Sequence[float], bad: Sequence[float]) -> float:
-    """Share of the pairs in which the good one has the higher score; equal ones count half (Mann-Whitney)."""
+    """Ratio of pairs in which the good one has the higher score; equal scores count half (Mann-Whitney)."""
     if not good or not bad:
         return float("nan")
     differences = np.subtract.outer(np.array(good), np.array(bad))

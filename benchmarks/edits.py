@@ -2,13 +2,13 @@
 
     python benchmarks/edits.py                          200 episodes of 100 frames, less than five minutes
     python benchmarks/edits.py --episodes 20 --frames 50
-    python benchmarks/edits.py --episodes 50 --frames 150 --size 640 480     images as people have them
+    python benchmarks/edits.py --episodes 50 --frames 150 --size 640 480     images of a typical size
     python benchmarks/edits.py --copies 1 10 --without-lerobot     how demorec's cost grows with the dataset
 
-Deletes a twentieth of the episodes, splits 80 to 20, merges 5 datasets, trims a frame off either end of every episode
-(LeRobot has no trim). Two cameras of 96x96, as LeRobot's default writer encodes them (AV1), in a dataset of a tenth
-of the episodes, which is merged ten times: that keeps its packets. CPU seconds count child processes. What starting
-and loading libraries costs is measured first, and stated beside.
+Deletes a twentieth of the episodes, splits 80 to 20, merges 5 datasets, and trims a frame off both ends of every
+episode (LeRobot has no trim). The dataset has two cameras of 96x96, encoded by LeRobot's default writer (AV1); a tenth
+of its episodes are recorded and merged ten times, which keeps their packets. CPU seconds include child processes. The
+cost of starting and loading libraries is measured first, and listed separately.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ import numpy as np
 
 BIN = Path(sys.executable).parent
 ENVIRONMENT = {**os.environ, "HF_HUB_OFFLINE": "1", "HF_DATASETS_OFFLINE": "1", "OMP_NUM_THREADS": "1"}
-ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # with it every start would compile the package anew
+ENVIRONMENT.pop("PYTHONDONTWRITEBYTECODE", None)  # otherwise every start would compile the package again
 
 
 def written_by_lerobot(root: Path, episodes: int, frames: int, width: int, height: int) -> Path:
@@ -54,7 +54,7 @@ def written_by_lerobot(root: Path, episodes: int, frames: int, width: int, heigh
 
 
 def multiplied(root: Path, times: int, out: Path) -> Path:
-    """The episodes of a dataset again and again, their packets as they are."""
+    """Repeat the episodes of a dataset with unchanged packets."""
     copies = [Path(shutil.copytree(root, out.with_name(f"{out.name}_{number}"))) for number in range(times)]
     if times == 1:
         return copies[0]
@@ -73,11 +73,11 @@ if done.returncode not in (0, -signal.SIGABRT):  # LeRobot's threads may abort w
 used = resource.getrusage(resource.RUSAGE_CHILDREN)
 print(used.ru_utime + used.ru_stime, time.perf_counter() - start, used.ru_maxrss / 1000)
 """
-"""A process of its own, since what it starts is said to take as much memory as itself at least."""
+"""A separate process, since the reported memory of a child is at least that of its parent."""
 
 
 def seconds(*command: object) -> tuple[float, float, float]:
-    """CPU and wall seconds of a command with its children, and MB of memory at most."""
+    """CPU and wall seconds of a command with its children, and its peak memory in MB."""
     words = [sys.executable, "-c", _MEASURED, *map(str, command)]
     done = subprocess.run(words, env=ENVIRONMENT, capture_output=True, text=True, check=False)
     if done.returncode:
@@ -87,7 +87,7 @@ def seconds(*command: object) -> tuple[float, float, float]:
 
 
 def commands(root: Path, copies: Sequence[Path], out: Path, episodes: int) -> dict[str, dict[str, list[list[object]]]]:
-    """Work -> who does it -> commands."""
+    """Work -> program -> commands."""
     gone = list(range(0, episodes, 20))
     ours: list[object] = [BIN / "demorec", "dataset"]
     theirs: list[object] = [BIN / "lerobot-edit-dataset", f"--root={root}", "--repo_id=local/x"]
@@ -121,7 +121,7 @@ def commands(root: Path, copies: Sequence[Path], out: Path, episodes: int) -> di
 
 
 def start_costs(root: Path) -> dict[str, float]:
-    """CPU s of starting each: of demorec and LeRobot with all that an edit loads."""
+    """CPU s of starting demorec and LeRobot, including all that an edit loads."""
     dry = (BIN / "demorec", "dataset", "select", root, "--episodes", 0, "--out", "x", "--dry-run")
     return {
         "demorec": seconds(*dry)[0],
@@ -131,7 +131,7 @@ def start_costs(root: Path) -> dict[str, float]:
 
 
 def measured(folder: Path, root: Path, episodes: int, rounds: int, without: str) -> None:
-    """Run everything on a dataset, and print a row for each kind of work."""
+    """Measure everything on a dataset, and print a row for each kind of work."""
     copies = [Path(shutil.copytree(root, folder / f"d{number}")) for number in range(5)]
     idle = start_costs(root)
     spent: dict[tuple[str, str], list[tuple[float, float, float]]] = {}
@@ -171,7 +171,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=100, help="of each episode")
     parser.add_argument("--size", type=int, nargs=2, default=(96, 96), help="width and height of the images")
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--copies", type=int, nargs="+", default=[1], help="datasets so many times as large")
+    parser.add_argument("--copies", type=int, nargs="+", default=[1], help="factors by which the dataset is enlarged")
     parser.add_argument("--without-lerobot", action="store_true")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="demorec-benchmark-") as name:

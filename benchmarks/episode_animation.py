@@ -18,12 +18,12 @@ WIDTH, HEIGHT, GAP, BAR = 480, 360, 4, 32
 SHOWN_SIZE = (723, 297)
 EVERY, MILLISECONDS = 3, 100
 HELD = 8
-"""How often the last image is shown, so that the end can be seen."""
+"""Number of times that the last image is repeated, so that the end is visible."""
 DARK = (24, 28, 34)
 
 
 def draw_bar(canvas: Image.Image, phases: list[str], frame: int) -> None:
-    """The phases over time, the present moment, and the name of the present phase."""
+    """Draw the phases over time, the current time, and the name of the current phase."""
     draw, font = ImageDraw.Draw(canvas), ImageFont.load_default(size=17)
     colors, width, top = phase_colors(phases), canvas.width, HEIGHT + GAP
     for index, phase in enumerate(phases):

@@ -1,11 +1,11 @@
-"""The export against LeRobot's own writers, its growth, its memory, and its speed against cp and the checks of bytes.
+"""Exports compared with LeRobot's own writers, their growth and memory, and their speed compared with cp and checksums.
 
     python benchmarks/export.py                          a small sample
     python benchmarks/export.py --episodes 4 --frames 90 --rounds 3 --growth 10 100 1000
 
-Every round runs all candidates one after the other on the same frames; CPU time counts all processes and threads,
-so that the figures can be compared on a shared machine. What is compared is what a user waits for after recording:
-the images of our recordings are coded already, so the cost of recording them is told beside it.
+Every round runs all candidates one after the other on the same frames; CPU time includes all processes and threads, so
+that the figures can be compared on a shared machine. The comparison covers the time that a user waits after recording:
+images in recordings are encoded already, so the cost of recording them is listed separately.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from demorec.mcap import EpisodeWriter
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 
 CAMERAS = {"front": (640, 480), "wrist": (224, 224), "side": (224, 224)}
-"""Those of the comparison, with their sizes."""
+"""Cameras of the comparison, with their sizes."""
 
 Images = dict[str, list[NDArray[np.uint8]]]
 
@@ -76,7 +76,7 @@ def measured(cost: Cost, per: float) -> Iterator[None]:
 
 
 def scene_images(frames: int, width: int, height: int, seed: int) -> list[NDArray[np.uint8]]:
-    """Images that cost an encoder what rendered ones do: shaded surfaces, edges, a moving arm, a little noise."""
+    """Images as expensive to encode as rendered ones: shaded surfaces, edges, a moving arm, a little noise."""
     rng = np.random.default_rng(seed)
     rows, columns = np.mgrid[0:height, 0:width].astype(np.float32) / np.float32(height)
     table = np.stack([170 + 40 * columns, 140 + 30 * rows, 100 + 20 * columns], axis=-1)
@@ -93,7 +93,7 @@ def scene_images(frames: int, width: int, height: int, seed: int) -> list[NDArra
 
 
 def made_up(images: Images, episode: int) -> tuple[EpisodeInfo, list[Frame], Outcome]:
-    """An episode of made-up numbers and the given images."""
+    """An episode of synthetic numbers and the given images."""
     from support.recording import make_episode
 
     length = len(next(iter(images.values())))
@@ -159,7 +159,7 @@ def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
         folder = work / f"round{number}"
         run = folder / "run"
         run.mkdir(parents=True)
-        if number == 0:  # loads what is loaded at first use
+        if number == 0:  # loads libraries
             record(folder / "warm.mcap", episodes[0])
             export_lerobot([folder / "warm.mcap"], folder / "warm", ExportOptions(verify=False))
         with measured(costs["record"], total):
@@ -180,8 +180,8 @@ def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
         shutil.rmtree(folder)
     ours = statistics.median(costs["export"].cpu)
     print(f"\n{args.episodes} episodes of {args.frames} frames, cameras {CAMERAS}, {args.rounds} rounds")
-    print(f"(our export takes them {args.repeat} times over, since what it costs once would be in the way)")
-    print(f"{'ms a frame':28} {'CPU':>9} {'wall':>9}   CPU against ours")
+    print(f"(demorec's export gets them {args.repeat} times, to make its fixed cost negligible)")
+    print(f"{'ms a frame':28} {'CPU':>9} {'wall':>9}   CPU / demorec")
     for name, cost in costs.items():
         print(f"{name:28} {cost} {statistics.median(cost.cpu) / ours:10.1f}x")
     return {
@@ -191,7 +191,7 @@ def compare(args: argparse.Namespace, work: Path) -> dict[str, Any]:
 
 
 def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
-    """Cost an episode and peak memory of exports of more and more episodes, each in a process of its own."""
+    """Cost an episode and peak memory of exports with increasing numbers of episodes, each in a separate process."""
     from support.recording import write_episode
 
     run = work / "growth" / "episodes"
@@ -226,7 +226,7 @@ def growth(args: argparse.Namespace, work: Path) -> list[dict[str, float]]:
 
 
 def bytes_alone(run: Path) -> None:
-    """What the bytes of recordings cost by themselves: each chunk unpacked, its CRC-32 and its SHA-256 made."""
+    """Only unpack each chunk, and compute its CRC-32 and SHA-256."""
     for path in sorted(run.iterdir()):
         with path.open("rb") as file:
             for record in StreamReader(file, emit_chunks=True).records:
@@ -237,7 +237,7 @@ def bytes_alone(run: Path) -> None:
 
 
 def against_copy(args: argparse.Namespace, work: Path) -> dict[str, float]:
-    """MB of recordings a second, exported and copied by cp, at 640x480; and CPU time against that of `bytes_alone`."""
+    """MB of recordings a second, exported and copied by cp, at 640x480; and CPU time relative to `bytes_alone`."""
     run = work / "copy" / "episodes"
     run.mkdir(parents=True)
     names = ("front", "wrist")
@@ -258,7 +258,7 @@ def against_copy(args: argparse.Namespace, work: Path) -> dict[str, float]:
             out = work / "copied"
             with measured(costs[name] if number else Cost(), 1):
                 way(out)
-            shutil.rmtree(out, ignore_errors=True)  # the bytes alone leave none
+            shutil.rmtree(out, ignore_errors=True)  # `bytes_alone` writes none
     print(f"\nSpeed at 640x480, {size:.0f} MB in {args.copy_episodes} recordings")
     print(f"{'':26} {'MB/s':>9} {'CPU s':>9}")
     result = {}
@@ -276,7 +276,9 @@ def main() -> None:
     parser.add_argument("--episodes", type=int, default=2)
     parser.add_argument("--frames", type=int, default=45)
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--repeat", type=int, default=20, help="how often our export takes the same recordings")
+    parser.add_argument(
+        "--repeat", type=int, default=20, help="number of copies of the recordings that demorec's export gets"
+    )
     parser.add_argument("--growth", type=int, nargs="*", default=[10, 100])
     parser.add_argument("--growth-frames", type=int, default=12)
     parser.add_argument("--copy-episodes", type=int, default=20)

@@ -1,10 +1,10 @@
-"""The first start on a machine: CPU time from the start of Python to the first frame, with nothing kept from before.
+"""The first start on a machine: CPU time from the start of Python to the first frame, with empty caches.
 
     python benchmarks/first_start.py --rounds 3
     git worktree add /tmp/before HEAD~1 && python benchmarks/first_start.py --against /tmp/before
 
-A frame is two 224x224 images and all numbers. The versions take turns; each starts with empty folders for compiled
-code and meshes, and then once more with what that start has kept.
+A frame is two 224x224 images and all numbers. The versions alternate; each starts with empty caches for compiled code
+and meshes, and then once more with the caches of that start.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def start(folder: Path, kept: Path) -> list[float]:
 
 
 def main() -> None:
-    """Start each version by turns, tell medians."""
+    """Start the versions alternately, and print medians."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--against", type=Path, help="a folder with another version of demorec/")

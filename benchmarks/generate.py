@@ -1,16 +1,16 @@
-"""The main job from scene to dataset: workers, executors, and the same job done the way people do it today.
+"""Generation from scene to dataset: workers, executors, and the same work done with common tools.
 
     python benchmarks/generate.py                                   a small sample of everything below `--only`
     python benchmarks/generate.py --episodes 12 --rounds 3 --only "demorec 1 worker" "today default"
-    python benchmarks/generate.py --scaling --episodes 12           one worker, two, two of Ray: what they cost beside
+    python benchmarks/generate.py --scaling --episodes 12           one worker, two, two of Ray: their overhead
     python benchmarks/generate.py --memory 10 200                   peak memory at two lengths of a run
     python benchmarks/generate.py --driver 1000 100000              run.json at two lengths of a run
 
 "Today" is PyBullet's TinyRenderer and `LeRobotDataset.add_frame` / `save_episode`, with LeRobot's defaults (AV1) and
-with streaming encoding; scenes, expert and image sizes are ours, so that only the pipeline differs. Each variant
-is a process of its own and each round runs all of them one after the other; CPU time counts all processes that
-belong to a variant, so that ratios hold on a busy machine as well. "All" has the start-up in it (imports, compiled
-code, the first episode), "steady" is what one more episode costs.
+with streaming encoding; scenes, expert and image sizes are demorec's, so that only the pipeline differs. Each variant
+is a separate process and each round runs all of them one after the other; CPU time includes all processes that belong
+to a variant, so that ratios hold on a busy machine as well. "All" includes the start-up (imports, compiled code, the
+first episode), "steady" is the cost of one more episode.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Sample:
     episodes: int
     frames: int
     peak_bytes: int
-    steady: tuple[float, ...]  # CPU seconds of each episode, as the process that made it measured them
+    steady: tuple[float, ...]  # CPU seconds of each episode, measured in its process
     beside: float = 0.0  # CPU seconds an episode outside the workers, once they work
 
 
@@ -55,8 +55,8 @@ class Meter:
     """CPU seconds and memory of a process and all its descendants, sampled while they live.
 
     Args:
-        pid: Of the process.
-        episodes: Folder whose files tell how many episodes are finished, to separate start-up from work.
+        pid: Process ID.
+        episodes: Folder of finished episodes, whose number separates start-up from work.
     """
 
     def __init__(self, pid: int, episodes: Path | None = None) -> None:
@@ -91,7 +91,7 @@ class Meter:
             self._beside.setdefault(finished, sum(s for key, s in self._seen.items() if key not in self._workers))
 
     def stop(self) -> float:
-        """CPU seconds of all that was seen."""
+        """Stop sampling and return the CPU seconds of all processes."""
         self._stop.set()
         self._thread.join()
         return sum(self._seen.values())
@@ -105,7 +105,7 @@ class Meter:
 
 
 def is_worker(command: str) -> bool:
-    """Whether a process of ours, of Python or of Ray carries out attempts."""
+    """Whether a process of demorec, Python or Ray makes attempts."""
     return "spawn_main" in command or "default_worker.py" in command or command.startswith(("ray::_att", "ray::IDLE"))
 
 
@@ -121,7 +121,7 @@ def ours(name: str, episodes: int, folder: Path, args: argparse.Namespace) -> li
 
 
 def today(name: str, episodes: int, folder: Path, args: argparse.Namespace) -> list[list[str]]:
-    """One process a shard; the second half is what a second process makes."""
+    """One process a shard; a second process makes the second half."""
     shards = 2 if name.endswith("x2") else 1
     return [
         [sys.executable, __file__, "--be-today", str(folder / f"shard{shard}"), "--first", str(first)]
@@ -162,7 +162,7 @@ def run_variant(name: str, episodes: int, args: argparse.Namespace) -> Sample:
 
 
 def our_episodes(folder: Path) -> list[tuple[int, float]]:
-    """Frames and CPU seconds of each episode, its share of the export included."""
+    """Frames and CPU seconds of each episode, including its share of the export."""
     run = json.loads((folder / "run.json").read_text())
     export = (run["export"] or {}).get("seconds", 0.0) / len(run["episodes"])
     return [(line["num_frames"], sum(line["seconds"].values()) + export) for line in run["episodes"]]
@@ -219,7 +219,7 @@ def be_today(args: argparse.Namespace) -> None:
                 dataset.save_episode()
             else:
                 dataset.clear_episode_buffer()
-            # The encoders of LeRobot are threads of this process or children that it waits for.
+            # LeRobot's encoders are threads of this process, or children that it waits for.
             made.append((num_frames, sum(os.times()[:4]) - sum(before[:4])))
     dataset.finalize()
     args.be_today.with_suffix(".json").write_text(json.dumps(made))
@@ -266,12 +266,12 @@ def compare(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def scaling(args: argparse.Namespace) -> dict[str, Any]:
-    """What an episode costs in all processes once they work: the same attempts, and what is beside them."""
+    """Cost of an episode in all processes in steady state: the same attempts, and the overhead."""
     rows = compare(args)
     costs = {name: row["steady_cpu_s_per_episode"] + row["cpu_s_beside_per_episode"] for name, row in rows.items()}
     for name, row in rows.items():
         print(
-            f"{name:<22}attempts {row['steady_cpu_s_per_episode']:.3f} + beside {row['cpu_s_beside_per_episode']:.4f} "
+            f"{name:<22}attempts {row['steady_cpu_s_per_episode']:.3f} + overhead {row['cpu_s_beside_per_episode']:.4f} "
             f"= {costs[name]:.3f} CPU s an episode"
         )
     one, two, ray = (costs.get(name) for name in OURS)
@@ -309,7 +309,7 @@ def memory(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def make_nothing(plan: EpisodePlan, folder: Path) -> Attempt:
-    """A maker that only reports: what is left is the driver's work."""
+    """A maker that only reports, which leaves the driver's work."""
     index = plan.episode_index
     return Attempt(
         episode_index=index,
@@ -326,7 +326,7 @@ def make_nothing(plan: EpisodePlan, folder: Path) -> Attempt:
 
 
 def driver(args: argparse.Namespace) -> dict[str, Any]:
-    """What an episode costs the driver, and what run.json costs it at several lengths of a run."""
+    """Cost of an episode in the driver, and of run.json at several lengths of a run."""
     from demorec.core.config import GenerateConfig
     from demorec.generate.options import RunOptions
     from demorec.generate.run import generate
@@ -366,14 +366,16 @@ def driver(args: argparse.Namespace) -> dict[str, Any]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--episodes", type=int, default=6, help="of ours in each round")
-    parser.add_argument("--today-episodes", type=int, default=2, help="of today's way in each round (x2: at least 2)")
+    parser.add_argument("--episodes", type=int, default=6, help="episodes of demorec in each round")
+    parser.add_argument(
+        "--today-episodes", type=int, default=2, help="episodes of common tools in each round (x2: at least 2)"
+    )
     parser.add_argument("--rounds", type=int, default=1)
-    parser.add_argument("--size", type=int, default=224, help="of the images of both cameras")
+    parser.add_argument("--size", type=int, default=224, help="width and height of the images of both cameras")
     parser.add_argument("--cameras", nargs="+", default=["front", "wrist"])
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", nargs="*", default=[], choices=[*OURS, *TODAY], help="only these variants")
-    parser.add_argument("--scaling", action="store_true", help="ours only, without export: efficiency and overhead")
+    parser.add_argument("--scaling", action="store_true", help="demorec only, without export: efficiency and overhead")
     parser.add_argument("--memory", nargs="*", type=int, default=None, help="lengths of runs, instead of comparing")
     parser.add_argument("--driver", nargs="*", type=int, default=None, help="lengths of runs, for run.json alone")
     parser.add_argument("--json", type=Path, help="also write the figures here")

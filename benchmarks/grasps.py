@@ -1,10 +1,9 @@
-"""How hard fingers press, whether what they hold slips, how often tasks succeed, and what physics costs.
+"""Finger forces, slip of held objects, success of tasks, and the cost of physics.
 
     python benchmarks/grasps.py --episodes 340 --workers 8 --out grasps.jsonl     # all tasks, both arms: 20,000 grasps
 
-Whole episodes without images. A grasp slips when the object moves by more than a millimetre in the hand while it is
-lifted and carried. Episodes that are in `--out` are not made again: the same command continues after `--minutes` or
-Ctrl-C.
+Episodes are complete, without images. A grasp slips when the object moves by more than a millimetre in the hand while
+it is lifted and carried. Episodes in `--out` are not repeated: the same command continues after `--minutes` or Ctrl-C.
 """
 
 from __future__ import annotations
@@ -33,7 +32,7 @@ from demorec.loop import ScriptAgent, Session, make_world, prepare
 from demorec.loop.prepare import PreparedEpisode
 
 LIMIT = 0.001
-"""Of slip, metres."""
+"""Limit of slip, metres."""
 MAX_FORCE = 100.0
 """N of both fingers together."""
 Cell = tuple[str, str, str]
@@ -44,9 +43,9 @@ class Row:
     """One episode; lengths in metres, times in seconds.
 
     Attributes:
-        grasps: How often something was lifted.
-        force: The largest of the fingers' forces at a frame, of both together, N.
-        slip: The largest motion of a lifted object in the hand.
+        grasps: Number of lifts.
+        force: Maximum force of both fingers together at a frame, N.
+        slip: Maximum motion of a lifted object in the hand.
         cpu, simulated: CPU time of reset and control loop, and simulated time.
     """
 
@@ -66,7 +65,7 @@ class Row:
 
     @property
     def is_crushed(self) -> bool:
-        """Whether no real hand could have done it."""
+        """Whether the force exceeds that of any real hand."""
         return self.force > MAX_FORCE
 
 
@@ -107,7 +106,7 @@ def _timed(session: Session, episode: PreparedEpisode) -> tuple[float, list[Fram
 
 
 def lifted(episode: PreparedEpisode, frames: Sequence[Frame]) -> tuple[int, float]:
-    """How often something was lifted, and how far, metres, it moved in the hand at most until it was lowered."""
+    """Number of lifts, and maximum motion of an object in the hand, metres, until it was lowered."""
     hand = episode.info.simulated.scene.robot.world_from_base.matrix() @ matrices(
         np.array([frame.observation.base_from_tcp.vector() for frame in frames])
     )
@@ -132,12 +131,12 @@ def _poses(frames: Sequence[Frame], body: Body) -> Array:
 
 
 def _warm_up() -> None:
-    """Compile the kinematics and load what is loaded once, so that no episode's CPU time has it."""
+    """Compile the kinematics and load libraries, so that no episode's CPU time includes them."""
     run_episode(GenerateConfig(cameras=()), 0)
 
 
 def portion(jobs: Iterable[tuple[GenerateConfig, int]], args: argparse.Namespace) -> Iterator[Row]:
-    """Rows as they are made, in worker processes, until all jobs or the time are over."""
+    """Rows as they are made, in worker processes, until all jobs are done or the time is up."""
     end = time.monotonic() + 60 * args.minutes
     waiting: set[Future[Row]] = set()
     jobs = iter(jobs)
@@ -173,7 +172,7 @@ def table(rows: Sequence[Row]) -> Iterator[str]:
 
 
 def main() -> None:
-    """Make what is missing and print all."""
+    """Make the missing episodes and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--tasks", nargs="+", default=["all"], help="names, or all")
     parser.add_argument("--robots", nargs="+", default=["all"], help="names, or all")
@@ -182,8 +181,8 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--split", default="all", choices=["all", "train", "eval"])
     parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--minutes", type=float, default=1e6, help="start no episode after so long")
-    parser.add_argument("--out", type=Path, help="a line of JSON for each episode; what stands there is not made again")
+    parser.add_argument("--minutes", type=float, default=1e6, help="minutes after which no episode is started")
+    parser.add_argument("--out", type=Path, help="a line of JSON for each episode; episodes in it are not repeated")
     args = parser.parse_args()
     tasks = TASKS.names() if args.tasks == ["all"] else args.tasks
     robots = ROBOTS.names() if args.robots == ["all"] else args.robots

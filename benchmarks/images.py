@@ -1,4 +1,4 @@
-"""Sheets of images for the docs: every task at its grasp and at its end, and many looks of one task.
+"""Sheets of images for the docs: every task at its grasp and at its end, and many appearances of one task.
 
 python benchmarks/images.py --out docs/images
 """
@@ -22,13 +22,13 @@ Pixels = NDArray[np.uint8]
 WIDTH, HEIGHT = 320, 240
 CAPTION_LETTERS = 48
 CARRYING = {"lift", "transport", "hold"}
-"""Phases; of a task that lifts nothing the first touch is shown."""
+"""Phases at which a grasp is shown; for tasks without lifting, the first contact is shown."""
 EPISODES = {"line_up": 2}
-"""Of which not the first is shown: one at whose end the hand hides none of the things."""
+"""Tasks that show another episode than the first, because there the hand hides an object at the end."""
 
 
 def grasp_and_end(config: GenerateConfig, index: int) -> tuple[Pixels, Pixels, str]:
-    """The front camera's image when something is first held and at the end of an episode, and its instruction."""
+    """The front camera's images at the first grasp and at the end of an episode, and its instruction."""
     episode = prepare(EpisodePlan(config=config, episode_index=index))
     with make_world(episode.info) as world, make_renderer(episode.info) as renderer:
         frames = list(Session.of_episode(world, episode, renderer).run(ScriptAgent(episode)))

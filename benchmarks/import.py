@@ -1,20 +1,19 @@
-"""The import of a bag against LeRobot's own writer on the same bag: CPU seconds a gigabyte, milliseconds a frame.
+"""The import of a bag compared with LeRobot's own writer on the same bag: CPU seconds a gigabyte, milliseconds a frame.
 
     python benchmarks/import.py                              a small sample
     python benchmarks/import.py --seconds 30 --rounds 5 --images h264 jpeg
     python benchmarks/import.py --images h264 --gop 30     video with a keyframe a second
-    python benchmarks/import.py --growth 1 5 20              peak memory for so many gigabytes, as one bag and as many
+    python benchmarks/import.py --growth 1 5 20              peak memory for this many gigabytes, as one bag and as many
     python benchmarks/import.py --forge /tmp/forge/bin/python    against forge-robotics, too
 
-forge-robotics is no dependency: it is run by the Python of an environment of its own that has
-"forge-robotics[mcap,lerobot,video]", Pillow and opencv-python-headless. Where it fails on a bag, its own words stand in
-place of figures.
+forge-robotics is not a dependency. It runs in a separate environment that has "forge-robotics[mcap,lerobot,video]",
+Pillow and opencv-python-headless. Where it fails on a bag, its message takes the place of figures.
 
 The bag is written by `mcap` and `rosbags`: two joint topics at 200 Hz and two 640x480 cameras. Each round runs the
-candidates one after the other in processes of their own; loading libraries is not counted, of none of them.
-LeRobot's writer is given frames that were decoded by the same reader as ours, aligned as ours. "decoding and coding" is
-what no import of JPEG images into videos can do without: each image decoded by Pillow and coded by libx264, as our
-export codes it.
+candidates one after the other in separate processes; the time for loading libraries is excluded for all of them.
+LeRobot's writer gets frames that demorec's reader decoded and aligned. "decoding and coding" is the minimum work of an
+import of JPEG images into videos: Pillow decodes each image and libx264 encodes it, with the settings of demorec's
+export.
 """
 
 from __future__ import annotations
@@ -66,14 +65,14 @@ topic = "/side/image"
 
 @dataclass(frozen=True, kw_only=True)
 class Cost:
-    """Of one candidate in one round: CPU seconds of all threads and children, peak memory in bytes."""
+    """Cost of one candidate in one round: CPU seconds of all threads and children, peak memory in bytes."""
 
     cpu: float
     peak: int
 
 
 def scene(step: int, camera: int) -> NDArray[np.uint8]:
-    """An image with texture and motion, which costs a coder what real ones do."""
+    """An image with texture and motion, as expensive to encode as a real one."""
     generator = np.random.default_rng(camera)
     coarse = generator.integers(0, 255, (HEIGHT // 16 + 4, WIDTH // 16 + 4, 3), np.uint8)
     large = coarse.repeat(16, axis=0).repeat(16, axis=1)
@@ -82,7 +81,7 @@ def scene(step: int, camera: int) -> NDArray[np.uint8]:
 
 
 def make_bag(path: Path, seconds: float, images: str, gop: int) -> Path:
-    """A bag with `images` (h264 with a keyframe in front of every `gop` images, or jpeg)."""
+    """A bag with `images` (h264 with a keyframe before every `gop` images, or jpeg)."""
     bags.WIDTH, bags.HEIGHT = WIDTH, HEIGHT
     notes = bags.joints("/follower/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=1))
     notes += bags.joints("/leader/joint_states", bags.SO101_JOINTS, bags.times(200, seconds, seed=2), shift=0.1)
@@ -108,7 +107,7 @@ def make_bag(path: Path, seconds: float, images: str, gop: int) -> Path:
 
 
 def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
-    """The bags to a run, and with `exports` on to a LeRobot dataset."""
+    """Import the bags into a run, and with `exports` export a LeRobot dataset."""
     from demorec.extensions.imports.import_run import import_bags
 
     import_bags(bags_, mapping, out / "run")
@@ -120,7 +119,7 @@ def ours(bags_: list[Path], out: Path, mapping: Path, *, exports: bool) -> None:
 
 
 def lerobots(bag: Path, out: Path, mapping: Path) -> None:
-    """The same rows through LeRobotDataset.add_frame and save_episode, with its defaults."""
+    """Write the same rows with LeRobotDataset.add_frame and save_episode, with its defaults."""
     import av
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
@@ -171,7 +170,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
 
 
 def decoding_and_coding(bag: Path) -> None:
-    """Every image of the bag decoded and coded once as the export codes it, and nothing else."""
+    """Only decode every image of the bag and encode it once, as the export does."""
     from demorec.core.config import VideoConfig
     from demorec.extensions.imports.bag import open_bag
     from demorec.extensions.imports.decoding import BagDecoder
@@ -204,7 +203,7 @@ print(json.dumps({"cpu": used() - begin, "peak": peak, "frames": result.total_fr
 
 
 def forges(python: Path, bag: Path, out: Path) -> Cost | str:
-    """The bag to a LeRobot dataset by forge-robotics; its words where it fails."""
+    """Import the bag into a LeRobot dataset with forge-robotics; returns its message if it fails."""
     shutil.rmtree(out, ignore_errors=True)
     command = [str(python), "-c", FORGE, str(bag), str(out)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -243,7 +242,7 @@ def _used() -> float:
 
 
 def _peak() -> int:
-    """Bytes of memory that this process held at most; getrusage would tell of the parent's, too."""
+    """Peak memory of this process, bytes; getrusage would include the parent's."""
     (line,) = [line for line in Path("/proc/self/status").read_text().splitlines() if line.startswith("VmHWM")]
     return int(line.split()[1]) << 10
 
@@ -266,7 +265,7 @@ def measure(candidate: str, bags_: list[Path], folder: Path) -> Cost:
 
 
 def grow(path: Path, images: str, gop: int, gigabytes: float) -> Path:
-    """A bag of that size: a piece of ten seconds again and again, each time ten seconds later."""
+    """A bag of that size: repetitions of a ten-second piece, each shifted by another ten seconds."""
     from mcap.reader import make_reader
     from mcap.writer import CompressionType, Writer
 
@@ -327,7 +326,7 @@ def table(images: str, bag: Path, options: argparse.Namespace, folder: Path) -> 
 
 
 def tell(bags_: list[Path], folder: Path) -> None:
-    """Print what their import takes."""
+    """Print the cost of an import by forge-robotics."""
     gigabytes, cost = sum(bag.stat().st_size for bag in bags_) / 1e9, measure("import", bags_, folder)
     peak, cpu = cost.peak / 1e6, cost.cpu / gigabytes
     print(f"{gigabytes:.1f} GB in {len(bags_)} bags: peak {peak:.0f} MB, {cpu:.1f} CPU s/GB", flush=True)
@@ -335,8 +334,8 @@ def tell(bags_: list[Path], folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=4.0, help="of the bag")
-    parser.add_argument("--gop", type=int, default=2, help="images from a keyframe of H.264 video to the next")
+    parser.add_argument("--seconds", type=float, default=4.0, help="length of the bag")
+    parser.add_argument("--gop", type=int, default=2, help="images from one keyframe of H.264 video to the next")
     parser.add_argument("--rounds", type=int, default=2, help="0 for --growth alone")
     parser.add_argument("--images", nargs="+", choices=("h264", "jpeg"), default=["h264", "jpeg"])
     parser.add_argument(
@@ -344,7 +343,7 @@ def main() -> None:
     )
     parser.add_argument("--ours", action="store_true", help="leave LeRobot's writer out, which is slow")
     parser.add_argument("--forge", type=Path, help="Python of an environment with forge-robotics, to compare with it")
-    parser.add_argument("--folder", type=Path, help="where the bags go (default: the system's folder)")
+    parser.add_argument("--folder", type=Path, help="folder for the bags (default: the system's folder)")
     options = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="demorec-import-", dir=options.folder) as name:
         folder = Path(name)

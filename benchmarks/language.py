@@ -1,13 +1,13 @@
-"""What language, progress and boxes add to an export, to its size, and to reading an item of the dataset.
+"""Cost of language, progress and boxes: time and size of an export, and time to read an item of the dataset.
 
     python benchmarks/language.py                                    makes ten episodes first
     python benchmarks/language.py --run recordings/cubes --rounds 9
-    python benchmarks/language.py --commands 10 1000                 whole commands, of so many episodes
+    python benchmarks/language.py --commands 10 1000                 whole commands, on these numbers of episodes
 
-Every round exports the same run with each choice one after the other; CPU time of the process, medians, and the ratio
-to the plain export of the same round. The same random items are read by LeRobot and by demorec, with images (by each
-decoder that works here) and without. --commands runs `demorec export lerobot` as it is, LeRobot's verification
-included, without --language and with it, on copies of the run's recordings.
+Every round exports the same run with each choice one after the other; the table has medians of the process's CPU time,
+and the ratio to the plain export of the same round. LeRobot and demorec read the same random items, with images (by
+each decoder that works here) and without. --commands runs `demorec export lerobot` including LeRobot's verification,
+without --language and with it, on copies of the run's recordings.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CHOICES: dict[str, dict[str, Any]] = {
     "progress": {"progress": True},
     "boxes": {"boxes": True},
 }
-"""What is exported, and with which options."""
+"""Exports, with their options."""
 
 
 BATCH = 32
@@ -64,7 +64,7 @@ def exports(run: Path, work: Path, rounds: int) -> None:
 
 
 def decoders() -> list[str]:
-    """Those that work here; torchcodec needs an FFmpeg of the system's."""
+    """Decoders that work here; torchcodec needs the system's FFmpeg."""
     try:
         import torchcodec.decoders  # noqa: F401
     except (ImportError, RuntimeError, OSError):
@@ -73,14 +73,14 @@ def decoders() -> list[str]:
 
 
 def items(run: Path, work: Path, rounds: int, *, images: bool) -> None:
-    """Reading random items in batches, by LeRobot and by `FastDataset`, from datasets with and without language."""
+    """Read random items in batches, by LeRobot and by `FastDataset`, from datasets with and without language."""
     import numpy as np
     import torch
     from lerobot.datasets import LeRobotDataset
 
     from lerobot_policy_act_keypoints import FastDataset
 
-    torch.set_num_threads(1)  # threads that wait for each other count as CPU time
+    torch.set_num_threads(1)  # waiting threads would count as CPU time
     features = () if images else ("observation.state", "action")
     names = ("plain", "subtask", "language")
     readers: dict[tuple[str, str, str], Any] = {}
@@ -114,7 +114,7 @@ def items(run: Path, work: Path, rounds: int, *, images: bool) -> None:
 
 
 def commands(run: Path, work: Path, counts: list[int], rounds: int) -> None:
-    """Whole commands on so many episodes: copies of the run's, since no more than the number matters."""
+    """Run whole commands on copies of the run's episodes, since only their number matters."""
     recordings = sorted((run / "episodes").glob("*.mcap"))
     for count in counts:
         copies = work / f"copies-{count}"
@@ -140,7 +140,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--run", type=Path, help="a run with cameras and segmentation")
     parser.add_argument("--rounds", type=int, default=5)
-    parser.add_argument("--commands", type=int, nargs="+", help="measure whole commands, on so many episodes")
+    parser.add_argument("--commands", type=int, nargs="+", help="measure whole commands on these numbers of episodes")
     args = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         work, run = Path(folder), args.run

@@ -1,14 +1,14 @@
-"""What teaches: the same policy trained on variants of the data and run over held-out scenes.
+"""Compare variants of the training data: the same policy, trained on each and evaluated in held-out scenes.
 
     python benchmarks/learning.py --variants base clean plain_increments --out outputs/learning
     python benchmarks/learning.py --episodes 1000 --steps 8000 --scenes 100 --seeds 3
     python benchmarks/learning.py --variants joint_state joint_ee_state --episodes 300 --steps 3000 --scenes 60
 
-Every variant is made with the product's own commands (generate-dataset, demorec export lerobot, demorec evaluate).
-Training is LeRobot's ACT class with the numbers of a dataset held in memory: lerobot-train reads them row by row and
-spends five sixths of its CPU time there; the network, the loss and the optimizer are the same. One thread, no
-download. Each variant is one row: strict success in closed loop with its 95 % interval, and CPU seconds of training.
-What is there already (runs, datasets, policies, evaluations in --out) is used again.
+Every variant is made with demorec's commands (generate-dataset, demorec export lerobot, demorec evaluate). Training is
+LeRobot's ACT class with the numbers of a dataset held in memory: lerobot-train reads them row by row and spends five
+sixths of its CPU time there; the network, the loss and the optimizer are the same. One thread, no download. Each
+variant is one row: strict success in closed loop with its 95 % interval, and CPU seconds of training. Existing runs,
+datasets, policies and evaluations in --out are reused.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 STATE, ENVIRONMENT, ACTION = "observation.state", "observation.environment_state", "action"
 SWITCHED_OFF = 1e9
-"""Standard deviation of a component that a policy shall not see: normalising with it leaves nothing of it."""
+"""Standard deviation that hides a component from a policy: normalising with it leaves only zeros."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,12 +42,12 @@ class Variant:
     """One way to make data or to learn from it.
 
     Attributes:
-        about: What is different from the base.
+        about: Difference from the base.
         generate: Flags of generate-dataset.
-        action: As of demorec export lerobot.
-        plain: Take the way back from noise out of the increments.
+        action: Value of --action in demorec export lerobot.
+        plain: Remove the recovery from noise from the increments.
         see: Pattern of the components of the environment state that are not hidden; "" for all.
-        execute: Actions of the chunk that are executed before looking again.
+        execute: Actions of the chunk that are executed before the next observation.
     """
 
     about: str
@@ -61,11 +61,11 @@ class Variant:
 CHUNK = 16
 """Actions predicted at once."""
 THINGS = r"red_cube\.([xyz]|size\.[xyz]|yaw\.\w+|goal\.[xyz])"
-"""What a perfect eye would tell: where cube and mark are."""
+"""Components that perfect vision would give: positions of cube and mark."""
 VARIANTS = {
     "base": Variant(about="noise 0.02 rad, clean labels, increments, all of the state, 16 of 16 executed"),
     "clean": Variant(about="no action noise", generate=("--action-noise", "0", "0")),
-    "plain_increments": Variant(about="increments without the way back from noise", plain=True),
+    "plain_increments": Variant(about="increments without the recovery from noise", plain=True),
     "joint": Variant(about="absolute joint targets", action="joint"),
     "ee_delta": Variant(about="TCP deltas", action="ee_delta"),
     "joint_state": Variant(
@@ -95,7 +95,7 @@ def command(*words: str | Path) -> None:
 
 
 def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
-    """Generate and export, where that was not done yet."""
+    """Generate and export, unless done before."""
     label = "_".join(word.strip("-").replace(".", "") for word in variant.generate) or "base"
     run = args.out / f"run_{label}_{args.episodes}"
     command(
@@ -112,7 +112,7 @@ def make_dataset(variant: Variant, args: argparse.Namespace) -> Path:
 
 
 def load(dataset: Path, variant: Variant) -> Data:
-    """Read a dataset's numbers and hide what the variant hides."""
+    """Read a dataset's numbers and apply the variant's hidden components."""
     info = json.loads((dataset / "meta" / "info.json").read_text())
     tables = [pq.read_table(path) for path in sorted((dataset / "data").rglob("*.parquet"))]
     columns = {
@@ -213,7 +213,7 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
 
 
 def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
-    """One row of the table."""
+    """Measure one row of the table."""
     from demorec.core.config import GenerateConfig
     from demorec.extensions.policies.rollouts import evaluate, settings_for
     from demorec.extensions.policies.statistics import Rate

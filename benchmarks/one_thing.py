@@ -1,4 +1,5 @@
-"""pick_anything with a single thing, whose poses and extents a policy can see as numbers: does it take unseen things?
+"""pick_anything with a single object, whose pose and extents a policy gets as numbers: does it generalise to new
+objects?
 
     cd benchmarks; flags="--task one_thing:OneThing --split train --object-split train --cameras none --no-export"
     generate-dataset $flags --num-episodes 500 --out ../outputs/things
@@ -9,7 +10,7 @@
     for split in train eval; do demorec evaluate --policy ../outputs/act_things --task one_thing:OneThing \
         --object-split $split --num-episodes 100 --allow one_thing --out ../outputs/on_$split; done
 
-Both evaluations put the thing where no demonstration had it, `eval` shapes that none had either.
+Both evaluations put the object where no demonstration had it; `eval` also uses shapes that no demonstration had.
 """
 
 from __future__ import annotations
@@ -22,12 +23,12 @@ from demorec.tasks.sampling import Sampler
 
 
 class OneThing(PickAnything):
-    """As `PickAnything`, without anything else on the table; the thing is called "thing".
+    """`PickAnything` with one object on the table, which is called "thing".
 
-    Its yaw is told up to half a turn, which is all that two fingers care for.
+    Its yaw is given modulo half a turn, since two fingers cannot distinguish more.
     """
 
-    summary = "a single thing to a mark, a tray, a bowl or a plate"
+    summary = "a single object to a mark, a tray, a bowl or a plate"
 
     def layout(self, sampler: Sampler) -> Layout:
         """Draw it."""

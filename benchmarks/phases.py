@@ -1,4 +1,4 @@
-"""The drawing of docs/tasks.md: what the hand does in each phase of one pick and place.
+"""The drawing of docs/tasks.md: the hand's motion in each phase of one pick and place.
 
 python benchmarks/phases.py
 """

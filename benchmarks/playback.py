@@ -1,9 +1,9 @@
-"""What playback costs: an episode to .rrd, and what `generate-dataset --view` adds.
+"""Cost of playback: an episode to .rrd, and the overhead of `generate-dataset --view`.
 
     python benchmarks/playback.py recordings/cubes/episodes/episode_000000.mcap
     python benchmarks/playback.py EPISODE --view-episodes 3      (also generates episodes and sends them to a server)
 
-CPU seconds of the processes, medians.
+The output has medians of CPU seconds of the processes.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def measure_saving(path: Path, rounds: int) -> None:
 
 
 def measure_view(num_episodes: int) -> None:
-    """CPU of the process that sends, against that of generating the same episodes."""
+    """CPU time of the process that sends, compared with that of generating the same episodes."""
     port = free_port()
     server = subprocess.Popen(
         [viewer_program(), "--serve-grpc", "--bind", "127.0.0.1", "--port", str(port)],

@@ -1,10 +1,10 @@
-"""Reading a dataset for training: the plug-in's reader against LeRobot's, with equal arguments, in one interleaved run.
+"""Reading a dataset for training: the plug-in's reader and LeRobot's, with equal arguments, in one interleaved run.
 
     python benchmarks/reading.py                                    everything, smallest sample
     python benchmarks/reading.py --sizes 224 --workers 0 --batches 8 --rounds 3
 
-Batches of 64 random items by torch's DataLoader, none of them twice, so that no cache of frames helps. CPU time counts
-the worker processes with their start. The datasets show the same images: one is demorec's export (H.264), one is
+torch's DataLoader makes batches of 64 random items, without repetition, so that a cache of frames does not help. CPU
+time includes starting the worker processes. The datasets show the same images: one is demorec's export (H.264), one is
 written by LeRobot with its defaults (AV1).
 """
 
@@ -81,7 +81,7 @@ def written_by_lerobot(folder: Path, args: argparse.Namespace, size: int) -> Pat
 
 
 def without_images(folder: Path, args: argparse.Namespace) -> Path:
-    """The numbers of demorec's default features, 13 columns, of as many episodes as a training has."""
+    """Write the numbers of demorec's default features, 13 columns, for as many episodes as a training has."""
     from support.recording import write_episode
 
     from demorec.datasets.lerobot.export import export_lerobot
@@ -101,7 +101,7 @@ def cpu_seconds() -> float:
 
 
 def read(dataset: Any, rows: Sequence[int], workers: int, cost: Cost) -> Any:
-    """One round; the last batch comes back, for comparison."""
+    """Read one round; returns the last batch for comparison."""
     import torch
 
     start = "fork" if workers else None
@@ -110,7 +110,7 @@ def read(dataset: Any, rows: Sequence[int], workers: int, cost: Cost) -> Any:
     )
     cpu, wall = cpu_seconds(), time.perf_counter()
     last = None
-    for batch in loader:  # with its end the workers have ended, and their time counts
+    for batch in loader:  # the workers end with it, and their time counts
         last = batch
     cost.cpu.append(1e3 * (cpu_seconds() - cpu) / len(rows))
     cost.wall.append(1e3 * (time.perf_counter() - wall) / len(rows))
@@ -131,7 +131,7 @@ def compare(name: str, root: Path, windows: dict[str, list[float]], workers: int
     }
     costs = {reader: Cost() for reader in datasets}
     rng = np.random.default_rng(0)
-    for dataset in datasets.values():  # what is made once
+    for dataset in datasets.values():  # fixed costs
         dataset[0]
     for number in range(args.rounds):
         rows = rng.permutation(len(datasets["lerobot"]))[: BATCH * args.batches].tolist()

@@ -1,9 +1,9 @@
-"""Measures the recorder in real time: drops, what `write` costs, how much a kill loses.
+"""Measure the recorder in real time: dropped frames, the cost of `write`, and the loss in a kill.
 
     python benchmarks/recorder.py --seconds 60 --hz 100 --cameras 3
 
-A loop gives frames at an exact rate, with images of 640x480 that move and carry noise as those of cameras do. `write`
-is measured on the wall and in the CPU time of its own thread. Then another process does the same and is killed.
+A loop provides frames at an exact rate, with 640x480 images that move and have noise like those of cameras. `write` is
+measured in wall time and in CPU time of its thread. Then another process does the same and is killed.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def images(seed: int) -> list[NDArray[np.uint8]]:
 
 
 def loop(folder: Path, args: argparse.Namespace, *, tells: bool) -> tuple[list[float], list[float], int]:
-    """Record; wall and CPU milliseconds of every `write`, and how many frames were dropped."""
+    """Record; return wall and CPU milliseconds of every `write`, and the number of dropped frames."""
     names = [f"camera_{number}" for number in range(args.cameras)]
     seen = {name: images(number) for number, name in enumerate(names)}
     wall, cpu = [], []
@@ -73,7 +73,7 @@ def loop(folder: Path, args: argparse.Namespace, *, tells: bool) -> tuple[list[f
 
 
 def lost_seconds(folder: Path, args: argparse.Namespace) -> float:
-    """Seconds between the last frame that was given before `kill -9` and the last one that is there afterwards."""
+    """Seconds between the last frame given before `kill -9` and the last one kept in the file."""
     command = [sys.executable, __file__, "--victim", str(folder), "--hz", str(args.hz), "--cameras", str(args.cameras)]
     command += ["--codec", args.codec, "--preset", args.preset, "--gop", str(args.gop), "--seconds", "60"]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as victim:

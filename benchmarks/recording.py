@@ -1,4 +1,4 @@
-"""What encoding costs: bytes, CPU time and quality of one episode by codec and GOP.
+"""Cost of encoding: bytes, CPU time and quality of one episode by codec and GOP.
 
     python benchmarks/recording.py [--size 224] [--renderer raster]
 
@@ -33,7 +33,7 @@ def simulate(config: GenerateConfig) -> tuple[EpisodeInfo, list[Frame], Outcome]
 
 
 def raw_bytes(frames: list[Frame]) -> int:
-    """Images as RGB, numbers as float64."""
+    """Size of images as RGB, and of numbers as float64."""
     images = sum(image.color.nbytes for frame in frames for image in frame.images.values())
     observation = frames[0].observation
     numbers = 3 * len(observation.joint_position) + 2 + 6 + 7 + 7 * len(observation.object_poses)
@@ -53,7 +53,7 @@ def encoding_ms(video: VideoConfig, info: EpisodeInfo, frames: list[Frame]) -> f
 
 
 def psnr(recording: Recording, frames: list[Frame]) -> float:
-    """Of the decoded images, all cameras together, dB."""
+    """PSNR of the decoded images of all cameras together, dB."""
     errors = [
         np.mean((image.astype(np.float64) - frame.images[camera].color) ** 2)
         for camera in recording.cameras

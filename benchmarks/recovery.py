@@ -1,10 +1,10 @@
-"""From how many states the expert finishes a task that somebody else has begun, by how the state came about.
+"""Success of the expert from states that another agent has caused, by the kind of state.
 
     python benchmarks/recovery.py --tasks pick_place stack --states 50
 
-script: the middle of a script of its own, arm in motion; flailing: from there a random walk of all joints, the hand
-opening and closing, for up to two seconds; moved: the object of the first goal is somewhere else on the table. Random
-walks push objects over the edge of what the arm reaches and tip them over; these count as failures here.
+script: the middle of a scripted episode, arm in motion; flailing: from there a random walk of all joints, the hand
+opening and closing, for up to two seconds; moved: the object of the first goal is elsewhere on the table. Random walks
+push objects out of the arm's reach and tip them over; these count as failures here.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ from demorec.tasks.skills import Expert
 
 KINDS = ("script", "flailing", "moved")
 _FREE = 0.16
-"""Metres between an object that is put somewhere and everything else, the hand too."""
+"""Minimum distance of a displaced object from all others and the hand, metres."""
 
 
 def bring_about(kind: str, world: World, episode: PreparedEpisode, random: np.random.Generator) -> None:
-    """Bring a state about."""
+    """Bring the world into a state."""
     frames = int(random.integers(5, 200))
     for frame in Session.of_episode(world, episode).run(ScriptAgent(episode)):
         if frame.frame_index == frames:
@@ -71,7 +71,7 @@ def move_object(world: World, random: np.random.Generator) -> None:
 
 
 def outcome(world: World, episode: PreparedEpisode) -> str:
-    """What is wrong in the end; "" for a success."""
+    """Describe the failure at the end; "" for a success."""
     expert = Expert(world, replace(episode.behaviour, miss_x=0.0, miss_y=0.0))
     try:
         for step in episode.task.resume(expert):

@@ -4,7 +4,7 @@
     python benchmarks/render.py --rounds 11
     python benchmarks/render.py --robot so101 --task stack --sizes 224x224
 
-Process CPU time, since machines are shared; medians over rounds; the ratio is against TinyRenderer in the same run.
+The output has process CPU time, since machines are shared, as medians over rounds, and ratios to TinyRenderer.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ SIZES = ((96, 96), (224, 224), (640, 480))
 
 @dataclass(frozen=True)
 class State:
-    """What `World.set_state` needs to show one frame again."""
+    """Arguments of `World.set_state` that show one frame again."""
 
     joint_position: Array
     object_poses: dict[str, Pose]
@@ -101,7 +101,7 @@ def table(
             for cameras in [(camera,) for camera in every] + [tuple(every)]:
                 times: dict[Variant, list[float]] = {variant: [] for variant in variants}
                 for number in range(rounds):
-                    # Neighbouring frames, as in an episode; other ones in each round.
+                    # Use neighbouring frames, as in an episode, and different ones in each round.
                     first = number * max(1, (len(states) - frames) // max(1, rounds - 1)) if rounds > 1 else 0
                     chosen = states[first : first + frames]
                     for variant in variants:
@@ -109,7 +109,7 @@ def table(
                             painter = painter_for(
                                 renderer, world, cameras, antialias=variant.antialias, everything=variant.everything
                             )
-                            measure(painter, world, chosen[:1])  # what is made once a scene
+                            measure(painter, world, chosen[:1])  # fixed cost of a scene
                             few = chosen if variant.renderer == "raster" else chosen[:: max(1, frames // 4)]
                             times[variant].append(measure(painter, world, few) / len(cameras))
                 name = " + ".join(camera.name for camera in cameras)
@@ -124,7 +124,7 @@ def table(
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--renderers", nargs="+", default=list(RENDERERS.names()), choices=RENDERERS.names())
-    parser.add_argument("--robot", default="panda", help="whose episode the table measures")
+    parser.add_argument("--robot", default="panda", help="task of the measured episode")
     parser.add_argument("--task", default="pick_place", help="which")
     parser.add_argument("--sizes", nargs="+", default=[f"{w}x{h}" for w, h in SIZES])
     parser.add_argument("--rounds", type=int, default=3)

@@ -1,11 +1,11 @@
-"""How fast recordings are replayed, checked and drawn anew, and whether the replays are identical to the bit.
+"""Speed of replaying, checking and rerendering recordings, and whether the replays are bit-exact.
 
     python benchmarks/replay.py --episodes 100 --images 2
 
-CPU seconds of this process. Ratios are taken within one interleaved run: each episode is generated, checked,
-replayed and (the first few) drawn anew, one after the other. World and renderer are kept from one episode to the next,
-as the workers of `generate-dataset` and `demorec render` do; "as it was" makes a new renderer for each recording that
-is drawn anew.
+Figures are CPU seconds of this process. Ratios are taken within one interleaved run: each episode is generated,
+checked, replayed and (the first few) rerendered, one after the other. World and renderer are reused from one episode to
+the next, as in the workers of `generate-dataset` and `demorec render`; "as it was" makes a new renderer for each
+rerendered recording.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def generate(path: Path, config: GenerateConfig, index: int, simulators: Simulat
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=10, help="without images, replayed and checked")
-    parser.add_argument("--images", type=int, default=1, help="with two cameras, drawn anew and checked")
+    parser.add_argument("--images", type=int, default=1, help="with two cameras, rerendered and checked")
     parser.add_argument("--size", type=int, default=224)
     parser.add_argument("--task", default="pick_place")
     arguments = parser.parse_args()
@@ -58,7 +58,7 @@ def main() -> None:
 
     with stack, tempfile.TemporaryDirectory() as folder:
         plain = GenerateConfig(task=arguments.task, cameras=())
-        generate(Path(folder) / "warm.mcap", plain, 10_000, simulators)  # compiles what is compiled once
+        generate(Path(folder) / "warm.mcap", plain, 10_000, simulators)  # compiles functions
         for index in range(arguments.episodes):
             path = Path(folder) / f"{index}.mcap"
             start = time.process_time()
@@ -88,15 +88,15 @@ def main() -> None:
             timed("generate with images", start)
             start = time.process_time()
             rerender(path, Path(folder) / f"as_it_was_{index}.mcap", RerenderOptions())
-            timed("draw anew, as it was", start)
+            timed("rerender, as it was", start)
             start = time.process_time()
             drawn = rerender(path, Path(folder) / f"again_{index}.mcap", RerenderOptions(), renderers=warm)
-            timed("draw anew", start)
+            timed("rerender", start)
             same_pictures += not drawn.differing
             start = time.process_time()
             small = RerenderOptions(cameras=("front",), width=96, height=96)
             rerender(path, Path(folder) / f"small_{index}.mcap", small, renderers=warm)
-            timed("draw one camera, 96x96", start)
+            timed("rerender one camera, 96x96", start)
             for images in (False, True):
                 start = time.process_time()
                 check_subject(Subject(path=path, kind="recording"), CheckOptions(images=images))
@@ -108,11 +108,11 @@ def main() -> None:
     for name, seconds in cpu.items():
         of_images = name not in ("generate", "check", "replay")
         number, length = (arguments.images, filmed) if of_images else (count, simulated)
-        print(f"{name:<24} {1e3 * seconds / number:8.1f} CPU ms an episode, {length / seconds:8.1f} times real time")
+        print(f"{name:<26} {1e3 * seconds / number:8.1f} CPU ms an episode, {length / seconds:8.1f} times real time")
     if arguments.images:
         generation = cpu["generate with images"]
-        was, now = generation / cpu["draw anew, as it was"], generation / cpu["draw anew"]
-        print(f"generate / draw anew: as it was {was:.2f}, {now:.2f} now")
+        was, now = generation / cpu["rerender, as it was"], generation / cpu["rerender"]
+        print(f"generate / rerender: as it was {was:.2f}, {now:.2f} now")
 
 
 if __name__ == "__main__":

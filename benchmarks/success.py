@@ -1,10 +1,10 @@
-"""How often the expert succeeds, without images: strict success, first tries, failures by phase and reason, speed.
+"""Success of the expert, without images: strict success, first attempts, failures by phase and reason, speed.
 
     python benchmarks/success.py --episodes 500
     python benchmarks/success.py --tasks pick_place --robots panda --episodes 300 --json out.json
     python benchmarks/success.py --tasks pick_anything --objects household blocks random --episodes 2000
 
-Speed is given per core from process CPU time, so that it can be compared on a shared machine.
+Speed is per core and based on process CPU time, so that it can be compared on a shared machine.
 """
 
 from __future__ import annotations

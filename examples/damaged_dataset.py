@@ -1,4 +1,4 @@
-"""Damage the dataset in download/ like a careless recorder: docs/datasets.md cleans it again."""
+"""Damage the dataset in download/ like a careless recorder; docs/datasets.md shows the repair."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ TURN = 2 * math.pi
 
 XARM6 = RobotSpec(
     name="xarm6",
-    urdf="xarm6.urdf",  # beside this file
+    urdf="xarm6.urdf",  # next to this file
     base_link="stand",
     arm_joints=("joint1", "joint2", "joint3", "joint4", "joint5", "joint6"),
     tcp_link="tcp",

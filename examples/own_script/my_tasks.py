@@ -37,11 +37,11 @@ from demorec.api import (
 )
 
 STARTS = Region(x=(0.40, 0.48), y=(-0.12, 0.12))
-"""Where the cube may start: metres in front of the robot's base and to its left."""
+"""Start region of the cube: metres in front of the robot's base and to its left."""
 CLEARANCE = 0.05
-"""Between the cube and the hand before the push, metres."""
+"""Distance between the cube and the hand before the push, metres."""
 PUSH_SPEED = 0.06
-"""Of the hand, m/s: slow enough that the cube stops with it."""
+"""Speed of the hand, m/s: slow enough that the cube stops with it."""
 
 
 class PushToMark(Task):
@@ -70,11 +70,11 @@ class PushToMark(Task):
         )
 
     def instruction(self, scene: Scene, rng: np.random.Generator) -> str:
-        """What to do, in words."""
+        """Describe the task in words."""
         return wording(rng, "push the red cube onto the green target", "slide the red cube to the green target")
 
     def script(self, expert: Expert) -> Iterator[Step]:
-        """Set two finger tips apart, go down behind the cube, push until the cube is there, leave it."""
+        """Set the finger tips apart, lower them behind the cube, push it to the mark, and retreat."""
         world, goal = expert.world, expert.world.scene.goals[0]
         start, end = world.pose(goal.object).position, goal.onto_from_goal.position
         yaw = math.atan2(end[1] - start[1], end[0] - start[0])
@@ -83,10 +83,10 @@ class PushToMark(Task):
         behind = start - (side / 2 + CLEARANCE) * ahead
 
         expert.phase = "open"
-        # Two tips side by side steer the cube; it would turn around a single one.
+        # Two tips next to each other steer the cube; it would turn around a single one.
         yield from expert.set_gripper(side / 2, max_seconds=1.0, done=steady_width(world))
         expert.phase = "approach"
-        # The fingers are the same from both sides: the hand takes the turn that the arm can make.
+        # The fingers look the same from both sides, so the hand takes the turn that the arm can reach.
         hands = (hand_down(behind, turned) for turned in symmetric_yaws(yaw, 2))
         hand = next((hand for hand in hands if expert.reaches(hand)), None)
         if hand is None:
@@ -109,5 +109,5 @@ class PushToMark(Task):
         yield from expert.move(raised(away, 0.1), speed=0.3)
 
     def evaluate(self, world: World) -> tuple[SuccessCheck, ...]:
-        """The cube lies on the mark, and the hand is off it; how far that is open does not matter here."""
+        """Check that the cube is on the mark and free of the hand; the hand's opening does not matter here."""
         return placement_checks(world, world.scene.goals[0])

@@ -1,6 +1,6 @@
 """A gymnasium wrapper that records every episode: python examples/recorder/gym_wrapper.py runs/pendulum.
 
-The wrapper records frame t as the observation at t and the action that was chosen upon it, as policies learn it.
+The wrapper records frame t as the observation at t and the action chosen from it, as policies learn it.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ from demorec.api import RecordedEpisode
 
 
 class RecordEpisodes(gymnasium.Wrapper):  # type: ignore[misc]
-    """Records what passes through an environment of vectors; what it renders becomes the camera "view".
+    """Records the vectors of an environment; its rendered images become the camera "view".
 
     Args:
-        env: With `render_mode="rgb_array"` its images are recorded, too.
-        folder: Of the run.
-        task: What is to be done, in words.
+        env: Environment; with `render_mode="rgb_array"` its images are recorded, too.
+        folder: Folder of the run.
+        task: Instruction in words.
         fps: Steps per second.
     """
 
@@ -42,7 +42,7 @@ class RecordEpisodes(gymnasium.Wrapper):  # type: ignore[misc]
         self._images = {name: np.asarray(self.env.render()) for name in self._cameras}
 
     def reset(self, **kwargs: Any) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; one that was not over is recorded without an outcome."""
+        """Begin an episode; an unfinished one is recorded without an outcome."""
         if self._episode is not None:
             self._episode.finish()
         observation, info = self.env.reset(**kwargs)

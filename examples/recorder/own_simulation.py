@@ -1,7 +1,7 @@
-"""Records your own PyBullet simulation: python examples/recorder/own_simulation.py runs/kuka.
+"""Record your own PyBullet simulation: python examples/recorder/own_simulation.py runs/kuka.
 
 demorec's simulator is not used: the program loads a URDF from pybullet_data, steps its own world, takes images with two
-cameras and hands everything to the recorder. The URDF goes with it, so that a viewer shows the arm.
+cameras and passes everything to the recorder. The URDF is included, so that a viewer shows the arm.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ FOV_DEGREES = 60.0
 FOCAL = SIDE / 2 / math.tan(math.radians(FOV_DEGREES) / 2)
 INTRINSICS = (FOCAL, 0.0, SIDE / 2, 0.0, FOCAL, SIDE / 2, 0.0, 0.0, 1.0)
 MAX_SPEED = 1.5
-"""Of each joint, rad/s; without it PyBullet's motors jump to their targets."""
+"""Maximum speed of each joint, rad/s; without it PyBullet's motors jump to their targets."""
 EYES = {"front": (1.5, 0.0, 0.9), "side": (0.0, 1.5, 0.9)}
 
 
@@ -65,7 +65,7 @@ def main(folder: str, num_episodes: int = 2, num_frames: int = 45) -> None:
                                 physicsClientId=client,
                             )
                         images = {name: take_image(client, eye) for name, eye in EYES.items()}
-                        # Simulated time, exact: the clock on the wall says nothing about a simulation.
+                        # Simulated time is exact; wall time is meaningless here.
                         episode.write(position, goal, images, time_ns=frame * 1_000_000_000 // FPS)
                         for _ in range(PHYSICS_HZ // FPS):
                             pybullet.stepSimulation(physicsClientId=client)

@@ -1,7 +1,7 @@
-"""Records a real robot's own control loop: python examples/recorder/real_robot.py runs/real_robot.
+"""Record a real robot's own control loop: python examples/recorder/real_robot.py runs/real_robot.
 
-`MyArm` and `MyCamera` stand in for the drivers of your arm and camera. The loop reads what there is, sends a command
-and hands all of it to the recorder, which never holds it up: another thread encodes the images.
+`MyArm` and `MyCamera` stand in for the drivers of your arm and camera. The loop reads the sensors, sends a command and
+passes everything to the recorder, which never blocks it: another thread encodes the images.
 """
 
 from __future__ import annotations
@@ -26,22 +26,22 @@ class MyArm:
         self._position = np.zeros(len(JOINTS))
 
     def read(self) -> NDArray[np.float64]:
-        """(6,) rad."""
+        """Read the joint positions, (6,) rad."""
         return self._position.copy()
 
     def send(self, target: NDArray[np.float64]) -> None:
-        """(6,) rad."""
+        """Send joint targets, (6,) rad."""
         self._position += 0.5 * (target - self._position)
 
 
 class MyCamera:
-    """A camera that has a new image now and then, with the time at which it was taken."""
+    """A camera that has a new image now and then, with its time of capture."""
 
     def __init__(self) -> None:
         self._count = 0
 
     def latest(self) -> tuple[NDArray[np.uint8], int]:
-        """(480, 640, 3) RGB and its stamp in nanoseconds, of the clock that the loop uses, too."""
+        """(480, 640, 3) RGB and its timestamp in nanoseconds, in the loop's clock."""
         self._count += 1
         image = np.zeros((480, 640, 3), dtype=np.uint8)
         image[:, (4 * self._count) % 600 :][:, :40] = (200, 120, 0)
@@ -49,7 +49,7 @@ class MyCamera:
 
 
 def every(seconds: float, count: int) -> Iterator[int]:
-    """Numbers, one each time that so many seconds have passed."""
+    """Numbers, one at each interval of the given length."""
     start = time.monotonic()
     for number in range(count):
         time.sleep(max(0.0, start + number * seconds - time.monotonic()))
@@ -57,7 +57,7 @@ def every(seconds: float, count: int) -> Iterator[int]:
 
 
 def main(folder: str, num_episodes: int = 2, seconds: float = 2.0) -> None:
-    """Record some episodes; Ctrl-C ends the one that is being recorded, and keeps it."""
+    """Record some episodes; Ctrl-C ends the current one, and keeps it."""
     arm, camera = MyArm(), MyCamera()
     with Recorder(
         folder, robot=JOINTS, cameras={"top": (480, 640)}, fps=FPS, task="wave the gripper", clock=time.monotonic_ns

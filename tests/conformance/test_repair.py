@@ -153,9 +153,9 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
         lambda root: edit_json(root / "meta/stats.json", lambda data: data["action"].update(mean=[9.0] * 3)),
         "of action"),
     "no tasks": (lambda root: (root / "meta/tasks.parquet").unlink(), "table of tasks is written again"),
-    "tasks whose text is no index": (tasks_as_column, "text as its index"),
+    "tasks whose text is not an index": (tasks_as_column, "text as its index"),
     "tasks numbered otherwise": (other_task_numbers, "numbered from 0, in order"),
-    "a copy beside the files": (stray, "file-000 (copy).parquet is left out"),
+    "a copy next to the files": (stray, "file-000 (copy).parquet is left out"),
 }  # fmt: skip
 """Fault, with a public report of it -> function that makes it, and part of the message about it."""
 
@@ -258,7 +258,7 @@ def test_an_old_dataset_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixtur
 
 @pytest.mark.slow
 def test_wrong_paths_a_camera_without_videos_and_counters_as_floats(tmp_path: Path) -> None:
-    """As in GR00T's demo data (paths, camera) and in fixtures of lerobot-studio (counters)."""
+    """Faults of GR00T's demo data (paths, camera) and of fixtures in lerobot-studio (counters)."""
     roots = [write_v21(tmp_path / name) for name in ("whole", "d")]
     for path in roots[1].glob("data/*/*.parquet"):
         table = pq.read_table(path)

@@ -295,7 +295,7 @@ def test_chosen_episodes_are_imported(
     assert exit_code("import", "lerobot", apart, "--out", tmp_path / "other") == 0
     for mine, name in zip(recordings(tmp_path / "run"), ("episode_000002.mcap", "episode_000003.mcap"), strict=True):
         assert mine.read_bytes() == (tmp_path / "other/episodes" / name).read_bytes()
-    # The same run takes the others later, as they are then.
+    # A later import adds the other episodes, in their current state, to the same run.
     assert exit_code("import", "lerobot", root, "--episodes", "0", "--out", tmp_path / "run") == 0
     assert [file.stem for file in recordings(tmp_path / "run")] == [f"episode_00000{number}" for number in (0, 2, 3)]
 

@@ -101,7 +101,7 @@ def test_the_expert_finishes_from_any_state(spoil: Spoil) -> None:
         assert steps[0].phase == HALT_PHASE
         assert failed_conditions(world, prepared) == []
         phases = {step.phase for step in steps}
-        assert ("approach" in phases) == (spoil is not carry_tilted), "what is held is not let go first"
+        assert ("approach" in phases) == (spoil is not carry_tilted), "the held object is not released first"
 
 
 @pytest.mark.parametrize(("phase", "after"), [("descend", "close"), ("lower", "release")])

@@ -25,7 +25,7 @@ from demorec.render import Renderer
 
 @dataclass(frozen=True, kw_only=True)
 class Bounds:
-    """What a renderer promises.
+    """Accuracy that a renderer guarantees.
 
     Attributes:
         depth_median, depth_p99: Of a plane, metres.

@@ -62,7 +62,7 @@ class Waning(Executor):
         return [attempt_episode("support.makers:make", plan, self.folder)]
 
     def interrupt(self) -> None:
-        raise AssertionError("nobody interrupts this run")
+        raise AssertionError("this run is not interrupted")
 
     def close(self) -> None:
         self.plans.clear()

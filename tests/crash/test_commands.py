@@ -107,7 +107,7 @@ class Case:
         return {name: comparable(self.folder / name) for name in files_of(self.folder) if not name.endswith(".lock")}
 
     def check_whole(self, told: object) -> None:
-        """Check that each target is absent, old or whole, and no new one beside an old one."""
+        """Check that each target is absent, old or whole, and that no new one exists next to an old one."""
         state = self.state()
         assert state.items() <= self.before.items() or state.items() <= self.after.items(), told
         if len(self.row.targets) == 1 and not self.row.resumes:

@@ -256,7 +256,7 @@ def test_what_stops_a_run_is_told_and_the_same_command_goes_on(
 def test_a_vanished_folder_is_told(tmp_path: Path) -> None:
     with pytest.raises(GenerationError, match="has vanished"):
         run_fake(tmp_path / "run", maker="lose_the_folder")
-    assert not (tmp_path / "run").exists(), "it must not be begun anew"
+    assert not (tmp_path / "run").exists(), "it must not be started again"
     assert num_finished(tmp_path / "elsewhere") > 0
 
 
@@ -289,7 +289,7 @@ def test_the_first_interrupt_lets_current_episodes_end(
     assert run.sessions[-1].state == "interrupted"
     assert len(run.successes) == num_finished(out) < 8
     assert_gone(workers)
-    assert not list((out / "unfinished").glob("*.part")), "what was begun has ended"
+    assert not list((out / "unfinished").glob("*.part")), "running attempts have ended"
     assert run_fake(out).run.digest == reference.run.digest
 
 

@@ -1,4 +1,4 @@
-"""Edits change only what they are asked to: every column, file and packet before and after, by PyArrow and libav."""
+"""Edits change nothing else: every column, file and packet before and after, by PyArrow and libav."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Bags as real recorders write them, written by third-party libraries: `rosbags`, `mcap`, `foxglove`.
 
-A layout makes plain messages first, so that a test can hurt them before they are written, and knows what is in the bag
+A layout makes plain messages first, so that a test can damage them before they are written, and knows the bag's content
 without reading it. Topics, types, joint names and rates are those of:
 
 - franka: franka_ros2's broadcasters and GELLO's leader arm at up to 1 kHz, realsense2_camera, rosbag2 with MCAP;

@@ -88,7 +88,7 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
                 stored = group.create_dataset(camera, (count, width), "uint8", chunks=(1, width))
                 for number, data in enumerate(row):
                     stored[number] = np.frombuffer(data.ljust(width, b"\0"), np.uint8)
-            # As ALOHA's recorders write it: float32, cameras in the order of their own list, which differs from the
+            # As ALOHA's recorders write it: float32, cameras in the order of a separate list, which differs from the
             # file's.
             lengths = [[len(data) for data in coded[camera]] for camera in reversed(ALOHA_CAMERAS)]
             file.create_dataset("compress_len", data=np.array(lengths), dtype="f4")

@@ -27,7 +27,7 @@ VULKAN_DRIVERS = Path("/usr/share/vulkan/icd.d")
 def need(missing: bool, reason: str) -> None:
     """Skip with the reason; in CI, where everything is installed, fail."""
     if missing and os.environ.get("CI") == "true":
-        pytest.fail(f"CI lacks what this test needs: {reason}")
+        pytest.fail(f"CI lacks a requirement of this test: {reason}")
     if missing:
         pytest.skip(reason)
 

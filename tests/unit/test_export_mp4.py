@@ -39,7 +39,7 @@ def encoded(
 def coded(
     codec: str, count: int, *, fps: int = 30, seed: int = 0, crf: int | None = None
 ) -> tuple[EncodedVideo, list[np.ndarray[Any, Any]]]:
-    """A video and what a decoder makes of its packets."""
+    """A video and the images that a decoder makes of its packets."""
     settings, packets = encoded(codec, count, fps=fps, seed=seed, crf=crf)
     video_packets = [
         VideoPacket(frame_index=i, time_ns=i, data=data, is_keyframe=is_keyframe(codec, data))

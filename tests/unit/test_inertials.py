@@ -95,7 +95,7 @@ def test_a_link_that_no_body_can_be_is_named(tmp_path: Path, text: str, sentence
 def test_a_frame_weighs_nothing_and_the_engine_is_not_heard(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    """By statics: the motor holds the arm of 2 kg, half a metre out, and not the frame a metre out."""
+    """A static test: the motor holds the arm of 2 kg, half a metre out, and not the frame a metre out."""
     file = tmp_path / "arm.urdf"
     monkeypatch.setattr("demorec.robots.inertials.asset_path", lambda name: file)
     monkeypatch.setattr("demorec.sim.bodies.asset_path", lambda name: file)

@@ -130,7 +130,7 @@ BRICK = Body(
 
 @pytest.fixture
 def with_models(tmp_path: Path) -> Path:
-    """A recording with a mesh and a URDF beside the table and the cube."""
+    """A recording with a mesh and a URDF in addition to the table and the cube."""
     info, frames, outcome = make_episode(num_frames=3, cameras=())
     info = with_simulation(
         info, scene=replace(info.simulated.scene, bodies=(*info.simulated.scene.bodies, DUCK, BRICK))

@@ -120,7 +120,7 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
         return found + [bytes(p) for p in context.encode(None)]
 
     assert plain("cpu-independent=1:asm=0") == packets
-    assert plain("asm=0") != plain(""), "these images would not tell"
+    assert plain("asm=0") != plain(""), "these images prove nothing"
     assert len(packets) == len(images)
 
 

@@ -1,4 +1,4 @@
-"""Shared by the plug-in's tests: no network, one thread per process."""
+"""Fixtures for the plug-in's tests: no network, one thread a process."""
 
 from __future__ import annotations
 
