@@ -271,8 +271,8 @@ def scaling(args: argparse.Namespace) -> dict[str, Any]:
     costs = {name: row["steady_cpu_s_per_episode"] + row["cpu_s_beside_per_episode"] for name, row in rows.items()}
     for name, row in rows.items():
         print(
-            f"{name:<22}attempts {row['steady_cpu_s_per_episode']:.3f} + overhead {row['cpu_s_beside_per_episode']:.4f} "
-            f"= {costs[name]:.3f} CPU s an episode"
+            f"{name:<22}attempts {row['steady_cpu_s_per_episode']:.3f} + overhead {row['cpu_s_beside_per_episode']:.4f}"
+            f" = {costs[name]:.3f} CPU s an episode"
         )
     one, two, ray = (costs.get(name) for name in OURS)
     if one and two:

@@ -57,7 +57,7 @@ def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_
 
 
 def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
-    """A calibration error is drawn again, independent of the seed; the recorded error leads to the camera's true pose."""
+    """The second calibration error is independent of the seed; as recorded, it leads to the camera's true pose."""
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
     assert (report.compared, report.differing) == (("front",), {})
