@@ -1,6 +1,6 @@
-"""What other packages may rely on: every name here keeps its meaning from one version to the next.
+"""The interface for other packages: every name here keeps its meaning from one version to the next.
 
-Names are loaded when they are used: importing this module costs nothing. Those of an extension need its folder.
+Names are loaded when they are used: importing this module costs nothing. Names of an extension need its folder.
 """
 
 from __future__ import annotations

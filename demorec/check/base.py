@@ -28,7 +28,7 @@ ADVICE: Mapping[Group, tuple[str, str]] = {
     "time": ("Streams and frames do not match.", "record it again: the file was changed, or written wrongly"),
     "images": ("Images are missing or damaged.", "record it again, or leave it out"),
     "run": ("The run differs from its run.json.", "run the command that began it again, or restore the files"),
-    "import": ("The run lacks lost data, or has it at another time.", "look at it: demorec view {path}"),
+    "import": ("Data is missing from the run, or has the wrong time.", "look at it: demorec view {path}"),
     "dataset": ("The dataset differs from the export.", "export it again"),
 }
 """Group -> why a fault matters, and what to do."""
@@ -76,7 +76,7 @@ class Check:
     Attributes:
         name: Its row in `demorec.core.tables.FILE_CHECKS`.
         group: Kind of fault.
-        on: Forms that it can check, apart from other needs.
+        on: Forms of subjects that it can check if the other requirements are met.
         needs: Required data, in a few words.
         measures: Meaning of the value, in words.
         unit: Unit of the value and the limits; "" for counts and ratios.

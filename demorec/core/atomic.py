@@ -51,7 +51,7 @@ def atomic_write(
 
     Args:
         target: Path of the result.
-        kind: Kind of the result, which decides what it may replace.
+        kind: Kind of the result, which decides the files that it may replace.
         overwrite: Whether the user asks for replacement.
         sources: Inputs of the result, which are never replaced.
 

@@ -31,7 +31,7 @@ PRESETS: Mapping[str, tuple[str, ...]] = {
     "av1": tuple(str(number) for number in range(14)),
     "jpeg": (),
 }  # fmt: skip
-"""Codec -> the presets of x264 and SVT-AV1, fastest first and last."""
+"""Codec -> its encoder presets: those of x264 begin with the fastest, those of SVT-AV1 with the slowest."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -65,11 +65,11 @@ class GenerateConfig:
     """All options that decide the content of an episode."""
 
     task: str = "pick_place"
-    """What the robot does: a name from `demorec list tasks`, or my_package.my_module:MyTask."""
+    """Task of the robot: a name from `demorec list tasks`, or my_package.my_module:MyTask."""
     fixed: bool = False
     """Use the task's single fixed layout instead of random ones, if it has one (tutorial)."""
     robot: str = "panda"
-    """Which arm: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
+    """Robot arm: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     seed: int = 0
     """Root seed of all randomness."""
     fps: int = 30
@@ -110,7 +110,7 @@ class GenerateConfig:
     joint_rate: Literal["control", "physics"] = "control"
     """Record joint states once per frame, or at every physics step."""
     max_attempts: int = 3
-    """How many scenes to try for an episode before giving it up."""
+    """Maximum number of scenes to try for an episode."""
     max_episode_seconds: float = 60.0
     """Simulated seconds after which an episode counts as failed."""
 
@@ -158,7 +158,7 @@ class GenerateConfig:
                 OBJECTS.check_name(name, allowed)
 
     def validate(self) -> None:
-        """Check all values that need nothing heavy to be loaded; the config must be the user's own.
+        """Check all values that can be checked without heavy imports; the config must be the user's own.
 
         Raises:
             ConfigError: The first impossible value and the allowed ones.

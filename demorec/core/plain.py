@@ -22,7 +22,7 @@ from demorec.core.geometry import Pose
 _converter = make_converter(forbid_extra_keys=True)
 
 MAX_DEPTH = 64
-"""Maximum nesting of lists and objects: our own data need ten at most, and deeper ones would overflow recursive code.
+"""Maximum nesting of lists and objects: demorec's data need at most ten, and deeper data would overflow recursive code.
 """
 _MAX_DIGITS = 20
 """Maximum digits of a whole number; 64 bits need at most 20."""
@@ -134,7 +134,7 @@ def parse_json(text: str, *, allow_nan: bool = False) -> Any:
         them.
 
     Raises:
-        ValueError: Not JSON, nested deeper than `MAX_DEPTH`, or an integer over 64 bits; our own files have neither.
+        ValueError: Not JSON, nested deeper than `MAX_DEPTH`, or an integer over 64 bits; demorec's files have neither.
     """
     try:
         value = json.loads(text, parse_int=_whole_number, parse_constant=float if allow_nan else _refuse_constant)

@@ -71,7 +71,7 @@ class Registry[T]:
         return tuple(self.rows)
 
     def target(self, name: str) -> str:
-        """Return "module:attribute" of a name, which is the name itself for a thing of the user's own."""
+        """Return "module:attribute" of a name, which is the name itself for a user's object."""
         return self.rows.get(name, name)
 
     def check_name(self, name: str, allowed: Iterable[str] = ()) -> None:

@@ -23,7 +23,9 @@ _SHOWN = 5
 """Maximum foreign files in an error message."""
 _ASIDE = ".demorec-replaced"
 _MARK = "what-this-is.txt"
-_MARK_TEXT = "What --overwrite replaces. demorec removes this folder when the new is in place, or puts it back.\n"
+_MARK_TEXT = (
+    "Content that --overwrite replaces. demorec deletes this folder once the new content is complete, or restores it.\n"
+)
 
 
 @dataclass(frozen=True, kw_only=True)

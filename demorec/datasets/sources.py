@@ -16,7 +16,7 @@ from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 def find_recordings(paths: Sequence[Path]) -> list[Path]:
     """Return the recordings in files, runs (folders with episodes/) and folders of recordings, in order.
 
-    Those of failed attempts are included.
+    Recordings of failed attempts are included.
 
     Raises:
         ConfigError: A path is missing, holds no recording, or the same recording is given twice.

@@ -40,7 +40,7 @@ class SensorStream:
         topic: Topic of the messages.
         layout: "wrench" for three forces and three torques (geometry_msgs/WrenchStamped), "array" for any vector
             (std_msgs/Float64MultiArray).
-        frame: Link along the axes of which a wrench's vectors are given.
+        frame: Link in whose axes the vectors of a wrench are given.
     """
 
     topic: str
@@ -62,7 +62,6 @@ class Feature:
         source: Its origin, in words: "/joint_states position, latest before, header stamps".
         calibration: For each element a factor and an offset, for servos with other units: factor times the value plus
             offset is rad or m; empty if the unit suffices.
-            that say something else; empty where the unit says it.
         role: Role that its name does not imply; "" if its common name does (`demorec.episode.roles`).
         stream: Messages of a simulated sensor; None for any other feature.
     """

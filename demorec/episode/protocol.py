@@ -29,7 +29,7 @@ class SceneMotion:
         joint_position: Joint of the URDF -> (T,) rad or m.
         base_from_tcp: (T, 7), None if unknown.
         object_poses: Name -> (T, 7), world_from_object.
-        end_poses: Name -> (7,) pose of an object at the end, for sources that may not know its path.
+        end_poses: Name -> (7,) pose of an object at the end, for sources that may not know its trajectory.
         world_from_camera: Name -> (T, 7).
     """
 

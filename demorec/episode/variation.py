@@ -26,8 +26,8 @@ def _within(low: float, high: float, *, none: _Value = None, mild: _Value = None
 
     Args:
         low, high: Limits for the user.
-        none, mild, full: Default in the preset of that name; if missing, as in the previous one, and in "none" decided
-            by the task.
+        none, mild, full: Default in the preset of that name. A missing one equals that of the previous preset; if it is
+            missing in "none", the task decides.
     """
     mild = none if mild is None else mild
     presets = {"none": none, "mild": mild, "full": mild if full is None else full}
@@ -71,7 +71,7 @@ class Ranges:
     """Lift height above the grasp, m."""
     grasp_offset: Range | None = _within(-0.015, 0.015, none=(0.0, 0.0), full=(-0.005, 0.005))
     """Shift of the grasp along the fingers' faces, m."""
-    # Clean demonstrations hardly teach: a policy that leaves their narrow path has never seen the way back. Noise of
+    # Clean demonstrations teach little: a policy that leaves their narrow path has never seen the way back. Noise of
     # 0.02 rad with clean labels tripled the success of behaviour cloning (15 to 45 of 50).
     action_noise: Range | None = _within(0.0, 0.06, none=(0.0, 0.0), mild=(0.02, 0.02), full=(0.01, 0.025))
     """Standard deviation of the noise on executed joint targets, rad; labels stay clean."""

@@ -175,7 +175,7 @@ def _joint(source: ET.Element, scale: float) -> ET.Element:
             continue
         copy = ET.SubElement(joint, child.tag, dict(child.attrib))
         if child.tag == "origin" and scale != 1.0:
-            # Every bit, since kinematics is computed from this; a single product is the same on every CPU.
+            # All digits, since kinematics is computed from this; a single product is the same on every CPU.
             copy.set("xyz", " ".join(repr(float(v) * scale) for v in child.get("xyz", "0 0 0").split()))
         if child.tag == "limit" and scale != 1.0 and joint.get("type") == "prismatic":
             for bound in ("lower", "upper"):

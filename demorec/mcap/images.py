@@ -80,7 +80,7 @@ def read_pixel_statistics(data: bytes) -> PixelStatistics:
     """Decode the message of `pixel_statistics`."""
     values = decode(messages.INT64_ARRAY, data)[0]["data"]
     if len(values) != 1 + 3 * 256 or not ((values >= 0) & (values < _MOST_PIXELS)).all():
-        raise ValueError("a histogram of other numbers than counts")
+        raise ValueError("a histogram whose numbers are not counts")
     return PixelStatistics(num_images=int(values[0]), counts=values[1:].reshape(3, 256).copy())
 
 

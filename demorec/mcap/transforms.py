@@ -1,7 +1,7 @@
 """The coordinate frames of an episode (ROS: TF): their tree, and the motion of the moving ones.
 
-Every link of a described robot, every body and every camera with a pose is a frame. Those moved by joints or physics
-are on `/tf` at each frame, the rest on `/tf_static`.
+Every link of a described robot, every body and every camera with a pose is a frame. Frames moved by joints or physics
+are on `/tf` at each time step, the rest on `/tf_static`.
 """
 
 from __future__ import annotations

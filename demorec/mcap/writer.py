@@ -99,7 +99,7 @@ class BatchWriter(Closing, ABC):
 
     @abstractmethod
     def flush(self) -> None:
-        """Write everything complete, which then survives the end of this process.
+        """Write all complete frames, which then survive the end of this process.
 
         Raises:
             RecordingError: The disk is full or gone.

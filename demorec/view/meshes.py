@@ -1,7 +1,7 @@
 """Appearance of the robot and the objects: triangles with normals and colours, from URDF and mesh files.
 
-Mesh files are simplified once and kept in the user's cache folder: the original robot has 100,000 triangles, of which a
-laptop or browser shows at most a tenth with visible effect.
+Mesh files are simplified once and kept in the user's cache folder: the original robot has 100,000 triangles, ten
+times as many as make a visible difference.
 """
 
 from __future__ import annotations

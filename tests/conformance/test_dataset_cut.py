@@ -40,7 +40,7 @@ def test_parts_at_given_frames(video: bool, tmp_path: Path, capsys: pytest.Captu
     assert "episode 0: 3 parts of 12 frames, 0:5, 5:9, 9:12" in told
     assert "6 parts of 3 episodes, 39 of 39 frames" in told
     # A group of pictures has two images, so a part that begins inside one keeps the keyframe before it.
-    assert ("2 images beside cuts stay in the videos" in told) == video
+    assert ("2 images next to cuts stay in the videos" in told) == video
     whole, found = items(root), items(tmp_path / "new")
     expected = [*parts_of(whole[0], 0, 5, 9, 12), whole[1], *parts_of(whole[2], 0, 6, 14)]
     assert [same(a, b) for a, b in zip(found, expected, strict=True)] == [True] * 6

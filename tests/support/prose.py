@@ -9,21 +9,21 @@ from pathlib import Path
 from typing import NamedTuple
 
 MAX_WORDS = 35
-SIGNALS = {
-    "begins with a preposition or a pronoun": r"^(Of|By which|As of|From which|In which|Whose|That|Those|Which|Theirs)\b",
-    "what-clause instead of a noun": r"(?i)\bwhat (is|was|are|were|it|they|has|had|comes|came|remains|stays)\b",
-    "chain of that": r"\b(that|which)\b.*\b(that|which)\b.*\b(that|which)\b",
-    "data that speaks": r"\b(tells?|told)\b",
-    "is no": r"\b(is|are) (no|none)\b(?! more|thing| longer)",
+PATTERNS = {
+    "preposition or pronoun first": r"^(Of|By which|As of|From which|In which|Whose|That|Those|Which|Theirs)\b",
+    "what-clause": r"\b[Ww]hat (is|was|are|were|it|they|has|had|comes|came|remains|stays)\b",
+    "chain of relative clauses": r"\b(that|which)\b.*\b(that|which)\b.*\b(that|which)\b",
+    "data that tells": r"\b(tells?|told)\b",
+    "is no": r"\b(is|are) (no|none)\b(?! more| longer)",
     "lies, stands, goes": r"\b(lies|stands|goes)\b",
-    "whoever": r"\b(whoever|somebody|anybody|nobody)\b|of (ours|one's own|theirs)\b",
+    "whoever": r"\b(whoever|somebody|anybody|nobody)\b|\bof (ours|theirs|one's own)\b",
     "anew, beside": r"\b(anew|beside|shall|from which on)\b",
 }
-"""Sign of an odd sentence -> pattern."""
+"""Sign of an odd sentence -> its pattern; a sign asks for a second reading."""
 
 
-class Flagged(NamedTuple):
-    """An odd sentence, where it begins, and its signs."""
+class OddSentence(NamedTuple):
+    """A sentence with signs, and the line at which its text begins."""
 
     path: Path
     line: int
@@ -33,21 +33,21 @@ class Flagged(NamedTuple):
 
 def signs_of(sentence: str) -> tuple[str, ...]:
     """Name the signs of a sentence; empty for a good one."""
-    found = [name for name, pattern in SIGNALS.items() if re.search(pattern, sentence)]
+    found = [sign for sign, pattern in PATTERNS.items() if re.search(pattern, sentence)]
     return (*found, *(["too long"] if len(sentence.split()) > MAX_WORDS else []))
 
 
-def read(paths: Iterable[Path]) -> tuple[list[Flagged], int]:
+def read(paths: Iterable[Path]) -> tuple[list[OddSentence], int]:
     """Read Python and Markdown files; return the odd sentences and the number of all sentences."""
-    flagged, count = list[Flagged](), 0
+    odd, count = list[OddSentence](), 0
     for path in paths:
         texts = _markdown if path.suffix == ".md" else _python
         for line, text in texts(path.read_text(encoding="utf-8")):
             for sentence in _sentences(text):
                 count += 1
                 if signs := signs_of(sentence):
-                    flagged.append(Flagged(path, line, signs, sentence))
-    return flagged, count
+                    odd.append(OddSentence(path, line, signs, sentence))
+    return odd, count
 
 
 def _python(source: str) -> Iterator[tuple[int, str]]:
@@ -55,16 +55,21 @@ def _python(source: str) -> Iterator[tuple[int, str]]:
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
             yield node.lineno, node.value
-    for comment in re.finditer(r"(?:^ *# .*\n)+|(?<=  )# .*", source, flags=re.M):
-        yield source[: comment.start()].count("\n") + 1, re.sub(r"(?m)^ *# ", "", comment[0])
+    for comment in re.finditer(r"(?m)(?:^ *# .*\n)+|(?<=  )# .*", source):
+        yield _line(source, comment), re.sub(r"(?m)^ *# ", "", comment[0])
 
 
 def _markdown(source: str) -> Iterator[tuple[int, str]]:
-    """(line, text) of paragraphs and table cells, without code."""
-    prose = re.sub(r"^ *```.*?^ *```|^(?: {4,}|!\[|<).*?$", lambda code: "\n" * code[0].count("\n"), source, flags=re.M | re.S)
-    for paragraph in re.finditer(r"\S.*?(?=\n\s*\n|\n\||\n *[-*\d]+\.? |\Z)", prose, flags=re.S):
-        for cell in paragraph[0].split("|"):
-            yield prose[: paragraph.start()].count("\n") + 1, re.sub(r"`[^`]*`", "X", cell)
+    """(line, text) of paragraphs, items of lists and table cells, without code."""
+    code = r"(?ms)^ *```.*?^ *```$|^(?: {4}|!\[|<)[^\n]*$"
+    prose = re.sub(code, lambda found: "\n" * found[0].count("\n"), source)
+    for block in re.finditer(r"(?s)\S.*?(?=\n\s*\n|\n\||\n *[-*] |\n *\d+\. |\Z)", prose):
+        for cell in block[0].split("|"):
+            yield _line(prose, block), re.sub(r"`[^`]*`", "X", cell)
+
+
+def _line(source: str, found: re.Match[str]) -> int:
+    return source.count("\n", 0, found.start()) + 1
 
 
 def _sentences(text: str) -> Iterator[str]:

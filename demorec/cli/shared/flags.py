@@ -93,7 +93,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     except SystemExit as end:
         page, write = (err, tell) if end.code else (out, say)
         page.seek(0)
-        write(*_laid_out(page.read(), terminal_width()))  # tyro repeats what it does not understand as it is
+        write(*_laid_out(page.read(), terminal_width()))  # tyro repeats unknown words unescaped
         if asks_for_help and any(hidden.values()):
             say(f"{prog} {_HELP_ALL} shows {sum(hidden.values())} more options.")
         for word in args if end.code else ():

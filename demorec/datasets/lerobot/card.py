@@ -53,9 +53,9 @@ _SIMULATED_MEANING = {
     REWARD: "1 at the last frame of a success, else 0",
     SUCCESS: "true at the last frame of a success",
     INTERVENTION: "true where the expert acts in an episode that a policy began; its other frames are the policy's",
-    PERSISTENT: "what is said of the episode, each entry from its `timestamp` on until the next one of its style; all "
-    "of it in every row",
-    EVENTS: "what is said at this row alone",
+    PERSISTENT: "statements about the episode, each valid from its `timestamp` until the next one of its style; all of "
+    "them in every row",
+    EVENTS: "statements of this row alone",
 }
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
@@ -228,8 +228,8 @@ def _robot_section(root: Path) -> Iterable[str]:
         names = ", ".join(f"`{path.relative_to(root).as_posix()}`" for path in urdfs)
         yield ""
         yield (
-            f"The robot as a URDF: {names}. The JSON file beside it says which element of which feature moves which of "
-            "its joints (`joints`), and, of a simulated robot, its TCP link, limits and gripper (`spec`)."
+            f"The robot as a URDF: {names}. The JSON file next to it maps the elements of features to its joints "
+            "(`joints`) and, for a simulated robot, has its TCP link, limits and gripper (`spec`)."
         )
 
 
@@ -271,7 +271,7 @@ def _success_section(root: Path) -> Iterable[str]:
     yield "## Success"
     yield ""
     if num_unknown := len(rows) - total:
-        yield f"Of {num_unknown} episodes nobody said whether they succeeded."
+        yield f"Episodes with an unknown outcome: {num_unknown}."
         yield ""
     if not total:
         return

@@ -106,7 +106,7 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
 
 
 def elsewhere(root: Path, path: Path, key: str) -> Path | None:
-    """Find the only file with this name, for a camera in a folder with its name, if info.json names other folders."""
+    """Find the only file with this name (for a camera, in a folder named after it) where info.json is wrong."""
     found = [other for other in root.rglob(path.name) if not key or key in other.relative_to(root).parts]
     if len(found) > 1:
         found = [other for other in found if other.parent.name == path.parent.name]
@@ -130,7 +130,7 @@ def _old_rows(root: Path, info: DatasetInfo) -> Iterator[tuple[Path, dict[str, A
 
 
 def _check_row(row: dict[str, Any], path: Path) -> None:
-    """Raise ExportError if a row of the episodes' table has values that no position can have."""
+    """Raise ExportError if a row of the episodes' table has impossible positions."""
     for name, value in row.items():
         if name == "tasks":
             is_good = isinstance(value, list) and all(isinstance(task, str) for task in value)
@@ -162,7 +162,7 @@ def read_tasks(root: Path) -> list[str]:
 
 
 def _by_number(rows: Sequence[tuple[object, object]], path: Path) -> list[str]:
-    """Put tasks at their numbers, with "" for numbers that no task has."""
+    """List the tasks by number, with "" for missing numbers."""
     found: dict[int, str] = {}
     for number, task in rows:
         if not isinstance(number, int) or not 0 <= number < len(rows) + _MAX_TASK_GAPS:

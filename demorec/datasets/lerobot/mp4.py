@@ -34,7 +34,7 @@ class Stored:
     """Location of encoded images in a file.
 
     Attributes:
-        path: Of the file.
+        path: Path of the file.
         spans: (begin, bytes) of the consecutive parts.
         is_own: Whether the file has no other content and is deleted once the images are written.
     """

@@ -22,7 +22,7 @@ _RECORDED: Mapping[str, Literal["float32", "float64"]] = {
 NOT_HELD = "imported recordings hold none"
 _NEXT: Mapping[str, str] = {
     "next.success": "its last value becomes the outcome of the episode",
-    "next.done": "an export writes it anew, true in the last row of an episode",
+    "next.done": "an export computes it again: true in the last row of an episode",
     "next.reward": "imported recordings hold an outcome, and no rewards",
 }
 """Columns of LeRobot's environments -> their treatment in an import."""

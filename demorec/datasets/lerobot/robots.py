@@ -70,8 +70,8 @@ class RobotRecord:
     def described(self, feature: Feature, usual_name: str = "") -> Feature:
         """Return a feature with its joints, units and calibration, if they fit its elements.
 
-        feature: Description in the dataset.
-            feature: As the dataset describes it.
+        Args:
+            feature: Description in the dataset.
             usual_name: Name for the lookup if its own name is unknown; "" for none.
         """
 
@@ -142,7 +142,7 @@ def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """Return the row of `ROBOTS` with joints named like the elements of observation.state, such as "panda_joint1.pos".
 
     For datasets without a description of the robot; lengths are those of the model. LeRobot's own arms are left out
-    unless the gripper's name implies metres: their joints have the same names in degrees and in shares of their ranges.
+    unless the gripper's name implies metres: their joints have the same names in degrees and in percent.
     """
     from demorec.mcap.description import robot_description  # loads all code for reading recordings
 

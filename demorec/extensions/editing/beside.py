@@ -1,4 +1,4 @@
-"""Files beside an edited dataset's tables, and the data of its sources that it omits.
+"""Files next to an edited dataset's tables, and the data of its sources that it omits.
 
 These are the sidecar's rows, robots, attempts, camera poses, boxes and progress. Omissions are known before anything is
 written.
@@ -101,7 +101,7 @@ def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.
 
 
 class SidecarReader:
-    """Files beside one source's tables, for the episodes of a plan.
+    """Files next to one source's tables, for the episodes of a plan.
 
     Args:
         plan: The new dataset.

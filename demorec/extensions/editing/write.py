@@ -86,8 +86,8 @@ def write_plan(
         progress: Called after every episode.
 
     Returns:
-        Number of episodes whose images were decoded for their statistics, and number of images beside cuts that stay in
-        the videos because others are decoded from them.
+        Number of episodes whose images were decoded for their statistics, and number of images next to cuts that stay
+        in the videos because others are decoded from them.
 
     Raises:
         ExportError: A source is damaged.

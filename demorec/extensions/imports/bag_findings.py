@@ -83,7 +83,7 @@ def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
 
 
 def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
-    """Header times that are simulated or from a clock that was never set, and that the rows use."""
+    """Header times of a simulated or unset clock that the rows use."""
     known = [line for line in _of_another_epoch(lines) if line.is_header]
     if known:
         years = float(np.median([np.median(line.skews_ns) for line in known])) / NS / _YEAR_S
@@ -99,7 +99,7 @@ def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Findi
     skews = [float(np.median(line.skews_ns)) / NS for line in lines if line.is_header]
     if not skews or abs(usual := float(np.median(skews))) <= SKEW_S:
         return
-    text = f'goes by times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
+    text = f'is on times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
     for line in (line for line in lines if not line.is_header):
         yield of_stream(line.stream, "clock_offset", text)
     for topic, texts in bag.streams.texts.items():

@@ -61,7 +61,7 @@ def import_hdf5(
         Hdf5Error: A file cannot be read, or does not fit the mapping.
         RecordingError: The disk is full or gone.
     """
-    assert mapping_path is not None, "whoever calls asks for it"
+    assert mapping_path is not None, "the caller requires it"
     mapping = read_mapping(mapping_path, "hdf5")
     urdf = urdf_text(mapping, mapping_path)
     for path in paths:

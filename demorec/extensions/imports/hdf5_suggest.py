@@ -111,7 +111,7 @@ class _Contents:
 def summarize_hdf5(path: Path) -> dict[str, Any]:
     """Summarise a file for `demorec info --json`: episodes, rate, and datasets of the first episode.
 
-    Of an unknown layout all datasets are listed, and the number of episodes is None.
+    For an unknown layout all datasets are listed, and the number of episodes is None.
 
     Raises:
         Hdf5Error: It cannot be read.
@@ -165,7 +165,7 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
             )
         places = episode_places(file, Episodes(group=layout.group))
         contents = _Contents(file, places[0])
-        lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
+        lines = [f"# A mapping for {path.name}, suggested from its content; docs/import.md explains every key.", "#"]
         lines += [*_listed(contents, len(places)), *_last_row(contents, layout), "", *_left_out(contents, layout)]
         lines += ["[robot]", f"name = {quoted(_robot(contents, layout))}", *_model(contents), ""]
         lines += ["[task]", *_task(contents, path), ""]
@@ -178,9 +178,9 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
 
 
 def _listed(contents: _Contents, count: int) -> Iterator[str]:
-    """Every dataset of the first episode with its shape and first numbers."""
+    """Yield lines for every dataset of the first episode with its shape and first numbers."""
     where = f"{contents.place}, the first of {count} episodes" if contents.place else "the file, which is an episode"
-    yield f"# What is in {where}:"
+    yield f"# Content of {where}:"
     for name, array in contents.arrays.items():
         length = " of variable length" if array.is_ragged else ""
         yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}{length}"

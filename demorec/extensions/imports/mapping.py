@@ -228,9 +228,9 @@ class Episodes:
 
 @dataclass(frozen=True, kw_only=True)
 class SourceMapping:
-    """A whole mapping.
+    """A complete mapping.
 
-    A complete mapping.
+    Attributes:
         kind: Kind of its sources.
         robot, task, subtasks, clock, episodes: See these classes.
         features: Name of a feature -> its sources, in order.

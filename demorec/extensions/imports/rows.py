@@ -156,7 +156,8 @@ class Timelines:
     def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> tuple[Numbers, Int]:
         """Return the first `count` rows (R, D) of a feature and their timestamps.
 
-        float32 if all sources are, otherwise float64. A source that is a feature's next row is sampled one row later.
+        The rows are float32 if all sources are, otherwise float64. A source that is a feature's next row is sampled one
+        row later.
         """
         values, ages = [], []
         for index, source in enumerate(self.mapping.features[name]):

@@ -101,7 +101,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
             for candidate in of_publishers(found, list(topic.publishers))
         ]
     )
-    lines = [f"# A mapping for {path.name}, suggested from what is in it; docs/import.md explains every key.", "#"]
+    lines = [f"# A mapping for {path.name}, suggested from its content; docs/import.md explains every key.", "#"]
     if not choice.state:
         warning = (
             "No topic was recognised as the state of an arm or a base: write its source from the topics that the "
@@ -190,7 +190,7 @@ def _head(values: Values) -> ImageHead | None:
 
 def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
     """Yield lines for every topic with its type, rate, count and first values."""
-    yield "# What is in it:"
+    yield "# Content:"
     for name, topic in sorted(topics.items()):
         rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
         stamp = "" if topic.has_stamp else ", no times in its headers"

@@ -58,7 +58,7 @@ class RolloutFlags:
     objects: tuple[str, ...] = ()
     """Shelves that the task draws from, as in generate-dataset."""
     object_split: Split = "all"
-    """Which shapes of the shelves: eval has those that generate-dataset --object-split train leaves out."""
+    """Shapes of the shelves: eval has those that generate-dataset --object-split train leaves out."""
     cameras: tuple[str, ...] = ()
     """Your own cameras that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
     num_episodes: int = 50

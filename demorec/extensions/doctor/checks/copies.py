@@ -105,7 +105,7 @@ def shared_pieces(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _shared(episode: EpisodeEvidence, size: int, first_seen: dict[bytes, tuple[int, int]]) -> Mapping[int, list[int]]:
-    """Find earlier episode, or this one -> first frames of the shared windows; also registers new windows."""
+    """Map earlier episodes, and this one, to the first frames of shared windows; also register new windows."""
     rows = _digests(episode)
     found: dict[int, list[int]] = defaultdict(list)
     moving = np.flatnonzero([one != two for one, two in pairwise(rows)])

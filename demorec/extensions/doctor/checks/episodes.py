@@ -26,7 +26,7 @@ MIN_END_SPEED = 0.8
 MAX_REST_SPEED = 0.3
 """Maximum final speed, relative to the same, of an episode that ends at rest."""
 MIN_RESTING_SHARE = 0.8
-"""Minimum ratio of other episodes that end at rest, so that one that does not counts as cut off."""
+"""Minimum ratio of other episodes ending at rest for a moving end to count as cut off."""
 END_S = 0.2
 MIN_IDLE_S = 3.0
 """Minimum idle time at an end, seconds, that is worth trimming."""

@@ -40,7 +40,7 @@ def folder_of(evidence: Evidence) -> LeRobotFolder:
     needs="a LeRobot dataset",
     measures="episodes with unreadable rows",
     unit="episodes",
-    why="Training ends with an error, or the rows of another episode are taken.",
+    why="Training ends with an error, or reads rows of another episode.",
     do="download or record it again, or drop the episode: " + DROP,
 )
 def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
@@ -339,7 +339,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
     needs="a LeRobot dataset",
     measures="files that nothing refers to",
     unit="files",
-    why="They fill the disk and the download; merges, deleted episodes and renamed cameras leave them.",
+    why="They enlarge the disk usage and the download; merges, deleted episodes and renamed cameras leave them behind.",
     do="demorec dataset select {path} --where 'num_frames > 0' --out NEW copies only used files",
 )
 def unused_files(evidence: Evidence) -> Iterator[Fault]:

@@ -17,7 +17,7 @@ from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.view_fit import MAX_UNRELATED_RATIO, MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
 
 MIN_EXPLAINED = 0.35
-"""Minimum usual ratio of the images' variance explained by the state, for a camera to be judged."""
+"""Minimum ratio of the images' variance that the state usually explains, for a camera to be judged."""
 MAX_SET_LAG_S = 0.3
 """Maximum usual delay of images after the state: cameras need 30 to 150 ms."""
 MIN_SHIFT = 1.5
@@ -26,7 +26,7 @@ MIN_GAIN = 1.4
 """Minimum factor by which an episode's own lag reduces the unexplained variance, compared with the usual one."""
 
 MIN_OTHER_RATIO = 0.5
-"""Minimum ratio, of the variance usually explained by the state, that another episode's state must explain."""
+"""Minimum part of the usually explained variance that another episode's state must explain."""
 MIN_OTHER_GAIN = 2.0
 """Minimum factor by which the state of another episode reduces the unexplained variance, relative to the largest such
 factor of episodes whose own state explains the images as usual."""

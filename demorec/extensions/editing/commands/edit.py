@@ -101,7 +101,7 @@ class Edit:
             say(*_changes(plan))
             self._print_result("", name, plan, "Left out")
             if around:
-                say(f"{counted(around, 'image')} beside cuts stay in the videos, because others need them.")
+                say(f"{counted(around, 'image')} next to cuts stay in the videos, because others need them.")
             if decoded:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
@@ -208,5 +208,5 @@ def pairs(words: Sequence[str], example: str) -> dict[str, str]:
     found = dict(word.partition("=")[::2] for word in words)
     if not words or any("=" not in word for word in words) or len(found) != len(words):
         given = f", not {' '.join(words)!r}" if words else ""
-        raise ConfigError(f"Each name is given once, with what it gets: {example}{given}.")
+        raise ConfigError(f"Each name is given once, with its value: {example}{given}.")
     return found
