@@ -223,13 +223,13 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
 def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
     """Streams of numbers with many messages in no row; cameras, if any, decide the rows."""
     for line in (line for line in lines.lines.values() if line.stream.names and line.is_regular):
-        num_used = num_messages = 0
+        num_unused = num_messages = 0
         for rows in episodes:
-            shown = line.chosen(rows.table.time_ns).index
-            num_used += len(np.unique(shown))
-            num_messages += int(shown[-1] - shown[0]) + 1
-        if num_messages - num_used > RATE * num_messages:
-            share = 100 * (num_messages - num_used) / num_messages
+            chosen = line.chosen(rows.table.time_ns)
+            num_unused += chosen.num_unused
+            num_messages += int(np.ptp(chosen.index)) + 1
+        if num_unused > RATE * num_messages:
+            share = 100 * num_unused / num_messages
             text = (
                 f"{share:.3g} % of its messages are in no row, since it comes {NS / line.period_ns:.1f} times a second "
                 f"and rows {lines.mapping.clock.fps} times"

@@ -157,6 +157,12 @@ class ChosenSamples:
     age_ns: Int
     reach_ns: Int
 
+    @property
+    def num_unused(self) -> int:
+        """Number of messages from the first to the last of the rows that none of them takes; all have one."""
+        used = self.index if self.fraction is None else np.append(self.index, self.index[self.fraction > 0] + 1)
+        return int(used.max() - used.min()) + 1 - len(np.unique(used))
+
 
 def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
     """Choose the messages for some rows.

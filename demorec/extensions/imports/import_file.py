@@ -99,11 +99,12 @@ def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str,
     """Return the figures of a stream by their column in the report's table.
 
     The skew is the median of log time minus header time, the jitter the deviation of the steps without lost messages,
-    and the age that of the oldest message in any row.
+    the age that of the oldest message in any row, and unused messages are in no row.
     """
     steps = np.diff(line.times_ns)
     usual = steps[(steps > 0.4 * line.period_ns) & (steps < 1.6 * line.period_ns)]
-    ages = [line.chosen(rows.table.time_ns).reach_ns.max() for rows in episodes]
+    chosen = [line.chosen(rows.table.time_ns) for rows in episodes]
+    ages = [choice.reach_ns.max() for choice in chosen]
     return {
         "stream": line.stream.label,
         "topic": line.stream.topic,
@@ -115,6 +116,7 @@ def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str,
         "longest ms": f"{steps.max(initial=0) / 1e6:.1f}",
         "lost": str(int(lost_in(line).sum()) if line.is_regular else 0),
         "age ms": f"{max(ages) / 1e6:.1f}" if ages else "-",
+        "unused": str(sum(choice.num_unused for choice in chosen)),
     }
 
 

@@ -6,7 +6,7 @@ import json
 import math
 import re
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -21,11 +21,15 @@ from demorec.extensions.imports.clock import NS, SKEW_S
 from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
 from demorec.extensions.imports.fields import FieldError, follow, stamp_of
 from demorec.extensions.imports.image_messages import ImageHead, NoColorError, image_head
-from demorec.extensions.imports.mapping import Clock
+from demorec.extensions.imports.mapping import MAX_FPS, Clock
 from demorec.extensions.imports.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
 
+_USUAL_FPS = 30
+"""Suggested rate of a bag without a stream of known rate."""
+_MIN_GRID_RATIO = 0.995
+"""Minimum rate of rows, relative to that of a stream of which they hold nearly every message."""
 _MAX_DECODED = 64
 """Maximum messages of a topic that are decoded."""
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
@@ -49,6 +53,7 @@ class _Topic(TopicSummary):
         has_stamp: Whether headers have a time.
         skew_ns: Log time minus header time of the first message.
         problem: Reason why no message can be read; "" otherwise.
+        stamp: Times that rows use, "header" or "log".
     """
 
     name: str
@@ -60,15 +65,17 @@ class _Topic(TopicSummary):
     has_stamp: bool = True
     skew_ns: int = 0
     problem: str = ""
+    stamp: str = "header"
 
     @property
     def is_text(self) -> bool:
         """Whether its messages are texts."""
         return self.first is not None and self.head is None and isinstance(self.first.get("data"), str)
 
-    def rate_by(self, stamp: str) -> float:
+    @property
+    def row_rate_hz(self) -> float:
         """Rate by the times that rows use; simulated time runs slower or faster than log time."""
-        if stamp == "log" or not self.has_stamp or len(self.stamps_ns) < 3:
+        if self.stamp == "log" or not self.has_stamp or len(self.stamps_ns) < 3:
             return self.rate_hz
         steps = np.diff(np.unique(self.stamps_ns))
         usual = steps[np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)]  # without pauses
@@ -117,7 +124,9 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
-    lines += ["", "[clock]", *_clock(topics, cameras, [*choice.state, *choice.action])]
+    parts = [*choice.state, *choice.action]
+    is_mixed = _set_stamps(topics, {*cameras.values(), *(part.topic for part in parts)})
+    lines += ["", "[clock]", *_clock(topics, cameras, parts, is_mixed=is_mixed)]
     lines += [*_subtasks(topics), *_features(choice, topics)]
     for camera, topic in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}"]
@@ -250,22 +259,37 @@ def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
         yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts say what the robot does")
 
 
-def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[Candidate]) -> list[str]:
-    mapped = {*cameras.values(), *(part.topic for part in parts)}
+def _set_stamps(topics: Mapping[str, _Topic], mapped: Collection[str]) -> bool:
+    """Choose header or log times for all topics; return whether log times replace some headers."""
     skews = [topics[name].skew_ns for name in mapped if topics[name].has_stamp]
     # One clock for all if header times are far from log times and some topics have only the latter.
     is_mixed = 0 < len(skews) < len(mapped) and abs(float(np.median(skews))) > SKEW_S * NS
-    stamp = "log" if is_mixed or not skews else "header"
-    rates = {topic: topics[topic].rate_by(stamp) for topic in cameras.values() if topics[topic].rate_hz}
+    for topic in topics.values():
+        topic.stamp = "log" if is_mixed or not skews else "header"
+    return is_mixed
+
+
+def _clock(
+    topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[Candidate], *, is_mixed: bool
+) -> list[str]:
+    rates = {topic: topics[topic].row_rate_hz for topic in cameras.values() if topics[topic].rate_hz}
     heads = {topic: topics[topic].head for topic in rates}
     colour = {
         topic: rate for topic, rate in rates.items() if (head := heads[topic]) and head.encoding not in DEPTH_UNITS
     }
     colour = colour or rates
     slowest = min(colour, key=lambda topic: colour[topic], default="")
-    part_rates = [hz for part in parts if (hz := topics[part.topic].rate_by(stamp))]
-    rate = colour.get(slowest, min([30.0, *part_rates]))
-    lines = [f"fps = {max(1, round(rate))}"]
+    part_rates = {part.topic: hz for part in parts if (hz := topics[part.topic].row_rate_hz)}
+    rate = colour[slowest] if slowest else min(part_rates.values(), default=_USUAL_FPS)
+    fps = max(1, round(rate))
+    if not slowest:  # rows are on a grid, which loses no message if it is as fast
+        fps = min(fps + (fps < _MIN_GRID_RATIO * rate), MAX_FPS)
+    lines = [f"fps = {fps}"]
+    if not slowest:
+        for topic, hz in part_rates.items():
+            if fps < _MIN_GRID_RATIO * hz:
+                unused = f"{100 * (1 - fps / hz):.3g} % of its messages are in no row"
+                lines.append(f"# {quoted(topic)} comes {hz:.1f} times a second: {unused}")
     if slowest:
         lines += [f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic']
     if is_mixed:
@@ -303,7 +327,7 @@ def _source(feature: str, part: Candidate, topics: Mapping[str, _Topic], *, pref
         yield f"names = [{quoted(part.name)}]"
     if prefix or part.prefix:
         yield f"prefix = {quoted(prefix + part.prefix)}"
-    if topic.rate_hz and (age_s := 2 / topic.rate_hz) > Clock(fps=1).max_age_s:
+    if topic.row_rate_hz and (age_s := 2 / topic.row_rate_hz) > Clock(fps=1).max_age_s:
         yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
     if not topic.has_stamp:
         yield _LOG
