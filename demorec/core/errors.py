@@ -195,7 +195,7 @@ def describe_error(error: BaseException) -> str:
             return words
     lines = str(error).split("\n", 1)
     if "set_int_max_str_digits" in lines[0]:
-        return "a whole number has more digits than are read"
+        return "a whole number has too many digits"
     return lines[0].rstrip(".")[:_MAX_WORDS] or "no reason is given"
 
 

@@ -305,9 +305,7 @@ def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Note
 
 @pytest.mark.slow
 def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) -> None:
-    """LeRobot reads the bag's numbers as float32, and the message of each row is the one that a brute-force search
-    finds.
-    """
+    """LeRobot reads the bag's numbers as float32; each row has the message that a brute-force search finds."""
     from lerobot.datasets.lerobot_dataset import LeRobotDataset
 
     notes, folder = trossen_dataset

@@ -14,7 +14,7 @@ PATTERNS = {
     "what-clause": r"\b[Ww]hat (is|was|are|were|it|they|has|had|comes|came|remains|stays)\b",
     "chain of relative clauses": r"\b(that|which)\b.*\b(that|which)\b.*\b(that|which)\b",
     "data that tells": r"\b(tells?|told)\b",
-    "is no": r"\b(is|are) (no|none)\b(?! more| longer)",
+    "is no": r"(?<!there )\b(is|are) (no|none)\b(?! more| longer)",
     "lies, stands, goes": r"\b(lies|stands|goes)\b",
     "whoever": r"\b(whoever|somebody|anybody|nobody)\b|\bof (ours|theirs|one's own)\b",
     "anew, beside": r"\b(anew|beside|shall|from which on)\b",

@@ -73,9 +73,7 @@ def test_a_card_claims_nothing_of_imported_data(kind: str, tmp_path: Path) -> No
     for claim in (
         "license:",
         "ecorded and exported by demorec",
-        "as it was recorded",
-        "as it came",
-        "that was recorded",
+        "stored as recorded",
     ):
         assert claim not in card
     assert kind == "recorder" or "| `action` | float32 | [6] | observation.state of the next frame |" in card

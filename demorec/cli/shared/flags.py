@@ -77,7 +77,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     asks_for_help = bool({"-h", "--help", _HELP_ALL} & set(args))
     leaves_out = asks_for_help and _HELP_ALL not in args
     rare: frozenset[str] = getattr(command, "rare_flags", frozenset()) if leaves_out else frozenset()
-    # tyro draws its boxes as the encoding allows, but knows that of Unicode by one spelling only.
+    # tyro draws its boxes as the encoding allows, but recognises UTF-8 in one spelling only.
     encoding = codecs.lookup(sys.stdout.encoding or "utf-8").name
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
@@ -106,7 +106,7 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
 
 @contextmanager
 def _leaving_out(names: frozenset[str]) -> Iterator[Mapping[str, bool]]:
-    """Leave fields, of a command or of the dataclasses in it, out of the help; give which of them the command has."""
+    """Leave fields, of a command or of the dataclasses in it, out of the help; report which of them the command has."""
     global _left_out
     _left_out = dict.fromkeys(names, False)
     try:

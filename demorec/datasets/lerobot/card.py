@@ -49,7 +49,7 @@ _SIMULATED_MEANING = {
     EE_POSE: "tool centre point in the base frame: position (m), quaternion xyzw with x >= 0",
     ENVIRONMENT_STATE: "privileged: TCP, objects and goals, symmetric and relative quantities first, raw poses last "
     "(m, rad; base frame)",
-    COMMAND: "what the motors were sent: joint targets (rad), gripper opening (m)",
+    COMMAND: "commands sent to the motors: joint targets (rad), gripper opening (m)",
     REWARD: "1 at the last frame of a success, else 0",
     SUCCESS: "true at the last frame of a success",
     INTERVENTION: "true where the expert acts in an episode that a policy began; its other frames are the policy's",
@@ -60,7 +60,7 @@ _SIMULATED_MEANING = {
 _ACTION_MEANING: Mapping[ActionKind, str] = {
     "joint": "absolute joint targets (rad), gripper opening (m)",
     "joint_increment": "joint target minus that of the frame before (rad), the first minus the initial positions, plus "
-    "the way back from exploration noise (demorec.episode.features); gripper opening (m), absolute",
+    "the recovery from exploration noise (demorec.episode.features); gripper opening (m), absolute",
     "ee": "absolute pose of the tool centre point in the base frame: position (m), quaternion xyzw with x >= 0; "
     "gripper opening (m)",
     "ee_delta": "change of the tool centre point's pose since the frame before, the first since the observed one: "
@@ -68,24 +68,21 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
 }
 
 _SIMULATED_ROWS = (
-    "Row t holds the observation at time t, taken before the action of row t is applied; the action is what the "
-    "expert wanted to be reached at the next frame. Where exploration noise was added to what the motors got, the "
-    "action is derived from the clean target. Frame times are multiples of the simulation's frame period, not of a "
-    "wall clock."
+    "Row t holds the observation at time t, taken before the action of row t is applied; the action is the "
+    "expert's target for the next frame. Where exploration noise was added to the motor commands, the action is "
+    "derived from the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock."
 )
 _RECORDED_ROWS = (
-    "Row t holds what the recordings have at frame t; the table above says where each feature comes from. LeRobot's "
-    "timestamps are multiples of the nominal period; the frames' own stamps, and how old each sample was, are in the "
-    "recordings."
+    "Row t holds the data of frame t in the recordings; the table above lists the origin of each feature. LeRobot's "
+    "timestamps are multiples of the nominal period; the recordings have the exact timestamps of the frames and the "
+    "age of each sample."
 )
 _SIMULATED_SIDECAR = (
-    f"`{SIDECAR_DIR}/` holds what LeRobot has no column for: `episodes/` (seed, outcome with every check, phases, "
+    f"`{SIDECAR_DIR}/` holds data without a column in LeRobot: `episodes/` (seed, outcome with every check, phases, "
     "camera intrinsics and extrinsics, poses, the complete scene of every episode), `camera_poses/` (of moving "
     "cameras, per frame, world_from_camera, OpenCV axes), `attempts/` (failed ones too), `configs.json`."
 )
-_RECORDED_SIDECAR = (
-    f"`{SIDECAR_DIR}/episodes/` says where each episode comes from, how it ended and what its cameras were."
-)
+_RECORDED_SIDECAR = f"`{SIDECAR_DIR}/episodes/` has the origin, the outcome and the cameras of each episode."
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -114,7 +111,7 @@ class _Provenance:
 _SIMULATED = _Provenance(
     demonstration="scripted demonstration{plural} by a simulated {robot} arm in PyBullet",
     origin="Recorded and exported by demorec",
-    packets="every video packet is the one that was recorded",
+    packets="video packets are stored as recorded",
     licence=_OWN_LICENCE,
     tags=("simulation",),
     rows=_SIMULATED_ROWS,
@@ -123,7 +120,7 @@ _SIMULATED = _Provenance(
 _RECORDED = _Provenance(
     demonstration="demonstration{plural} of {robot}",
     origin="Exported by demorec",
-    packets="every video packet is the one that the recordings hold",
+    packets="video packets are those of the recordings, unchanged",
     licence=None,
     tags=(),
     rows=_RECORDED_ROWS,
@@ -258,7 +255,7 @@ def _origin_section(root: Path, configs: Mapping[str, Any], options: ExportOptio
     yield ""
     is_one_run = len(configs) == 1 and not options.append
     if is_one_run and not any(row["origin"] for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["origin"])):
-        yield "This command makes it again from this folder alone and compares every episode to the bit:"
+        yield "This command generates it again from this folder alone and compares every episode bit for bit:"
         yield from ("", "```sh", "generate-dataset --config path/of/this/folder --out copy", "```", "")
 
 
