@@ -33,7 +33,7 @@ def serve() -> None:
         subject = find_subjects([Path(line.strip())])[0]
         start = time.process_time()
         report = check_subject(subject, CheckOptions())
-        print(time.process_time() - start, report.level, flush=True)
+        print(time.process_time() - start, report.verdict, flush=True)
 
 
 class Checker:
@@ -57,9 +57,9 @@ class Checker:
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         print(path, file=self._process.stdin, flush=True)
-        seconds, level = self._process.stdout.readline().split()
-        if level != "pass":
-            raise SystemExit(f"{path} did not pass: {level}")
+        seconds, verdict = self._process.stdout.readline().split()
+        if verdict != "good":
+            raise SystemExit(f"{path} did not pass: {verdict}")
         return float(seconds)
 
     def close(self) -> None:

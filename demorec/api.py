@@ -10,6 +10,9 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from demorec.check.base import Fault as Fault
+    from demorec.check.base import NotMeasuredError as NotMeasuredError
+    from demorec.check.base import check as check
     from demorec.cli.shared.flags import Positional as Positional
     from demorec.cli.shared.output import say as say
     from demorec.core.atomic import atomic_write as atomic_write
@@ -45,9 +48,6 @@ if TYPE_CHECKING:
     from demorec.episode.scene import Goal as Goal
     from demorec.episode.scene import Scene as Scene
     from demorec.episode.scene import Shape as Shape
-    from demorec.extensions.doctor.base import Fault as Fault
-    from demorec.extensions.doctor.base import check as check
-    from demorec.extensions.doctor.errors import NotMeasuredError as NotMeasuredError
     from demorec.extensions.doctor.evidence import EpisodeEvidence as EpisodeEvidence
     from demorec.extensions.doctor.evidence import Evidence as Evidence
     from demorec.extensions.policies.gym_env import DemorecEnv as DemorecEnv
@@ -185,9 +185,9 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "ProgressCallback": "demorec.datasets.options",
         "atomic_write": "demorec.core.atomic",
         "ReplaceableKind": "demorec.core.replacing",
-        "check": "demorec.extensions.doctor.base",
-        "Fault": "demorec.extensions.doctor.base",
-        "NotMeasuredError": "demorec.extensions.doctor.errors",
+        "check": "demorec.check.base",
+        "Fault": "demorec.check.base",
+        "NotMeasuredError": "demorec.check.base",
         "Evidence": "demorec.extensions.doctor.evidence",
         "EpisodeEvidence": "demorec.extensions.doctor.evidence",
         "Positional": "demorec.cli.shared.flags",

@@ -163,7 +163,7 @@ class TaskContract:
                 writer.write(frame)
             writer.finish(outcome)
         report = check_subject(Subject(path=path, kind="recording"), CheckOptions())
-        failed = [f"{result.check}: {result.detail}" for result in report.results if result.level == "fail"]
+        failed = [f"{found.check}: {found.message}" for found in report.findings if found.severity == "broken"]
         assert not failed, "; ".join(failed)
         for proof in prove([path], modules_of([self.task, self.robot])):
             assert proof.level == "pass", proof.problem or "this machine cannot make the episode again"

@@ -1,72 +1,114 @@
-"""A check: one function that measures one quantity, with the limits that judge it.
+"""A check: one commonly reported fault, the data that show it, and the fix.
 
-A check returns the worst value and its place. The limits turn the value into pass, warn or fail, so that a report shows
-both the value and the limit. `demorec list checks` prints the limits. Larger values are worse.
+A check is a generator of `Fault`s with the decorator `check`. It gets a recording, a run, a dataset or a set of
+episodes, and raises `NotMeasuredError` with the reason if it cannot judge. Its docstring is its page in
+`demorec explain`.
 """
 
 from __future__ import annotations
 
 import inspect
 import logging
-import math
+import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial, wraps
-from typing import Any, Literal
-
-import numpy as np
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, Protocol
 
 from demorec.core.errors import DemorecError, MissingDependencyError, resource_error
-from demorec.core.geometry import Array
 
-Level = Literal["pass", "warn", "fail", "skip"]
-Form = Literal["simulated", "external", "run", "external run", "dataset"]
-"""Subject of a check: a simulated recording, an external one, a run of either, or a LeRobot dataset."""
-Group = Literal["file", "time", "images", "run", "import", "dataset"]
-ADVICE: Mapping[Group, tuple[str, str]] = {
-    "file": ("The recording is damaged or incomplete.", "demorec recover {path}, or record it again"),
-    "time": ("Streams and frames do not match.", "record it again: the file was changed, or written wrongly"),
-    "images": ("Images are missing or damaged.", "record it again, or leave it out"),
-    "run": ("The run differs from its run.json.", "run the command that began it again, or restore the files"),
-    "import": ("Data is missing from the run, or has the wrong time.", "look at it: demorec view {path}"),
-    "dataset": ("The dataset differs from the export.", "export it again"),
-}
-"""Group -> why a fault matters, and what to do."""
-
-BLOCKED = "it needs a damaged part"
-NOTHING = "nothing to measure"
-
-SCENE = "a simulated scene"
+Severity = Literal["look", "broken"]
+"""broken: training fails or gives wrong results. look: unusual, to be examined by a person."""
+Verdict = Literal["good", "look", "broken"]
+RANK: Mapping[str, int] = {"good": 0, "look": 1, "broken": 2}
+"""Severity rank of a verdict."""
+Family = Literal["files", "time", "numbers", "alignment", "images", "set"]
+FAMILIES: tuple[Family, ...] = ("files", "time", "numbers", "alignment", "images", "set")
+Form = Literal["simulated", "external", "run", "external run", "dataset", "episodes"]
+"""Subject of a check: a simulated recording, an external one, a run of either, a LeRobot dataset that demorec wrote, or
+the episodes of any source, read by the doctor."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Measurement:
-    """Result of a measurement.
+class NotMeasuredError(Exception):
+    """A check cannot judge its subject; the text gives the reason."""
 
-    Attributes:
-        value: The worst value, in the check's unit.
-        frame: Frame of that value; None if it belongs to no single frame.
-        detail: Description for people (which joint, topic, camera or file).
-    """
 
-    value: float
-    frame: int | None = None
-    detail: str = ""
+class NotApplicableError(NotMeasuredError):
+    """A check is about other kinds of data, or was not requested."""
+
+
+class Checkable(Protocol):
+    """Subject of checks."""
+
+    @property
+    def path(self) -> Path:
+        """Its path, for advice."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class NotMeasured:
-    """A check that cannot judge its subject.
+class Fault:
+    """One finding of a check in one place.
 
     Attributes:
-        why: Reason for people: "too few frames", or the missing data.
+        severity: Severity of the fault.
+        episode: Number of the episode; None for the whole set.
+        frames: First and last frame; None for the whole episode.
+        value: Measured value, with its unit.
+        message: One sentence that describes the fault.
+        do: The fix, if it differs from the check's own advice.
     """
 
+    severity: Severity
+    episode: int | None = None
+    frames: tuple[int, int] | None = None
+    value: str = ""
+    message: str
+    do: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Finding(Fault):
+    """A fault with the name of its check and its reasons.
+
+    Attributes:
+        check: Name of the check.
+        why: Why it matters.
+    """
+
+    check: str
     why: str
 
 
-Found = Measurement | NotMeasured | None
-"""Result of a check; None if it does not apply (no cameras, no depth)."""
+@dataclass(frozen=True, kw_only=True)
+class CheckResult:
+    """Result of a check on one subject.
+
+    Attributes:
+        check: Its name.
+        findings: Its findings.
+        not_measured: Reason why it could not judge, or not everything; "" if it could.
+    """
+
+    check: str
+    findings: tuple[Finding, ...] = ()
+    not_measured: str = ""
+
+    @property
+    def worst(self) -> Finding | None:
+        """The first finding of the worst severity; None without findings."""
+        return max(self.findings, key=lambda finding: RANK[finding.severity], default=None)
+
+    @property
+    def verdict(self) -> Verdict | Literal["not measured"]:
+        """Severity of the worst finding."""
+        if self.worst is not None:
+            return self.worst.severity
+        return "not measured" if self.not_measured else "good"
+
+    @property
+    def message(self) -> str:
+        """Message of the worst finding, or the reason why it could not judge."""
+        return self.not_measured if self.worst is None else self.worst.message
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,202 +116,98 @@ class Check:
     """One check.
 
     Attributes:
-        name: Its row in `demorec.core.tables.FILE_CHECKS`.
-        group: Kind of fault.
-        on: Forms of subjects that it can check if the other requirements are met.
-        needs: Required data, in a few words.
-        measures: Meaning of the value, in words.
-        unit: Unit of the value and the limits; "" for counts and ratios.
-        warn, fail: A value up to `warn` passes, up to `fail` is a warning, and above is a failure.
-        needs_images: Whether images must be decoded.
-        measure: The function.
+        name, family: A noun, and its group.
+        on: Forms that it can check.
+        needs: Required data or roles, in a few words.
+        measures: Its finding in at most 50 characters.
+        unit: Unit of its values.
+        why, do: Why a fault matters, and the fix; `{path}` and `{episode}` are filled in.
+        needs_images: Whether images must be decoded for it alone.
+        find: The generator.
     """
 
     name: str
-    group: Group
+    family: Family
     on: tuple[Form, ...]
     needs: str
     measures: str
     unit: str
-    warn: float
-    fail: float
+    why: str
+    do: str
     needs_images: bool
-    measure: Callable[[Any], Found]
-
-    @property
-    def why(self) -> str:
-        """Why a fault matters."""
-        return ADVICE[self.group][0]
-
-    @property
-    def do(self) -> str:
-        """Remedy; `{path}` is a placeholder for the file."""
-        return ADVICE[self.group][1]
+    find: Callable[[Any], Iterator[Fault]]
 
     @property
     def page(self) -> str:
-        """Explanation for people."""
-        return f"{inspect.cleandoc(self.measure.__doc__ or '')}\n\n{self.summary}."
+        """Explanation for users."""
+        return inspect.cleandoc(self.find.__doc__ or "")
 
-    @property
-    def summary(self) -> str:
-        """One line for `demorec list checks`."""
-        unit = f" {self.unit}" if self.unit else ""
-        warns = "" if self.warn == self.fail else f"warns above {self.warn:g}{unit}, "
-        fails = "never fails" if math.isinf(self.fail) else f"fails above {self.fail:g}{unit}"
-        return f"{self.group}, needs {self.needs}: {self.measures}; {warns}{fails}"
+    def run(self, subject: Checkable) -> CheckResult | None:
+        """Return its findings; None if it does not apply.
 
-    def run(self, subject: object) -> Result:
-        """Measure and judge; an error while reading or computing is a failure of this check, but a missing package is
-        not.
+        An error while reading is a finding of a check of files, and a reason for not measuring of any other.
 
         Raises:
-            ResourceError: The machine lacks resources; this implies nothing about the subject.
+            ResourceError: This machine cannot measure it, which implies nothing about the data.
         """
+        found: list[Finding] = []
+        path = shlex.quote(str(subject.path))
+        reason = ""
         try:
-            found = self.measure(subject)
-        except MissingDependencyError as error:
-            return self.skipped(str(error))
+            for fault in self.find(subject):
+                found.append(self._finding(fault, path))
+        except NotApplicableError:
+            return None
+        except (NotMeasuredError, MissingDependencyError) as error:
+            reason = str(error)
         except Exception as error:
             if (lack := resource_error(error)) is not None:
                 raise lack from error
-            if isinstance(error, DemorecError):
-                return self._result("fail", Measurement(value=math.nan, detail=str(error)))
-            # An unforeseen fault must not discard the findings of other checks.
+            # Data that break one check in an unforeseen way must not hide the findings of the others.
             logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
-            odd = Measurement(value=math.nan, detail="this check cannot be computed on these data")
-            return self._result("fail", odd)
-        if found is None:
-            return self.skipped(NOTHING)
-        if isinstance(found, NotMeasured):
-            return self.skipped(found.why)
-        level: Level = "pass" if found.value <= self.warn else "warn" if found.value <= self.fail else "fail"
-        return self._result(level, found)
+            reason = str(error) if isinstance(error, DemorecError) else "it cannot be computed on these data"
+            if self.family == "files":
+                found.append(self._finding(Fault(severity="broken", message=reason), path))
+                reason = ""
+        return CheckResult(check=self.name, findings=tuple(found), not_measured=reason)
 
-    def skipped(self, why: str) -> Result:
-        """Result of a check that could not be run."""
-        return self._result("skip", Measurement(value=math.nan, detail=why))
-
-    def _result(self, level: Level, found: Measurement) -> Result:
-        return Result(
-            check=self.name,
-            group=self.group,
-            level=level,
-            value=float(found.value) if math.isfinite(found.value) else None,
-            unit=self.unit,
-            warn=self.warn,
-            fail=self.fail,
-            frame=found.frame,
-            detail=found.detail,
-            why=self.why,
-            do=self.do,
-        )
-
-
-@dataclass(frozen=True, kw_only=True)
-class Result:
-    """Judgement of one subject by a check.
-
-    Attributes:
-        check, group, unit, warn, fail: See `Check`.
-        level: "skip" if there was nothing to measure.
-        value: The measured value; None if nothing could be measured or it is not finite.
-        frame, detail: See `Measurement`.
-        why, do: Why it matters, and what to do; `{path}` is a placeholder for the file.
-    """
-
-    check: str
-    group: str
-    level: Level
-    value: float | None
-    unit: str
-    warn: float
-    fail: float
-    frame: int | None
-    detail: str
-    why: str
-    do: str
-
-    @property
-    def allowed(self) -> float:
-        """Limit to report with the value: the one that a failure or a warning exceeded."""
-        return self.fail if self.level == "fail" else self.warn
-
-    @property
-    def is_blocked(self) -> bool:
-        """Whether nothing was measured because a required part is damaged, which another check reports."""
-        return self.level == "skip" and self.detail == BLOCKED
+    def _finding(self, fault: Fault, path: str) -> Finding:
+        number = "" if fault.episode is None else str(fault.episode)
+        do = (fault.do or self.do).replace("{path}", path).replace("{episode}", number)
+        return Finding(**{**vars(fault), "do": do}, check=self.name, why=self.why)
 
 
 def check(
     *,
-    group: Group,
+    family: Family,
+    on: tuple[Form, ...] = ("episodes",),
+    needs: str,
     measures: str,
-    warn: float = 0,
-    fail: float | None = None,
     unit: str = "",
-    on: tuple[Form, ...] = ("simulated",),
-    needs: str = SCENE,
+    why: str,
+    do: str,
     needs_images: bool = False,
-) -> Callable[[Callable[[Any], Found | Iterator[Found]]], Check]:
-    """Decorate a function as a `Check` with the function's name. A generator is judged by the `worst` value that it
-    yields.
+) -> Callable[[Callable[[Any], Iterator[Fault]]], Check]:
+    """Make a `Check` from a generator; the function's name becomes the check's."""
 
-    Warnings need `fail`; without any limit only zero passes.
-    """
-
-    def wrap(function: Callable[[Any], Found | Iterator[Found]]) -> Check:
-        @wraps(function)
-        def measure(subject: object) -> Found:
-            found = function(subject)
-            return worst(*found) if isinstance(found, Iterator) else found
-
+    def wrap(function: Callable[[Any], Iterator[Fault]]) -> Check:
         return Check(
             name=function.__name__,
-            group=group,
+            family=family,
             on=on,
             needs=needs,
             measures=measures,
             unit=unit,
-            warn=warn,
-            fail=warn if fail is None else fail,
+            why=why,
+            do=do,
             needs_images=needs_images,
-            measure=measure,
+            find=function,
         )
 
     return wrap
 
 
-file_check = partial(check, group="file", on=("simulated", "external"), needs="a recording")
-time_check = partial(check, group="time")
-external_check = partial(check, on=("external",), needs="a timestamp for each sample")
-run_check = partial(check, group="run", on=("run",), needs="a run of simulated episodes")
-dataset_check = partial(check, group="dataset", on=("dataset",), needs="a LeRobot dataset")
-
-
-def worst(*found: Found) -> Found:
-    """Measurement with the largest value (a NaN counts as largest), including the reasons for missing measurements.
-
-    If nothing was measured, the reason, or None if nothing applies.
-    """
-    known = [measurement for measurement in found if isinstance(measurement, Measurement)]
-    reasons = list(dict.fromkeys(row.why for row in found if isinstance(row, NotMeasured)))
-    if not known:
-        return NotMeasured(why="; ".join(reasons)) if reasons else None
-    largest = max(known, key=lambda m: math.inf if math.isnan(m.value) else m.value)
-    if not reasons:
-        return largest
-    return replace(largest, detail="; ".join([largest.detail, *(f"not measured: {why}" for why in reasons)]))
-
-
-def worst_frame(error: Array, detail: str) -> Measurement | None:
-    """Largest of (T,) values and its frame; None if all are NaN."""
-    if not np.isfinite(error).any():
-        return None
-    frame = int(np.nanargmax(error))
-    return Measurement(value=float(error[frame]), frame=frame, detail=detail)
-
-
-def counted(wrong: Sequence[str], good: str = "") -> Measurement:
-    """Number of faults and the first three by name, or `good` if there are none."""
-    return Measurement(value=len(wrong), detail="; ".join(wrong[:3]) or good)
+def listed(wrong: Sequence[str], severity: Severity = "broken", shown: int = 3) -> Iterator[Fault]:
+    """Yield one fault with the number of wrong parts and the first ones by name; none if nothing is wrong."""
+    if wrong:
+        yield Fault(severity=severity, value=str(len(wrong)), message="; ".join(wrong[:shown]))

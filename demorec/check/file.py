@@ -6,51 +6,59 @@ External recordings have a separate clock for each stream.
 from __future__ import annotations
 
 from collections.abc import Iterator
+from functools import partial
+from typing import Any
 
 import numpy as np
 
-from demorec.check.base import (
-    Found,
-    Measurement,
-    check,
-    counted,
-    external_check,
-    file_check,
-    time_check,
-    worst_frame,
-)
+from demorec.check.base import Fault, check, listed
 from demorec.check.episode import CheckedEpisode
 from demorec.episode.episode import NO_IMAGE
 from demorec.mcap import channels, messages
 
+MAX_MISSING_RATIO = 0.5
+"""Maximum ratio of frames without an image: a camera that is missing more often shows nothing."""
 
-@file_check(
-    measures="recordings that cannot be opened",
+file_check = partial(
+    check,
+    family="files",
+    on=("simulated", "external"),
+    needs="a recording",
+    why="The recording is damaged or incomplete.",
+    do="demorec recover {path}, or record it again",
 )
-def opens(episode: CheckedEpisode) -> Measurement:
+stream_check = partial(
+    check,
+    family="files",
+    on=("simulated",),
+    needs="a simulated scene",
+    why="Streams and frames do not match.",
+    do="record it again: the file was changed, or written wrongly",
+)
+
+
+@file_check(measures="recordings that cannot be opened")
+def opens(episode: CheckedEpisode) -> Iterator[Fault]:
     """Verify the checksums of index and metadata, and the format version."""
-    return Measurement(value=0, detail=f"{episode.recording.num_frames} frames")
+    episode.recording.num_frames  # noqa: B018
+    yield from ()
 
 
-@file_check(
-    measures="damaged chunks, and messages that differ from the index",
-)
-def checksums(episode: CheckedEpisode) -> Measurement:
+@file_check(measures="damaged chunks, and messages that differ from the index")
+def checksums(episode: CheckedEpisode) -> Iterator[Fault]:
     """Verify the checksum of every chunk and attachment, and the counts of the index."""
     counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
-    wrong = [
-        f"{topic}: {counts[topic]}, the index has {count}"
-        for topic, (_, count) in episode.recording.topics.items()
-        if counts[topic] != count
-    ]
-    return counted(wrong, f"{sum(counts.values())} messages")
+    return listed(
+        [
+            f"{topic}: {counts[topic]}, the index has {count}"
+            for topic, (_, count) in episode.recording.topics.items()
+            if counts[topic] != count
+        ]
+    )
 
 
-@check(
-    group="file",
-    measures="topics that are missing or of another type",
-)
-def topics(episode: CheckedEpisode) -> Measurement:
+@stream_check(measures="topics that are missing or of another type")
+def topics(episode: CheckedEpisode) -> Iterator[Fault]:
     """Find the streams that the metadata lists: each with its type and one message per frame."""
     num_frames = episode.recording.num_frames
     expected: dict[str, tuple[str, int | None]] = {}
@@ -75,7 +83,7 @@ def topics(episode: CheckedEpisode) -> Measurement:
             wrong.append(f"{topic} has {len(found.time_ns)} messages, expected {count}")
         elif len(found.time_ns) == 0:
             wrong.append(f"{topic} is empty")
-    return counted(wrong, f"{len(expected)} topics")
+    return listed(wrong)
 
 
 def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, str]]:
@@ -91,30 +99,24 @@ def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, 
         yield channels.camera_topic(camera, "segmentation"), messages.COMPRESSED_IMAGE
 
 
-@file_check(
-    measures="streams that do not decode into numbers",
-)
-def readable(episode: CheckedEpisode) -> Measurement:
+@file_check(measures="streams that do not decode into numbers")
+def readable(episode: CheckedEpisode) -> Iterator[Fault]:
     """Decode every message by the layout in the metadata, at its frame's time."""
-    words = len(list(episode.recording.events())) + len(episode.recording.subtasks)
-    return Measurement(value=0, detail=f"{episode.recording.table().num_frames} frames, {words} events and subtasks")
+    list(episode.recording.events())
+    episode.recording.subtasks  # noqa: B018
+    episode.recording.table()
+    yield from ()
 
 
-@file_check(
-    measures="recordings that a crash cut off",
-    fail=1,
-)
-def complete(episode: CheckedEpisode) -> Measurement:
+@file_check(measures="recordings that a crash cut off")
+def complete(episode: CheckedEpisode) -> Iterator[Fault]:
     """Check for the outcome at the end of a recording."""
-    cut = episode.recording.outcome is None
-    return Measurement(value=int(cut), detail="recovered from a crash, no outcome" if cut else "")
+    if episode.recording.outcome is None:
+        yield Fault(severity="look", message="recovered from a crash, no outcome")
 
 
-@time_check(
-    measures="messages away from their frame's time",
-    unit="ms",
-)
-def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
+@stream_check(measures="messages away from their frame's time", unit="ms")
+def frame_times(episode: CheckedEpisode) -> Iterator[Fault]:
     """Compare the times of every stream of numbers with multiples of 1 / fps."""
     expected = episode.frame_times
     for topic in (stream.topic for stream in episode.recording.streams if stream.topic in episode.scan):
@@ -122,28 +124,33 @@ def frame_times(episode: CheckedEpisode) -> Iterator[Found]:
         if topic == channels.JOINT_STATES and len(times) != len(expected):
             times = times[np.isin(times, expected)]  # the others are between frames
         count = min(len(times), len(expected))
-        yield worst_frame(np.abs(times[:count] - expected[:count]) / 1e6, topic)
+        error_ns = np.abs(times[:count] - expected[:count])
+        if error_ns.any():
+            yield _late(topic, error_ns, int(np.argmax(error_ns)), "its frame")
 
 
-@time_check(
-    measures="header timestamps that differ from the log time",
-    unit="ms",
-)
-def stamps(episode: CheckedEpisode) -> Iterator[Found]:
+@stream_check(measures="header timestamps that differ from the log time", unit="ms")
+def stamps(episode: CheckedEpisode) -> Iterator[Fault]:
     """Compare the timestamp in each message's header, which ROS tools use, with its log time."""
     for topic, scan in episode.scan.items():
         if scan.stamp_ns is None or not len(scan.time_ns):
             continue
-        off = np.abs(scan.stamp_ns - scan.time_ns)
-        index = int(np.argmax(off))
-        frame = int(np.searchsorted(episode.frame_times, scan.time_ns[index], side="right")) - 1
-        yield Measurement(value=float(off[index]) / 1e6, frame=max(frame, 0), detail=topic)
+        error_ns = np.abs(scan.stamp_ns - scan.time_ns)
+        if error_ns.any():
+            time_ns = scan.time_ns[int(np.argmax(error_ns))]
+            frame = max(int(np.searchsorted(episode.frame_times, time_ns, side="right")) - 1, 0)
+            yield _late(topic, error_ns, frame, "its header's timestamp")
 
 
-@time_check(
-    measures="images that are missing or far from a keyframe",
-)
-def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
+def _late(topic: str, error_ns: np.ndarray[Any, np.dtype[np.int64]], frame: int, reference: str) -> Fault:
+    error = f"{error_ns.max() / 1e6:.4g} ms"
+    return Fault(
+        severity="broken", frames=(frame, frame), value=error, message=f"{topic} is up to {error} off {reference}"
+    )
+
+
+@stream_check(measures="images that are missing or far from a keyframe")
+def video_frames(episode: CheckedEpisode) -> Iterator[Fault]:
     """Count each camera's encoded images: one per frame, at the frame's time, with a keyframe in every GOP."""
     expected = episode.frame_times
     for camera in episode.recording.info.simulated.scene.cameras:
@@ -154,29 +161,43 @@ def video_frames(episode: CheckedEpisode) -> Iterator[Found]:
         count = min(len(times), len(expected))
         off = np.flatnonzero(times[:count] != expected[:count])
         if len(times) != len(expected) or len(off):
-            number = abs(len(times) - len(expected)) + len(off)
             frame = int(off[0]) if len(off) else count
-            detail = f"camera {camera.name}: {len(times)} images for {len(expected)} frames"
-            yield Measurement(value=number, frame=frame, detail=detail)
+            yield Fault(
+                severity="broken",
+                frames=(frame, frame),
+                value=f"{abs(len(times) - len(expected)) + len(off)} images",
+                message=f"camera {camera.name}: {len(times)} images for {len(expected)} frames",
+            )
             continue
         keyframes = episode.recording.keyframes(camera.name).tolist()
         gaps = np.diff([*keyframes, len(expected)]) if keyframes else np.array([len(expected)])
-        late = (0 if keyframes[:1] == [0] else 1) + int((gaps > settings.gop).sum())
-        place = keyframes[int(np.argmax(gaps))] if late and keyframes else None
-        detail = f"camera {camera.name}: {len(keyframes)} keyframes, GOP {settings.gop}"
-        yield Measurement(value=late, frame=place, detail=detail)
+        if keyframes[:1] != [0] or (gaps > settings.gop).any():
+            frame = keyframes[int(np.argmax(gaps))] if keyframes else 0
+            yield Fault(
+                severity="broken",
+                frames=(frame, frame),
+                message=f"camera {camera.name}: {len(keyframes)} keyframes, GOP {settings.gop}",
+            )
 
 
-@external_check(
-    group="images",
-    measures="frames without an image of a camera (share)",
-    fail=0.5,
+@check(
+    family="files",
+    on=("external",),
+    needs="a timestamp for each sample",
+    measures="frames without an image of a camera",
+    unit="% of frames",
+    why="Images are missing.",
+    do="record it again, or leave it out",
 )
-def missing_images(subject: CheckedEpisode) -> Iterator[Found]:
+def missing_images(subject: CheckedEpisode) -> Iterator[Fault]:
     """Count the frames of each camera without an image."""
     for camera, numbers in subject.recording.table().images.items():
         without = np.flatnonzero(numbers == NO_IMAGE)
-        if len(numbers):
-            first = int(without[0]) if len(without) else None
-            text = f"camera {camera}: {len(without)} of {len(numbers)} frames"
-            yield Measurement(value=len(without) / len(numbers), frame=first, detail=text)
+        if len(without):
+            share = len(without) / len(numbers)
+            yield Fault(
+                severity="broken" if share > MAX_MISSING_RATIO else "look",
+                frames=(int(without[0]), int(without[-1])),
+                value=f"{share:.0%} of frames",
+                message=f"camera {camera}: {len(without)} of {len(numbers)} frames have no image",
+            )

@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
-from demorec.check.base import Measurement, check, counted
+from collections.abc import Iterator
+
+from demorec.check.base import Fault, NotApplicableError, check, listed
 from demorec.check.episode import CheckedEpisode
 
 
 @check(
-    group="images",
+    family="files",
     on=("simulated", "external"),
     measures="cameras whose images do not all decode",
     needs="images",
+    why="Images are missing or damaged.",
+    do="record it again, or leave it out",
     needs_images=True,
 )
-def images_decode(subject: CheckedEpisode) -> Measurement | None:
+def images_decode(subject: CheckedEpisode) -> Iterator[Fault]:
     """Decode every image: colour, depth and labels."""
     cameras, wrong = subject.undecoded()
     if not cameras:
-        return None
-    return counted([f"{camera}: {problem}" for camera, problem in wrong], f"{cameras} cameras")
+        raise NotApplicableError("the recording has no images")
+    return listed([f"{camera}: {problem}" for camera, problem in wrong])

@@ -8,7 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.base import BLOCKED, Check, Form, Level, Result
+from demorec.check.base import RANK, Check, CheckResult, Finding, Form, Verdict
 from demorec.check.dataset import CheckedDataset
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
@@ -21,7 +21,6 @@ from demorec.runs.run_file import DATASET
 _WORTH_PROCESSES = {"with images": 4, "without": 50}
 """Minimum number of recordings for several processes to be faster than one: each takes seconds to start."""
 SubjectKind = Literal["recording", "run", "dataset"]
-_SEVERITY: dict[Level, int] = {"skip": 0, "pass": 1, "warn": 2, "fail": 3}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,20 +79,17 @@ class SubjectReport(Subject):
         results: Results in table order.
     """
 
-    results: tuple[Result, ...]
+    results: tuple[CheckResult, ...]
 
     @property
-    def level(self) -> Level:
-        """The worst level; "skip" if nothing was measured."""
-        return max((result.level for result in self.results), key=lambda level: _SEVERITY[level], default="skip")
+    def findings(self) -> list[Finding]:
+        """Findings of all checks, in table order."""
+        return [finding for result in self.results for finding in result.findings]
 
-    def is_bad(self, *, strict: bool = False) -> bool:
-        """Whether a check failed or, with `strict`, warned."""
-        return _SEVERITY[self.level] >= _SEVERITY["warn" if strict else "fail"]
-
-    def count(self, level: Level) -> int:
-        """Count the results with a level."""
-        return sum(result.level == level for result in self.results)
+    @property
+    def verdict(self) -> Verdict:
+        """Severity of the worst finding."""
+        return max((finding.severity for finding in self.findings), key=RANK.__getitem__, default="good")
 
 
 def find_subjects(paths: Sequence[Path]) -> list[Subject]:
@@ -143,36 +139,28 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """Run all checks of one recording, run or dataset."""
     if subject.kind == "recording":
         with CheckedEpisode(subject.path, colours=options.colours) as episode:
-            found = _run(options, episode)
+            found = tuple(_run(options, episode))
     elif subject.kind == "run":
-        found = _run(options, CheckedRun(subject.path))
+        found = tuple(_run(options, CheckedRun(subject.path)))
     else:
-        found = _run(options, CheckedDataset(subject.path))
-    results = tuple(replace(result, detail=_within(subject.path, result.detail)) for result in found)
-    return SubjectReport(**vars(subject), results=results)
+        found = tuple(_run(options, CheckedDataset(subject.path)))
+    return SubjectReport(**vars(subject), results=found)
 
 
-Checked = CheckedEpisode | CheckedDataset | CheckedRun
+def _run(options: CheckOptions, subject: CheckedEpisode | CheckedDataset | CheckedRun) -> Iterator[CheckResult]:
+    """Run the checks of a subject in order, except those that fail on the same unreadable part as an earlier one."""
+    path = subject.path
+    known: set[str] = set()
+    for check in options.checks(subject.form):
+        result = None if check.needs_images and not options.images else check.run(subject)
+        if result is None or (result.findings and {finding.message for finding in result.findings} <= known):
+            continue
+        known |= {finding.message for finding in result.findings}
+        yield replace(result, findings=tuple(_within(path, finding) for finding in result.findings))
+        if check.name == "opens" and result.findings:
+            return
 
 
-def _within(path: Path, detail: str) -> str:
-    """Remove the subject's path from a result's detail; the report prints it above."""
-    return detail.removesuffix(f": {path}").replace(f"{path}/", "")
-
-
-def _run(options: CheckOptions, subject: Checked) -> list[Result]:
-    """Run the checks of a subject in order. A check that fails on the same unreadable part as another is blocked."""
-    checks = [check for check in options.checks(subject.form) if options.images or not check.needs_images]
-    results: list[Result] = []
-    unreadable: set[str] = set()
-    for check in checks:
-        result = check.run(subject)
-        if result.level == "fail" and result.value is None:
-            if result.detail in unreadable:
-                result = check.skipped(BLOCKED)
-            unreadable.add(result.detail)
-        results.append(result)
-        if check.name == "opens" and result.level == "fail":
-            results += [other.skipped(BLOCKED) for other in checks if other is not check]
-            break
-    return results
+def _within(path: Path, finding: Finding) -> Finding:
+    """Remove the subject's path from a message; the report prints it above."""
+    return replace(finding, message=finding.message.removesuffix(f": {path}").replace(f"{path}/", ""))

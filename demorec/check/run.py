@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import asdict
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
-from demorec.check.base import Form, Measurement, counted, run_check
+from demorec.check.base import Fault, Form, check, listed
 from demorec.core.errors import DemorecError, resource_error
 from demorec.core.files import sha256_of
 from demorec.core.plain import to_plain
@@ -16,7 +15,14 @@ from demorec.episode.info import EpisodeInfo
 from demorec.runs.recorded import recorded_line
 from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
 
-_ANY_RUN: tuple[Form, ...] = ("run", "external run")
+run_check = partial(
+    check,
+    family="files",
+    on=("run", "external run"),
+    needs="a run",
+    why="The run differs from its run.json.",
+    do="run the command that began it again, or restore the files",
+)
 _NOT_RECORDED = ("file", "seconds")
 """Keys of an attempt in run.json that are not in its recording."""
 
@@ -53,43 +59,38 @@ class CheckedRun:
         return [path for folder in (EPISODES, FAILED) for path in sorted((self.path / folder).glob("*.mcap"))]
 
 
-@run_check(measures="files missing, changed, or not in run.json", on=_ANY_RUN, needs="a run")
-def run_files(run: CheckedRun) -> Measurement:
+@run_check(measures="files missing, changed, or not in run.json")
+def run_files(run: CheckedRun) -> Iterator[Fault]:
     """Compare the recordings with those that run.json lists, and their SHA-256."""
-    listed = {attempt.file: attempt.sha256 for attempt in run.attempts}
+    recorded = {attempt.file: attempt.sha256 for attempt in run.attempts}
     there = {str(path.relative_to(run.path)) for path in run.recordings}
     hint = "" if run.run.is_complete else " yet; the command that began the run adds it and continues"
-    wrong = [f"{file} is missing" for file in sorted(listed.keys() - there)]
-    wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - listed.keys())]
-    for file in sorted(there & listed.keys()):
+    wrong = [f"{file} is missing" for file in sorted(recorded.keys() - there)]
+    wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - recorded.keys())]
+    for file in sorted(there & recorded.keys()):
         try:
-            if sha256_of(run.path / file) != listed[file]:
+            if sha256_of(run.path / file) != recorded[file]:
                 wrong.append(f"{file} has changed")
         except OSError as error:
             if (lack := resource_error(error, run.path / file)) is not None:
                 raise lack from error
             wrong.append(f"{file} cannot be read ({error.strerror})")
-    return counted(wrong, f"{len(there)} recordings")
+    return listed(wrong)
 
 
-@run_check(
-    measures="requested episodes that are missing",
-    on=_ANY_RUN,
-    needs="a run",
-    fail=math.inf,
-)
-def run_complete(run: CheckedRun) -> Measurement:
+@run_check(measures="requested episodes that are missing", unit="episodes")
+def run_complete(run: CheckedRun) -> Iterator[Fault]:
     """Count the remaining episodes of an interrupted generation or import."""
-    return Measurement(value=run.run.num_missing, detail=run.run.unfinished)
+    if missing := run.run.num_missing:
+        yield Fault(severity="look", value=f"{missing} episodes", message=run.run.unfinished)
 
 
-@run_check(measures="recordings that differ from run.json", on=_ANY_RUN, needs="a run")
-def run_agrees(run: CheckedRun) -> Measurement:
+@run_check(measures="recordings that differ from run.json")
+def run_agrees(run: CheckedRun) -> Iterator[Fault]:
     """Compare each recording with its line in number, attempt, seed, outcome and digest, and with the run's config and
     versions.
     """
-    wrong = [text for attempt in run.attempts for text in _contradictions(run, attempt)]
-    return counted(wrong, f"{len(run.attempts)} recordings")
+    return listed([text for attempt in run.attempts for text in _contradictions(run, attempt)])
 
 
 def _contradictions(run: CheckedRun, attempt: Attempt) -> Iterator[str]:

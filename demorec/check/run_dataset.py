@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from demorec.check.base import Measurement, counted, run_check
+from demorec.check.base import Fault, NotApplicableError, check, listed
 from demorec.check.dataset import CheckedDataset, DescribedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error
@@ -25,15 +25,22 @@ _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 """Sidecar keys that do not come from the recording."""
 
 
-@run_check(measures="episodes of its dataset that differ from the recordings")
-def run_dataset(run: CheckedRun) -> Measurement | None:
+@check(
+    family="files",
+    on=("run",),
+    needs="a run of simulated episodes",
+    measures="episodes of its dataset that differ from the recordings",
+    why="The dataset differs from the run.",
+    do="export it again",
+)
+def run_dataset(run: CheckedRun) -> Iterator[Fault]:
     """Compare every number and encoded image of each episode with its recording, exported with the same options."""
     path = run.path / DATASET
     if not is_dataset(path):
-        return None
+        raise NotApplicableError("the run has no dataset")
     dataset = CheckedDataset(path)
     if not dataset.sidecar or any(row["source"] is None for row in dataset.sidecar):
-        return Measurement(value=1, detail="the dataset does not name its source recordings")
+        return listed(["the dataset does not name its source recordings"])
     dataset.check_simulated()
     options = export_options(path)
     wrong = list(dict.fromkeys(dataset.unreadable.values()))
@@ -46,7 +53,7 @@ def run_dataset(run: CheckedRun) -> Measurement | None:
         file = folder / Path(str(episode.kept["source"])).name
         if words := [what for what, _ in episode_differences(file, options, episode, dataset)]:
             wrong.append(f"episode {episode.number}: {', '.join(words)}")
-    return counted(wrong, f"{len(dataset.sidecar)} episodes")
+    return listed(wrong)
 
 
 def export_options(dataset: Path) -> ExportOptions:

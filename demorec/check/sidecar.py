@@ -3,22 +3,30 @@
 from __future__ import annotations
 
 import reprlib
+from collections.abc import Iterator
 
-from demorec.check.base import Measurement, counted, dataset_check
+from demorec.check.base import Fault, NotApplicableError, check, listed
 from demorec.check.dataset import CheckedDataset
 from demorec.datasets.episode import SUCCESS
 from demorec.datasets.lerobot.inspect import episode_digests
 
 
-@dataset_check(measures="episodes that differ from their sidecar entry", needs="demorec's sidecar")
-def dataset_sidecar(dataset: CheckedDataset) -> Measurement | None:
+@check(
+    family="files",
+    on=("dataset",),
+    needs="demorec's sidecar",
+    measures="episodes that differ from their sidecar entry",
+    why="The dataset differs from the export.",
+    do="export it again",
+)
+def dataset_sidecar(dataset: CheckedDataset) -> Iterator[Fault]:
     """Compare instruction, outcome and content digest of each episode with the sidecar."""
     if not dataset.sidecar:
-        return None
+        raise NotApplicableError("another program wrote the dataset")
     count = len(dataset.folder.listed)
     known = [row["episode_index"] for row in dataset.sidecar]
     if sorted(set(known)) != known or not set(known) <= set(range(count)):
-        return Measurement(value=1, detail=f"its rows have the episodes {reprlib.repr(known)}, the dataset has {count}")
+        return listed([f"its rows have the episodes {reprlib.repr(known)}, the dataset has {count}"])
     missing = sorted(set(range(count)) - set(known))
     wrong = [f"episode {number} is unknown, perhaps recorded with LeRobot's resume" for number in missing]
     infos = {each.number: each.info for each in dataset.described()}
@@ -34,4 +42,4 @@ def dataset_sidecar(dataset: CheckedDataset) -> Measurement | None:
             wrong.append(f"episode {number} has another outcome")
         elif digests[number] != row["content_digest"]:
             wrong.append(f"episode {number} has changed since it was exported")
-    return counted(wrong, f"{len(known)} episodes")
+    return listed(wrong)

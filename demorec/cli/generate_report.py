@@ -55,8 +55,9 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     failures: list[str] = []
     for done, report in enumerate(check_subjects(subjects, options)):
         progress(done + 1, total)
-        warned.update(r.check for r in report.results if r.level == "warn")
-        failures += [f"{report.path.name}: {r.check}: {r.detail}" for r in report.results if r.level == "fail"]
+        warned.update(found.check for found in report.findings if found.severity == "look")
+        broken = [found for found in report.findings if found.severity == "broken"]
+        failures += [f"{report.path.name}: {found.check}: {found.message}" for found in broken]
     paths = [result.folder / file for file in sample]
     proofs = []
     for proof in prove(paths, result.run.config.modules):

@@ -40,4 +40,4 @@ def test_all_tasks_go_into_one_dataset(tmp_path: Path) -> None:
     assert row == dataset.num_frames
     assert len(dataset.meta.tasks) == len({dataset[i]["task"] for i in dataset.meta.episodes["dataset_from_index"]})
 
-    assert [r for r in checked(out, "dataset").results if r.level in ("warn", "fail")] == []
+    assert [r for r in checked(out, "dataset").results if r.verdict in ("look", "broken")] == []

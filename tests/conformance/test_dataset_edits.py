@@ -154,7 +154,7 @@ def test_statistics_of_arrays_are_those_of_their_last_dimension(dataset: Path, t
     depth = np.stack([item[DEPTH] for item in shown]).astype(np.float64)
     assert depth.mean() / 1000 == pytest.approx(np.ravel(found[DEPTH]["mean"])[0], rel=1e-5)  # LeRobot decodes to mm
     results = {result.check: result for result in checked(tmp_path / "t", "dataset", images=False).results}
-    assert results["wrong_statistics"].level == "pass", results["wrong_statistics"]
+    assert results["wrong_statistics"].verdict == "good", results["wrong_statistics"]
 
 
 def statistics(root: Path) -> dict[str, Any]:
@@ -168,7 +168,7 @@ def test_the_results_are_clean(small: Path, tmp_path: Path, images: bool) -> Non
     assert edit("shuffle", small, "--seed", 3, "--out", tmp_path / "shuffled") == 0
     for name in ("trimmed", "shuffled"):
         results = checked(tmp_path / name, "dataset", images=images).results
-        assert not [result for result in results if result.level in ("fail", "warn")]
+        assert not [result for result in results if result.verdict in ("broken", "look")]
 
 
 def test_decoded_statistics_are_those_of_the_images(small: Path, tmp_path: Path) -> None:

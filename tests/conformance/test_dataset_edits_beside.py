@@ -55,8 +55,8 @@ def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def failing(root: Path) -> set[str]:
     """Return the failed dataset checks; motion and images are synthetic, so their checks do not count."""
     results = checked(root, "dataset", images=False).results
-    assert {result.check: result.level for result in results}["dataset_sidecar"] == "pass"
-    return {result.check for result in results if result.level == "fail" and result.check.startswith("dataset")}
+    assert {result.check: result.verdict for result in results}["dataset_sidecar"] == "good"
+    return {result.check for result in results if result.verdict == "broken" and result.check.startswith("dataset")}
 
 
 @pytest.mark.slow

@@ -19,11 +19,10 @@ import pytest
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
+from support.check import result_of
 from support.commands import exit_code
 
-from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.core.tables import FILE_CHECKS
 from demorec.episode.info import Origin
 from demorec.extensions.imports import planning
 from demorec.extensions.imports.bag_files import BagError
@@ -153,9 +152,9 @@ def test_bad_bags_are_skipped_and_listed(
         assert left_out[number]["bag"] == f"run_{2 * number + 1}.mcap"
         assert reason in left_out[number]["reason"]
         assert left_out[number]["reason"] in shown
-    judged = FILE_CHECKS.load("import_dropped").run(CheckedRun(run))
-    assert judged.value == len(BAD)
-    assert "run_1.mcap: The bag is empty" in judged.detail
+    judged = result_of(run, "import_dropped", "run")
+    assert judged.findings[0].value == str(len(BAD))
+    assert "run_1.mcap: The bag is empty" in judged.message
 
 
 def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:

@@ -166,7 +166,7 @@ def test_other_readers_find_it(kind: str, tmp_path: Path) -> None:
 def test_the_commands_take_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, _ = imported("32FC1", tmp_path)
     report = check_subject(Subject(path=recording_of(run), kind="recording"), CheckOptions())
-    assert not [result.check for result in report.results if result.level == "fail"]
+    assert not [result.check for result in report.results if result.verdict == "broken"]
     assert exit_code("info", recording_of(run)) == 0
     assert "64x48 32FC1 as it came" in capsys.readouterr().out
     assert exit_code("view", run, "--save", tmp_path / "view.rrd") == 0

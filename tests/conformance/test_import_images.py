@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import bag_mappings, bags
+from support.check import result_of
 from support.commands import exit_code
 
-from demorec.check.run import CheckedRun
-from demorec.core.tables import FILE_CHECKS
 from demorec.mcap import Recording
 
 FRONT, SIDE = "/front/image_raw/compressed", "/side/image_raw/compressed"
@@ -159,7 +158,7 @@ def test_cameras_of_different_rates(fps: int, slow: int, tmp_path: Path, capsys:
     (share,) = re.findall(r"([\d.]+) % of (?:the rows show the image before|its images are in no row)", note)
     assert float(share) == pytest.approx({30: 50, 15: 50, 25: 100 / 6}[fps], abs=1)
     assert ("in no row" in note) == (fps < 30)
-    assert FILE_CHECKS.load("import_findings").run(CheckedRun(tmp_path / "run")).level == "pass"
+    assert result_of(tmp_path / "run", "import_findings", "run").verdict == "good"
 
 
 @pytest.mark.parametrize(("fps", "kind"), [(20, "skips"), (15, "note"), (25, "skips"), (60, "slow")])
@@ -174,5 +173,5 @@ def test_a_rate_that_no_camera_has(fps: int, kind: str, tmp_path: Path, capsys: 
     if fps < 30:
         (share,) = re.findall(r"([\d.]+) % of its images are in no row", lines[0])
         assert float(share) == pytest.approx(100 * left_out / 90, abs=1)
-    level = FILE_CHECKS.load("import_findings").run(CheckedRun(tmp_path / "run")).level
-    assert level == ("pass" if kind == "note" else "warn")
+    verdict = result_of(tmp_path / "run", "import_findings", "run").verdict
+    assert verdict == ("good" if kind == "note" else "look")

@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 from support import bag_mappings, bags
+from support.check import result_of
 from support.commands import exit_code
 
-from demorec.check.run import CheckedRun
-from demorec.core.tables import FILE_CHECKS
 from demorec.mcap import Recording
 
 TOPIC = "/episode"
@@ -65,7 +64,7 @@ def test_what_is_discarded_is_no_episode(
     assert f"{len(kept)} episode{'s' * (len(kept) > 1)}, " in told
     assert f" frames{dropped}: " in told
     assert told.endswith("No findings.\n")
-    assert FILE_CHECKS.load("import_dropped").run(CheckedRun(tmp_path / "run")).level == "pass"  # nothing is missing
+    assert result_of(tmp_path / "run", "import_dropped", "run").verdict == "good"  # nothing is missing
 
 
 def test_an_unknown_marker_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support import bag_mappings, bags
-from support.check import edit_parquet, level_of
+from support.check import edit_parquet, verdict_of
 from support.export import episode_rows, export
 
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -184,7 +184,7 @@ def test_playback_has_what_the_first_frames_are_decoded_from(expected: list[Imag
 
 def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> None:
     for name in ("undecodable_images", "dataset_sidecar"):
-        assert level_of(dataset, name, "dataset") == "pass"
+        assert verdict_of(dataset, name, "dataset") == "good"
     # An episode that is off by one image has a gap of the expected kind in front, but not the expected digest.
     for check, episode, shift in (
         ("dataset_sidecar", 1, -1),
@@ -200,4 +200,4 @@ def test_checks_take_them_and_nothing_else(dataset: Path, tmp_path: Path) -> Non
 
         for edge in ("from", "to"):
             edit_parquet(path, f"videos/{KEY}/{edge}_timestamp", shifted)
-        assert level_of(spoilt, check, "dataset") == "fail"
+        assert verdict_of(spoilt, check, "dataset") == "broken"

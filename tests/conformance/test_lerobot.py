@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import checked, edit_json, level_of
+from support.check import checked, edit_json, verdict_of
 from support.docs import run_examples
 from support.export import data_table, episode_rows, export, make_run
 from support.recording import make_episode
@@ -210,11 +210,11 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     assert (dataset / "demorec" / "robots").is_dir()  # docs/dataset-format.md describes LeRobot's tools
     assert not any((tmp_path / name / "demorec").exists() for name in ("both", "merged"))
     # The merge averages both datasets' quantiles: noted, but no failure; other numbers would be a failure.
-    levels = {r.check: r.level for r in checked(tmp_path / "both", "dataset").results}
-    assert levels["wrong_statistics"] == "warn"
-    assert [name for name, level in levels.items() if level == "fail"] == ["copied_episodes"]  # they are
+    verdicts = {r.check: r.verdict for r in checked(tmp_path / "both", "dataset").results}
+    assert verdicts["wrong_statistics"] == "look"
+    assert [name for name, verdict in verdicts.items() if verdict == "broken"] == ["copied_episodes"]  # they are
     edit_json(tmp_path / "both/meta/stats.json", lambda data: data["action"].update(q90=data["action"]["max"]))
-    assert level_of(tmp_path / "both", "wrong_statistics", "dataset") == "fail"
+    assert verdict_of(tmp_path / "both", "wrong_statistics", "dataset") == "broken"
 
 
 @pytest.mark.slow

@@ -73,7 +73,7 @@ def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
         assert recorded.success
         assert recorded.num_frames == len(state)
         assert recorded.info.origin == "teleoperation by LeRobot"
-    assert {"fail", "warn"}.isdisjoint(result.level for result in checked(recording).results)
+    assert {"broken", "look"}.isdisjoint(result.verdict for result in checked(recording).results)
     assert exit_code("replay", recording) == 0
 
 

@@ -168,13 +168,13 @@ def test_what_lerobot_recorded_is_read_as_radians(
     assert np.abs(read - expected).max() < 2e-6  # float32
     plain, understood = (
         {
-            result.check: result.level
+            result.check: result.verdict
             for result in checked(tmp_path / "d", "dataset", only=KINEMATIC, motors=motors).results
         }
         for motors in (None, SO101_FOLLOWER.motors(units, calibration))
     )
-    assert (plain["joint_limits"], understood["joint_limits"]) == ("skip", "pass")
-    assert {"warn", "fail"}.isdisjoint(understood.values())
+    assert (plain["joint_limits"], understood["joint_limits"]) == ("not measured", "good")
+    assert {"look", "broken"}.isdisjoint(understood.values())
 
 
 def test_a_real_arm_beyond_its_limits_is_found(
@@ -217,9 +217,9 @@ def test_what_is_no_calibration_is_refused(
 
 @pytest.mark.usefixtures("without_lerobot")  # the tests above read it this way
 def test_check_is_clean_and_knows_degrees(dataset: Path) -> None:
-    results = {result.check: result.level for result in checked(dataset, "dataset").results}
-    assert {"warn", "fail"}.isdisjoint(results.values())
-    assert results["joint_limits"] == "pass"
+    results = {result.check: result.verdict for result in checked(dataset, "dataset").results}
+    assert {"look", "broken"}.isdisjoint(results.values())
+    assert results["joint_limits"] == "good"
 
 
 def test_what_cannot_be_in_motor_units_is_refused(

@@ -180,7 +180,7 @@ def test_lerobot_gives_every_frame_of_what_was_repaired(
     assert len(found) == EPISODES
     assert all(same(a, b) for a, b in zip(found, frames, strict=True))
     results = checked(tmp_path / "new", "dataset", images=False).results
-    assert {result.level for result in results if result.check.startswith("dataset")} <= {"pass", "skip"}
+    assert {result.verdict for result in results if result.check.startswith("dataset")} <= {"good", "not measured"}
     assert repair(tmp_path / "new", "--out", tmp_path / "again") == 0
     assert capsys.readouterr().out == f"Nothing to repair, so nothing is written: {tmp_path / 'new'}\n"
     assert not (tmp_path / "again").exists()

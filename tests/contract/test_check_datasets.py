@@ -18,9 +18,9 @@ from support.check import (
     edit_column,
     edit_json,
     edit_parquet,
-    level_of,
     simulate,
     simulate_run,
+    verdict_of,
 )
 from support.commands import exit_code
 from support.export import rewrite_video
@@ -151,7 +151,7 @@ def test_a_fault_of_the_files(name: str, dataset: Path) -> None:
     fault, check = ALONE[name]
     shutil.rmtree(dataset / "demorec")
     fault(dataset)
-    assert level_of(dataset, check, "dataset") in ("warn", "fail")
+    assert verdict_of(dataset, check, "dataset") in ("look", "broken")
 
 
 def second_video(dataset: Path) -> None:
@@ -172,7 +172,7 @@ WARNED: dict[str, tuple[Fault, str]] = {
 def test_a_warning(name: str, dataset: Path) -> None:
     fault, check = WARNED[name]
     fault(dataset)
-    assert level_of(dataset, check, "dataset") == "warn"
+    assert verdict_of(dataset, check, "dataset") == "look"
 
 
 @pytest.mark.parametrize("is_ours", [True, False])
@@ -180,10 +180,10 @@ def test_the_good_one_passes(is_ours: bool, dataset: Path) -> None:
     if not is_ours:
         shutil.rmtree(dataset / "demorec")
     report = checked(dataset, "dataset")
-    assert [result for result in report.results if result.level in ("warn", "fail")] == []
-    skipped = {result.check for result in report.results if result.level == "skip"}
-    assert skipped - {"dataset_sidecar"} == {"image_lag", "image_take", "cut_off_episodes", "unusual_motion"}
-    assert ("dataset_sidecar" in skipped) != is_ours
+    assert [result for result in report.results if result.verdict in ("look", "broken")] == []
+    skipped = {result.check for result in report.results if result.verdict == "not measured"}
+    assert skipped == {"image_lag", "image_take", "cut_off_episodes", "unusual_motion"}
+    assert ("dataset_sidecar" in {result.check for result in report.results}) == is_ours
 
 
 @pytest.mark.slow
@@ -191,16 +191,16 @@ def test_a_nan_spoils_its_rows_and_not_the_other_checks(dataset: Path) -> None:
     shutil.rmtree(dataset / "demorec")
     value_of(STATE, 20, float("nan"))(dataset)
     edit_column(dataset, "observation.ee_pose", lambda rows: rows[:, [0, 1, 2, 6, 3, 4, 5]])
-    found = {result.check: result.level for result in checked(dataset, "dataset", images=False).results}
-    failed = {check for check, level in found.items() if level == "fail"}
+    found = {result.check: result.verdict for result in checked(dataset, "dataset", images=False).results}
+    failed = {check for check, verdict in found.items() if verdict == "broken"}
     assert failed == {"missing_numbers", "pose_mismatch", "wrong_statistics"}
-    assert "skip" not in {found["joint_limits"], found["velocity_mismatch"], found["action_lag"]}
+    assert "not measured" not in {found["joint_limits"], found["velocity_mismatch"], found["action_lag"]}
 
 
 def test_a_missing_video_leaves_the_other_checks(dataset: Path) -> None:
     next(dataset.glob("videos/*/*/*.mp4")).unlink()
-    found = {result.check: result.level for result in checked(dataset, "dataset", only=MEASURED).results}
-    assert found == dict.fromkeys(MEASURED[:-1], "pass") | {"undecodable_images": "skip"}
+    found = {result.check: result.verdict for result in checked(dataset, "dataset", only=MEASURED).results}
+    assert found == dict.fromkeys(MEASURED[:-1], "good") | {"undecodable_images": "not measured"}
 
 
 MEASURED = ("joint_limits", "contradicting_counts", "wrong_statistics", "undecodable_images")
@@ -220,15 +220,15 @@ CHANGED: dict[str, Fault] = {
 @pytest.mark.parametrize("name", CHANGED)
 def test_an_episode_that_the_sidecar_contradicts(name: str, dataset: Path) -> None:
     CHANGED[name](dataset)
-    assert level_of(dataset, "dataset_sidecar", "dataset") == "fail"
+    assert verdict_of(dataset, "dataset_sidecar", "dataset") == "broken"
 
 
 def test_an_external_episode_that_was_changed(tmp_path: Path) -> None:
     path = write_external(tmp_path / "e.mcap", make_external(cameras=(), num_frames=12))
     export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False))
-    assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "pass"
+    assert verdict_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "good"
     edit_column(tmp_path / "ds", "action", lambda rows: rows + 1e-3)
-    assert level_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "fail"
+    assert verdict_of(tmp_path / "ds", "dataset_sidecar", "dataset") == "broken"
 
 
 def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> None:
@@ -238,14 +238,20 @@ def test_episodes_that_the_sidecar_does_not_know(run: Path, tmp_path: Path) -> N
     pq.write_table(pq.read_table(path).slice(1), path)
     assert [episode.number for episode in CheckedDataset(spoilt / "dataset").described()] == [1, 2]
     (result,) = checked(spoilt / "dataset", "dataset", only=["dataset_sidecar"]).results
-    assert (result.level, result.detail) == ("fail", "episode 0 is unknown, perhaps recorded with LeRobot's resume")
-    assert level_of(spoilt / "dataset", "pose_mismatch", "dataset") == "pass"
+    assert (result.verdict, result.message) == (
+        "broken",
+        "episode 0 is unknown, perhaps recorded with LeRobot's resume",
+    )
+    assert verdict_of(spoilt / "dataset", "pose_mismatch", "dataset") == "good"
 
 
 def test_a_sidecar_of_other_episodes(dataset: Path) -> None:
     edit_parquet(next((dataset / "demorec/episodes").glob("*/*.parquet")), "episode_index", lambda _: [0, 1, 7])
     (result,) = checked(dataset, "dataset", only=["dataset_sidecar"]).results
-    assert (result.level, result.detail) == ("fail", "its rows have the episodes [0, 1, 7], the dataset has 3")
+    assert (result.verdict, result.message) == (
+        "broken",
+        "its rows have the episodes [0, 1, 7], the dataset has 3",
+    )
 
 
 def test_an_episode_twice(run: Path, tmp_path: Path) -> None:
@@ -253,7 +259,7 @@ def test_an_episode_twice(run: Path, tmp_path: Path) -> None:
     shutil.rmtree(spoilt / "dataset")
     shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000009.mcap")
     export_lerobot([spoilt], tmp_path / "ds", ExportOptions(verify=False))
-    assert level_of(tmp_path / "ds", "copied_episodes", "dataset") == "fail"
+    assert verdict_of(tmp_path / "ds", "copied_episodes", "dataset") == "broken"
 
 
 def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
@@ -264,7 +270,7 @@ def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
         stats["episode_index"]["mean"] = [17.0]
 
     edit_json(dataset / "meta" / "stats.json", renumbered)
-    assert level_of(dataset, "wrong_statistics", "dataset") == "pass"
+    assert verdict_of(dataset, "wrong_statistics", "dataset") == "good"
 
 
 @pytest.mark.slow
@@ -293,7 +299,7 @@ def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
         return data[:-40] + np.float64(np.nan).tobytes() + data[-32:]  # position, then two sequences of one number
 
     (tmp_path / "b.mcap").write_bytes(rewritten(source, messages=spoil))
-    assert level_of(tmp_path / "b.mcap", "missing_numbers") == "fail"
+    assert verdict_of(tmp_path / "b.mcap", "missing_numbers") == "broken"
     with pytest.raises(ExportError, match=r"observation.state is not finite in frame 11"):
         export_lerobot([tmp_path / "b.mcap"], tmp_path / "ds", ExportOptions(verify=False))
     assert not (tmp_path / "ds").exists()

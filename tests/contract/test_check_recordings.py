@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import Message, Spoilt, checked, flip_bits, level_of, rewrite_messages, simulate
+from support.check import Message, Spoilt, checked, flip_bits, rewrite_messages, simulate, verdict_of
 from support.commands import exit_code
 from support.tasks import QUICK_TASKS
 
@@ -38,7 +38,7 @@ def filmed(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def findings(path: Path) -> list[tuple[str, str]]:
     """Return the checks that do not pass."""
-    return [(result.check, result.level) for result in checked(path).results if result.level in ("warn", "fail")]
+    return [(result.check, result.verdict) for result in checked(path).results if result.verdict in ("look", "broken")]
 
 
 # ------------------------------------------------------------------------------------------------- good ones
@@ -46,7 +46,7 @@ def findings(path: Path) -> list[tuple[str, str]]:
 
 def test_the_good_ones_pass(good: Path, filmed: Path) -> None:
     assert findings(good) == findings(filmed) == []
-    assert {result.level for result in checked(filmed, only=FILE_CHECKS.names()).results} == {"pass"}
+    assert {result.verdict for result in checked(filmed, only=FILE_CHECKS.names()).results} == {"good"}
 
 
 @pytest.mark.slow
@@ -150,19 +150,19 @@ def test_spoilt_numbers(name: str, good: Path, tmp_path: Path) -> None:
     fault, check = NUMBERS[name]
     spoilt = Spoilt(good)
     fault(spoilt)
-    assert level_of(spoilt.write(tmp_path / "spoilt.mcap"), check) in ("warn", "fail")
+    assert verdict_of(spoilt.write(tmp_path / "spoilt.mcap"), check) in ("look", "broken")
 
 
 def test_a_nan_spoils_its_frame_and_not_the_other_checks(good: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(good)
     spoilt.set(joint_position=plus((40, 2), np.nan)(spoilt.columns.joint_position.copy()))
     path = spoilt.write(tmp_path / "spoilt.mcap")
-    assert findings(path) == [("missing_numbers", "fail")]
+    assert findings(path) == [("missing_numbers", "broken")]
     (found,) = checked(path, only=["missing_numbers"]).results
-    assert found.detail == "NaN or infinite numbers in observation.state"
+    assert found.message == "NaN or infinite numbers in observation.state"
     spoilt.set(base_from_tcp=scalar_first(spoilt.columns.base_from_tcp.copy()))
     twice = dict(findings(spoilt.write(tmp_path / "twice.mcap")))
-    assert twice == {"missing_numbers": "fail", "pose_mismatch": "fail"}
+    assert twice == {"missing_numbers": "broken", "pose_mismatch": "broken"}
 
 
 # ------------------------------------------------------------------------------------------------- the file
@@ -172,19 +172,19 @@ def test_a_truncated_file(good: Path, tmp_path: Path) -> None:
     data = good.read_bytes()
     (tmp_path / "cut.mcap").write_bytes(data[: len(data) // 2])
     report = checked(tmp_path / "cut.mcap")
-    assert findings(tmp_path / "cut.mcap")[0] == ("opens", "fail")
-    integrity = [result.level for result in report.results if result.check in FILE_CHECKS.names()]
-    assert "fail" not in integrity[1:]
+    assert findings(tmp_path / "cut.mcap")[0] == ("opens", "broken")
+    integrity = [result.verdict for result in report.results if result.check in FILE_CHECKS.names()]
+    assert "broken" not in integrity[1:]
 
 
 @pytest.mark.parametrize("place", [0.2, 0.5, 0.8])
 def test_flipped_bits(place: float, good: Path, tmp_path: Path) -> None:
     spoilt = flip_bits(good, tmp_path / "flipped.mcap", offset=int(good.stat().st_size * place))
-    assert checked(spoilt, only=["opens", "checksums"]).level == "fail"
+    assert checked(spoilt, only=["opens", "checksums"]).verdict == "broken"
 
 
 def test_an_index_with_flipped_bits(good: Path, tmp_path: Path) -> None:
-    assert level_of(flip_bits(good, tmp_path / "flipped.mcap", offset=-200), "opens") == "fail"
+    assert verdict_of(flip_bits(good, tmp_path / "flipped.mcap", offset=-200), "opens") == "broken"
 
 
 def dropped(topic: str, at: int | None = None) -> Callable[[Message], list[Message]]:
@@ -226,7 +226,7 @@ FILES: dict[str, tuple[Callable[[Message], list[Message]], set[str]]] = {
 def test_a_spoilt_file(name: str, good: Path, tmp_path: Path) -> None:
     edit, checks = FILES[name]
     spoilt = rewrite_messages(good, tmp_path / "s.mcap", edit)
-    assert checks <= {check for check, level in findings(spoilt) if level == "fail"}
+    assert checks <= {check for check, verdict in findings(spoilt) if verdict == "broken"}
 
 
 @pytest.mark.parametrize("share", [1 / 3, 2 / 3])
@@ -234,7 +234,7 @@ def test_a_recovered_recording_is_a_warning(share: float, good: Path, tmp_path: 
     part = tmp_path / "cut.mcap.part"
     part.write_bytes(good.read_bytes()[: int(good.stat().st_size * share)])
     recover(part, tmp_path / "cut.mcap")
-    assert findings(tmp_path / "cut.mcap") == [("complete", "warn")]
+    assert findings(tmp_path / "cut.mcap") == [("complete", "look")]
     for args, code in (((), 0), (("--strict",), 1)):
         assert exit_code("check", tmp_path / "cut.mcap", *args) == code
 
@@ -247,19 +247,19 @@ def test_a_frozen_camera(filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     front = [images["front"].color for images in spoilt.images]
     spoilt.image("front", lambda t, p: front[40] if 40 < t < 90 else p)
-    assert findings(spoilt.write(tmp_path / "spoilt.mcap")) == [("frozen_images", "fail")]
+    assert findings(spoilt.write(tmp_path / "spoilt.mcap")) == [("frozen_images", "broken")]
 
 
 @pytest.mark.slow
 def test_a_black_camera(filmed: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(filmed)
     spoilt.image("front", lambda t, p: p * 0)
-    assert level_of(spoilt.write(tmp_path / "spoilt.mcap"), "blank_images") == "fail"
+    assert verdict_of(spoilt.write(tmp_path / "spoilt.mcap"), "blank_images") == "broken"
 
 
 def test_a_lost_packet(filmed: Path, tmp_path: Path) -> None:
     spoilt = rewrite_messages(filmed, tmp_path / "s.mcap", dropped(channels.video_topic("front", "h264"), 2 * SECOND))
-    assert level_of(spoilt, "video_frames") == "fail"
+    assert verdict_of(spoilt, "video_frames") == "broken"
 
 
 def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
@@ -272,7 +272,7 @@ def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
         # The bytes of the image are at the end; its header stays intact.
         return [(m[0], m[1], m[2][:-300] + rng.integers(0, 255, 300, dtype=np.uint8).tobytes(), m[3])]
 
-    assert level_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "fail"
+    assert verdict_of(rewrite_messages(filmed, tmp_path / "s.mcap", edit), "images_decode") == "broken"
 
 
 @pytest.mark.slow
@@ -283,8 +283,8 @@ def test_a_depth_image_that_is_cut_off(tmp_path: Path) -> None:
     spoilt = rewrite_messages(
         path, tmp_path / "s.mcap", lambda m: [(*m[:2], m[2][:-40], m[3])] if (m[0], m[3]) == (topic, at) else [m]
     )
-    assert level_of(path, "images_decode") == "pass"
-    assert level_of(spoilt, "images_decode") == "fail"
+    assert verdict_of(path, "images_decode") == "good"
+    assert verdict_of(spoilt, "images_decode") == "broken"
 
 
 # ------------------------------------------------------------------------------------------------- the command

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.check import checked, copy, edit_column, edit_json, edit_parquet, level_of, simulate_run
+from support.check import checked, copy, edit_column, edit_json, edit_parquet, simulate_run, verdict_of
 from support.commands import exit_code
 
 from demorec.check.report import CheckOptions, check_subjects, find_subjects
@@ -66,8 +66,8 @@ LINES: dict[str, Callable[[Any], None]] = {
 
 
 def test_the_good_one_passes(good: Path) -> None:
-    assert {(result.check, result.level) for result in checked(good, "run").results} == {
-        (check, "pass") for check in ("run_files", "run_complete", "run_agrees", "run_dataset")
+    assert {(result.check, result.verdict) for result in checked(good, "run").results} == {
+        (check, "good") for check in ("run_files", "run_complete", "run_agrees", "run_dataset")
     }
 
 
@@ -96,7 +96,7 @@ def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
         owner[last] = None
         path.write_text(json.dumps(spoilt))
         is_damaged = exit_code("info", run) == 1
-        assert (level_of(run, "run_files", "run") == "fail") == is_damaged, (*above, last)
+        assert (verdict_of(run, "run_files", "run") == "broken") == is_damaged, (*above, last)
         damaged |= {last} if is_damaged else set()
     assert {"repo_id", "num_episodes", "sha256", "config"} <= damaged
 
@@ -104,7 +104,7 @@ def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
 @pytest.mark.parametrize("name", LINES)
 def test_a_line_that_lies(name: str, run: Path) -> None:
     edit_json(run / "run.json", LINES[name])
-    assert level_of(run, "run_agrees", "run") == "fail"
+    assert verdict_of(run, "run_agrees", "run") == "broken"
 
 
 def recordings_exchanged(run: Path) -> None:
@@ -129,7 +129,7 @@ FOLDERS: dict[str, tuple[Callable[[Path], None], set[str]]] = {
 def test_a_fault_of_the_folder(name: str, run: Path) -> None:
     change, checks = FOLDERS[name]
     change(run)
-    assert checks <= {result.check for result in checked(run, "run").results if result.level == "fail"}
+    assert checks <= {result.check for result in checked(run, "run").results if result.verdict == "broken"}
 
 
 @pytest.mark.parametrize("complete", [True, False])
@@ -138,14 +138,14 @@ def test_a_recording_that_a_killed_run_has_not_listed_yet(run: Path, complete: b
     if not complete:
         edit_json(run / "run.json", lambda data: data.update(num_episodes=9))
     (found,) = checked(run, "run", only=["run_files"]).results
-    assert "episode_000007.mcap is not in run.json" in found.detail
-    assert ("the command that began the run adds it" in found.detail) != complete
+    assert "episode_000007.mcap is not in run.json" in found.message
+    assert ("the command that began the run adds it" in found.message) != complete
 
 
 def test_an_episode_twice_is_a_copy(run: Path) -> None:
-    assert level_of(run, "copied_episodes", "run") == "pass"
+    assert verdict_of(run, "copied_episodes", "run") == "good"
     an_episode_twice(run)
-    assert level_of(run, "copied_episodes", "run") == "fail"
+    assert verdict_of(run, "copied_episodes", "run") == "broken"
 
 
 # ------------------------------------------------------------------------------------------------- its dataset
@@ -156,7 +156,7 @@ def with_its_digest(dataset: Path) -> None:
     edit_column(dataset, "observation.velocity", lambda rows: rows * (1 + 1e-5))
     digests = episode_digests(LeRobotFolder(dataset))
     edit_parquet(next(dataset.glob("demorec/episodes/*/*.parquet")), "content_digest", lambda _: digests)
-    assert level_of(dataset, "dataset_sidecar", "dataset") == "pass"
+    assert verdict_of(dataset, "dataset_sidecar", "dataset") == "good"
 
 
 def an_episode_less(dataset: Path) -> None:
@@ -172,14 +172,14 @@ DATASETS = {"changed with its digest": with_its_digest, "an episode less": an_ep
 @pytest.mark.parametrize("name", DATASETS)
 def test_a_dataset_that_differs_from_its_recordings(name: str, run: Path) -> None:
     DATASETS[name](run / "dataset")
-    assert level_of(run, "run_dataset", "run") == "fail"
+    assert verdict_of(run, "run_dataset", "run") == "broken"
 
 
 @pytest.mark.slow
 def test_a_dataset_of_another_run(good: Path, tmp_path: Path) -> None:
     other = simulate_run(tmp_path / "other", 2, seed=4, fps=10, cameras=("front",))
     copy(good / "dataset", other / "dataset")
-    assert level_of(other, "run_dataset", "run") == "fail"
+    assert verdict_of(other, "run_dataset", "run") == "broken"
 
 
 # ------------------------------------------------------------------------------------------------- several subjects
@@ -191,11 +191,11 @@ def test_one_bad_recording_leaves_the_reports_of_the_others(workers: int, run: P
     bad = run / "episodes" / "episode_000000.mcap"
     bad.write_bytes(bad.read_bytes()[:-1000])
     reports = list(check_subjects(find_subjects([run]), CheckOptions(workers=workers, images=False)))
-    assert [(report.path.name, report.level) for report in reports] == [
-        ("run", "fail"),
-        ("episode_000000.mcap", "fail"),
-        ("episode_000001.mcap", "pass"),
-        ("dataset", "pass"),
+    assert [(report.path.name, report.verdict) for report in reports] == [
+        ("run", "broken"),
+        ("episode_000000.mcap", "broken"),
+        ("episode_000001.mcap", "good"),
+        ("dataset", "good"),
     ]
 
 
@@ -205,10 +205,10 @@ def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.Monke
 
     monkeypatch.setattr("demorec.extensions.doctor.checks.number_consistency.arm_of", broken)
     results = {result.check: result for result in checked(good / "episodes" / "episode_000000.mcap").results}
-    assert results["joint_limits"].level == "skip"
-    assert "cannot be computed" in results["joint_limits"].detail
-    assert "index" not in results["joint_limits"].detail
-    assert {results[name].level for name in ("opens", "checksums", "missing_numbers")} == {"pass"}
+    assert results["joint_limits"].verdict == "not measured"
+    assert "cannot be computed" in results["joint_limits"].message
+    assert "index" not in results["joint_limits"].message
+    assert {results[name].verdict for name in ("opens", "checksums", "missing_numbers")} == {"good"}
 
 
 def test_the_command_goes_on_after_a_bad_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:

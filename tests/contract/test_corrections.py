@@ -112,7 +112,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
 
 def test_no_check_fails_on_a_correction(rollout: tuple[Attempt, Path]) -> None:
     report = check_subject(Subject(path=rollout[1], kind="recording"), CheckOptions())
-    assert [result.check for result in report.results if result.level == "fail"] == []
+    assert [result.check for result in report.results if result.verdict == "broken"] == []
 
 
 def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Path) -> None:
@@ -279,4 +279,4 @@ def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Arr
         phase not in (POLICY_PHASE, "halt") for phase in trajectory.phase
     ]
     checked = check_subject(Subject(path=path, kind="recording"), CheckOptions())
-    assert [result.check for result in checked.results if result.level == "fail"] == []
+    assert [result.check for result in checked.results if result.verdict == "broken"] == []

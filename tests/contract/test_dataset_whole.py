@@ -243,14 +243,14 @@ def test_the_checks_judge_the_other_episodes(spoilt: tuple[Path, Path]) -> None:
     root, path = spoilt
     found = {result.check: result for result in checked(root, "dataset", images=False).results}
     is_data = path.suffix == ".parquet"
-    assert (found["unreadable_episodes"].level == "fail") == is_data
-    assert (found["video_places"].level == "fail") != is_data
-    assert path.name in found["unreadable_episodes" if is_data else "video_places"].detail
-    assert {found[name].level for name in ("missing_numbers", "contradicting_counts", "wrong_statistics")} <= {
-        "pass",
-        "skip",
+    assert (found["unreadable_episodes"].verdict == "broken") == is_data
+    assert (found["video_places"].verdict == "broken") != is_data
+    assert path.name in found["unreadable_episodes" if is_data else "video_places"].message
+    assert {found[name].verdict for name in ("missing_numbers", "contradicting_counts", "wrong_statistics")} <= {
+        "good",
+        "not measured",
     }
-    assert found["missing_numbers"].level == "pass"
+    assert found["missing_numbers"].verdict == "good"
 
 
 def test_the_other_episodes_are_shown(spoilt: tuple[Path, Path], tmp_path: Path) -> None:

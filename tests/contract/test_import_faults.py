@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 from support import bag_mappings, bags
 from support.bag_faults import ACTION, FAULTS, FRONT, STATE, hurt
+from support.check import result_of
 
-from demorec.check.run import CheckedRun
-from demorec.core.tables import FILE_CHECKS
 from demorec.extensions.imports.bag import open_bag
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.bag_findings import all_findings
@@ -143,10 +142,10 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
     mapping = bag_mappings.write_mapping(MAPPING, tmp_path / "robot.toml")
     import_bags([bag], mapping, tmp_path / "run")
     bag.unlink()
-    found = FILE_CHECKS.load("import_findings").run(CheckedRun(tmp_path / "run"))
-    assert found.level == ("warn" if name else "pass")
-    assert (kind in found.detail) == bool(name)
-    assert FILE_CHECKS.load("import_dropped").run(CheckedRun(tmp_path / "run")).level == "pass"
+    found = result_of(tmp_path / "run", "import_findings", "run")
+    assert found.verdict == ("look" if name else "good")
+    assert (kind in found.message) == bool(name)
+    assert result_of(tmp_path / "run", "import_dropped", "run").verdict == "good"
 
 
 def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
@@ -155,6 +154,6 @@ def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
     text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')
     text = text.replace("[cameras.front]", cut + "[cameras.front]")
     import_bags([bag], bag_mappings.write_mapping(text, tmp_path / "robot.toml"), tmp_path / "run")
-    result = FILE_CHECKS.load("import_dropped").run(CheckedRun(tmp_path / "run"))
-    assert (result.level, result.value) == ("warn", 1)
-    assert "camera front" in result.detail
+    result = result_of(tmp_path / "run", "import_dropped", "run")
+    assert (result.verdict, result.findings[0].value) == ("look", "1")
+    assert "camera front" in result.message

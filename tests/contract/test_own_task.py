@@ -35,4 +35,4 @@ def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch
         options = ReplayOptions(allowed=("my_pushing_tasks",))
         ((report, _),) = replay_all([open_file(path, options)], options)
         assert report.is_identical
-        assert checked(path).level == "pass"
+        assert checked(path).verdict == "good"

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.check import checked, edit_column, level_of, simulate_run
+from support.check import checked, edit_column, simulate_run, verdict_of
 from support.export import data_table, info
 from support.external import make_external, write_external
 
@@ -69,9 +69,9 @@ def test_the_state_is_joints_gripper_and_the_recorded_pose(run: Path, dataset: P
 def test_such_a_dataset_passes_every_check(dataset: Path, small: Path) -> None:
     for path in (dataset, small):
         report = checked(path, "dataset", images=False)
-        assert [r for r in report.results if r.level in ("warn", "fail")] == []
+        assert [r for r in report.results if r.verdict in ("look", "broken")] == []
     for check in ("pose_mismatch", "joint_limits"):
-        assert level_of(small, check, "dataset") == "pass"
+        assert verdict_of(small, check, "dataset") == "good"
 
 
 @pytest.mark.slow
@@ -79,7 +79,7 @@ def test_a_wrong_pose_in_the_state_is_found(small: Path) -> None:
     before = states(small)
     edit_column(small, STATE, lambda rows: rows[:, [*range(11), 14, 11, 12, 13]])  # scalar first
     assert not np.array_equal(states(small), before)
-    assert level_of(small, "pose_mismatch", "dataset") == "fail"
+    assert verdict_of(small, "pose_mismatch", "dataset") == "broken"
 
 
 @pytest.mark.slow

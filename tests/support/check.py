@@ -18,12 +18,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from demorec.check.base import Level, Result
+from demorec.check.base import Check, CheckResult
 from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.episode.episode import CameraImages, Event, Frame, Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
-from demorec.extensions.doctor.base import FaultCheck
 from demorec.extensions.doctor.examine import examine
 from demorec.extensions.doctor.explain_command import split_checks
 from demorec.extensions.doctor.from_dataset import ReadOptions
@@ -88,7 +87,7 @@ def checked(
     """Run some checks, or all: of files' integrity, and of motion and images, in one form."""
     integrity, doctors = split_checks(only)
     subject = Subject(path=path, kind=kind)  # type: ignore[arg-type]
-    found: tuple[Result, ...] = ()
+    found: tuple[CheckResult, ...] = ()
     if integrity or not only:
         found = check_subject(subject, CheckOptions(only=integrity, images=images)).results
     if doctors and (kind != "run" or only):
@@ -96,28 +95,24 @@ def checked(
     return SubjectReport(**vars(subject), results=found)
 
 
-def _of_doctor(path: Path, checks: Sequence[FaultCheck], options: ReadOptions) -> Iterator[Result]:
-    """Convert the report of the dataset checks: the worst finding of each check that applies."""
+def _of_doctor(path: Path, checks: Sequence[Check], options: ReadOptions) -> Iterator[CheckResult]:
+    """Convert the report of the dataset checks: one result of each check that applies."""
     diagnosis, _ = examine(path, options, checks=checks)
-    levels: dict[str, Level] = {"look": "warn", "broken": "fail"}
     for check in checks:
-        mine = [finding for finding in diagnosis.findings if finding.check == check.name]
-        level: Level = "pass"
-        detail = ""
-        if mine:
-            level, detail = levels[mine[0].severity], mine[0].message
-        elif check.name in diagnosis.not_measured:
-            level, detail = "skip", diagnosis.not_measured[check.name]
-        yield Result(
-            check=check.name, group=check.family, level=level, value=None, unit=check.unit, warn=0, fail=0, frame=None,
-            detail=detail, why=check.why, do=check.do,
-        )  # fmt: skip
+        found = tuple(finding for finding in diagnosis.findings if finding.check == check.name)
+        yield CheckResult(check=check.name, findings=found, not_measured=diagnosis.not_measured.get(check.name, ""))
 
 
-def level_of(path: Path, check: str, kind: str = "recording") -> str:
-    """Return the result of one check."""
+def result_of(path: Path, check: str, kind: str) -> CheckResult:
+    """Return the result of one check, which must apply."""
+    (result,) = checked(path, kind, only=[check]).results
+    return result
+
+
+def verdict_of(path: Path, check: str, kind: str = "recording") -> str:
+    """Return the verdict of one check; "not applicable" if it has no result."""
     report = checked(path, kind, only=[check])
-    return next(result.level for result in report.results if result.check == check)
+    return next((result.verdict for result in report.results if result.check == check), "not applicable")
 
 
 class Spoilt:

@@ -10,7 +10,7 @@ import pytest
 from support.commands import exit_code
 from support.export import export
 
-from demorec.extensions.doctor.base import DiagnosedFault
+from demorec.check.base import Finding
 from demorec.extensions.doctor.checks import lerobot_opens
 from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
 
@@ -19,10 +19,12 @@ _OF_LEROBOT = "OfflineModeIsEnabled: Cannot reach the Hub: please unset the `HF_
 """LeRobot 0.6.1's last line when a file of the dataset is missing: it requests the file from the Hub."""
 
 
-def opened(dataset: Path) -> list[DiagnosedFault]:
+def opened(dataset: Path) -> tuple[Finding, ...]:
     """Findings of opening it with LeRobot."""
     evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
-    return lerobot_opens.lerobot_opens.run(evidence)[0]
+    result = lerobot_opens.lerobot_opens.run(evidence)
+    assert result is not None
+    return result.findings
 
 
 def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 import pybullet
 import pytest
 from rerun.chunk import RrdReader
-from support.check import level_of
+from support.check import verdict_of
 from support.export import data_table, export
 from support.external import TOP, URDF, Episode, make_external, write_external
 
@@ -160,9 +160,9 @@ FAULTS: dict[str, Callable[[Path], object]] = {
 @pytest.mark.slow
 @pytest.mark.parametrize("name", FAULTS)
 def test_a_description_that_changed_is_found(name: str, dataset: Path) -> None:
-    assert level_of(dataset, "joint_limits", "dataset") == "pass"
+    assert verdict_of(dataset, "joint_limits", "dataset") == "good"
     FAULTS[name](dataset)
-    assert level_of(dataset, "unreadable_episodes", "dataset") == "fail"
+    assert verdict_of(dataset, "unreadable_episodes", "dataset") == "broken"
 
 
 def test_an_arm_whose_model_is_not_installed_is_drawn_from_the_dataset(

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import checked, level_of
+from support.check import checked, verdict_of
 from support.commands import exit_code
 from support.external import FORCE, TOP, Episode, make_external, write_external
 
@@ -106,13 +106,13 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str]] = {
 }  # fmt: skip
 
 
-def levels(path: Path) -> dict[str, str]:
-    return {result.check: result.level for result in checked(path).results}
+def verdicts(path: Path) -> dict[str, str]:
+    return {result.check: result.verdict for result in checked(path).results}
 
 
 def test_a_good_episode_passes(tmp_path: Path) -> None:
-    found = levels(write_external(tmp_path / "a.mcap", steady()))
-    assert set(found.values()) <= {"pass", "skip"}
+    found = verdicts(write_external(tmp_path / "a.mcap", steady()))
+    assert set(found.values()) <= {"good", "not measured"}
     measured = {
         "opens",
         "checksums",
@@ -124,11 +124,11 @@ def test_a_good_episode_passes(tmp_path: Path) -> None:
         "sample_age",
     }
     measured |= {"missing_images", "images_decode", "missing_numbers", "joint_limits", "frozen_state", "frozen_images"}
-    assert {found[check] for check in measured} == {"pass"}
+    assert {found[check] for check in measured} == {"good"}
 
 
-@pytest.mark.parametrize(("force_n", "level"), [(0.0, "pass"), (5.0, "fail")])
-def test_a_contact_sensor_may_stay_at_zero(force_n: float, level: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("force_n", "verdict"), [(0.0, "good"), (5.0, "broken")])
+def test_a_contact_sensor_may_stay_at_zero(force_n: float, verdict: str, tmp_path: Path) -> None:
     episode = steady()
     touch = replace(FORCE, name="observation.contact_force", names=("gripper.force",), units=("N",))
     frames = []
@@ -138,14 +138,14 @@ def test_a_contact_sensor_may_stay_at_zero(force_n: float, level: str, tmp_path:
         samples[touch.name] = replace(force, vector=np.array([force_n]))
         frames.append(replace(frame, samples=samples))
     episode = replace(episode, info=replace(episode.info, features=(*episode.info.features[:2], touch)), frames=frames)
-    assert levels(write_external(tmp_path / "a.mcap", episode))["frozen_sensors"] == level
+    assert verdicts(write_external(tmp_path / "a.mcap", episode))["frozen_sensors"] == verdict
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_is_named_by_its_check_alone(tmp_path: Path, fault: str) -> None:
     change, check = FAULTS[fault]
-    found = levels(write_external(tmp_path / "a.mcap", change(steady())))
-    assert {name for name, level in found.items() if level not in ("pass", "skip")} == {check}
+    found = verdicts(write_external(tmp_path / "a.mcap", change(steady())))
+    assert {name for name, verdict in found.items() if verdict not in ("good", "not measured")} == {check}
 
 
 def run(capsys: pytest.CaptureFixture[str], *args: object) -> tuple[int, str]:
@@ -179,8 +179,8 @@ def test_a_run_of_other_files_is_a_failure(external_run: Path, tmp_path: Path) -
     write_external(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
     report = check_subject(Subject(path=tmp_path, kind="run"), CheckOptions())
     told = next(result for result in report.results if result.check == "run_files")
-    assert (told.level, told.value) == ("fail", 2)
-    assert "episode_000000.mcap is missing" in told.detail
+    assert (told.verdict, told.findings[0].value) == ("broken", "2")
+    assert "episode_000000.mcap is missing" in told.message
 
 
 def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
@@ -189,4 +189,4 @@ def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
             episode = steady(num_frames=20)
             episode = replace(episode, info=replace(episode.info, episode_index=index))
             opened.add(write_external(episode_path(opened.path, index), episode))
-    assert level_of(tmp_path / "run", "copied_episodes", "run") == "fail"
+    assert verdict_of(tmp_path / "run", "copied_episodes", "run") == "broken"

@@ -64,8 +64,9 @@ def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pyt
     dataset = tmp_path / "d"
     export_lerobot([run], dataset, ExportOptions(verify=False))
     evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
-    found, reason = lerobot_opens.run(evidence)
-    assert (found, "needs the package 'lerobot'" in str(reason)) == ([], True)
+    result = lerobot_opens.run(evidence)
+    assert result is not None
+    assert (result.findings, "needs the package 'lerobot'" in result.not_measured) == ((), True)
     monkeypatch.setitem(sys.modules, "torch", None)
     with pytest.raises(MissingDependencyError, match="train"):
         Policy(tmp_path)

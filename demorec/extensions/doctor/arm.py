@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array
 from demorec.episode.element_names import joint_of
-from demorec.extensions.doctor.errors import NotMeasuredError
 from demorec.extensions.doctor.evidence import Evidence
 from demorec.robots.urdf import Urdf
 

@@ -8,18 +8,18 @@ from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from demorec.check.base import RANK
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import counted, say, say_json
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, describe_error
-from demorec.extensions.doctor.base import RANK
 from demorec.extensions.doctor.examine import as_json, examine, lines_of
 
 if TYPE_CHECKING:
+    from demorec.check.base import Check
     from demorec.check.report import Subject, SubjectReport
-    from demorec.extensions.doctor.base import FaultCheck
     from demorec.extensions.doctor.diagnosis import Diagnosis
     from demorec.extensions.doctor.evidence import Evidence
     from demorec.extensions.remake.deep.check import DeepReport
@@ -112,7 +112,7 @@ class CheckCommand:
         tell_unfinished(self.paths)
         return 1 if bad or different else 0
 
-    def _diagnosed(self, reports: Sequence[SubjectReport], checks: Sequence[FaultCheck]) -> list[Diagnosis]:
+    def _diagnosed(self, reports: Sequence[SubjectReport], checks: Sequence[Check]) -> list[Diagnosis]:
         """Diagnose each path, and print it."""
         from demorec.extensions.doctor.from_dataset import ReadOptions
 

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from demorec.check.base import FAMILIES, RANK, Check, Finding, Verdict
 from demorec.episode.roles import Role
-from demorec.extensions.doctor.base import RANK, DiagnosedFault, FaultCheck, Verdict
-from demorec.extensions.doctor.checks import FAMILIES, all_checks
+from demorec.extensions.doctor.checks import all_checks
 from demorec.extensions.doctor.evidence import Evidence
 from demorec.extensions.doctor.scores import score_episodes
 
@@ -53,7 +54,7 @@ class Diagnosis:
 
     path: Path
     taken: Mapping[str, Role | None]
-    findings: tuple[DiagnosedFault, ...]
+    findings: tuple[Finding, ...]
     episodes: tuple[EpisodeVerdict, ...]
     not_measured: Mapping[str, str]
     num_checks: int = 0
@@ -96,9 +97,7 @@ class Diagnosis:
         }
 
 
-def diagnose(
-    evidence: Evidence, checks: Sequence[FaultCheck] | None = None, extra: Sequence[DiagnosedFault] = ()
-) -> Diagnosis:
+def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: Sequence[Finding] = ()) -> Diagnosis:
     """Run all checks, or some.
 
     Args:
@@ -109,15 +108,9 @@ def diagnose(
     Raises:
         ResourceError: This machine cannot run one of them.
     """
-    findings = list(extra)
-    not_measured: dict[str, str] = {}
-    made = 0
-    for check in all_checks() if checks is None else checks:
-        found, reason = check.run(evidence)
-        findings += found
-        made += reason == ""
-        if reason:
-            not_measured[check.name] = reason
+    results = [check.run(evidence) for check in (all_checks() if checks is None else checks)]
+    made = [result for result in results if result is not None]
+    findings = [*extra, *(_for_recordings(found, evidence) for result in made for found in result.findings)]
     order = {check.name: FAMILIES.index(check.family) for check in all_checks()}
     findings.sort(
         key=lambda f: (-RANK[f.severity], order.get(f.check, 0), f.check, -1 if f.episode is None else f.episode)
@@ -127,14 +120,23 @@ def diagnose(
         taken=dict(evidence.taken()),
         findings=tuple(findings),
         episodes=_verdicts(evidence, findings),
-        not_measured=not_measured,
-        num_checks=made,
+        not_measured={result.check: result.not_measured for result in made if result.not_measured},
+        num_checks=sum(not result.not_measured for result in made),
         num_frames=sum(episode.length for episode in evidence.episodes),
         cameras=tuple(evidence.cameras),
     )
 
 
-def _verdicts(evidence: Evidence, findings: Sequence[DiagnosedFault]) -> tuple[EpisodeVerdict, ...]:
+def _for_recordings(finding: Finding, evidence: Evidence) -> Finding:
+    """Replace advice to edit the dataset if the evidence is from recordings."""
+    if evidence.folder is not None or "demorec dataset" not in finding.do:
+        return finding
+    name = "the recordings" if finding.episode is None else evidence.names.get(finding.episode, "the recordings")
+    view = f"demorec view {shlex.quote(str(evidence.path))}"
+    return replace(finding, do=f"look at it: {view}; then leave {name} out, or record it again")
+
+
+def _verdicts(evidence: Evidence, findings: Sequence[Finding]) -> tuple[EpisodeVerdict, ...]:
     """Build the verdict on each episode, worst first."""
     found = []
     for number, score in score_episodes(evidence).items():

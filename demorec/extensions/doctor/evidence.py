@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import re
-import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -14,9 +13,9 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array, signs_of_course
 from demorec.episode.roles import Role, Roles
-from demorec.extensions.doctor.errors import NotMeasuredError
 from demorec.extensions.doctor.robust import without_gaps
 
 if TYPE_CHECKING:
@@ -24,6 +23,10 @@ if TYPE_CHECKING:
     from demorec.extensions.doctor.thumbnails import CameraThumbnails
 
 Flags = NDArray[np.bool_]
+DROP = "demorec dataset drop {path} --episodes {episode} --out NEW"
+"""Advice for one bad episode."""
+REPAIR = "demorec dataset repair {path} --out NEW"
+"""Advice for tables, counts and statistics that contradict the rows."""
 _HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
 """Joint names of a hand with fingers."""
 
@@ -103,11 +106,6 @@ class Evidence:
     names: Mapping[int, str] = field(default_factory=dict)
     earlier: Sequence[Evidence] = ()
     _derived: dict[tuple[object, ...], object] = field(default_factory=dict)
-
-    @property
-    def quoted_path(self) -> str:
-        """Path quoted for a shell, with braces doubled for `str.format`."""
-        return shlex.quote(str(self.path))
 
     def without_images(self) -> Evidence:
         """Return the same episodes without their images, to compare other sets with."""

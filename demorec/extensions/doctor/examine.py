@@ -8,12 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from demorec.check.base import Finding
 from demorec.cli.shared.output import counted
 
 if TYPE_CHECKING:
-    from demorec.check.base import Result
+    from demorec.check.base import Check
     from demorec.check.report import SubjectReport
-    from demorec.extensions.doctor.base import DiagnosedFault, FaultCheck
     from demorec.extensions.doctor.diagnosis import Diagnosis
     from demorec.extensions.doctor.evidence import Evidence
     from demorec.extensions.doctor.from_dataset import ReadOptions
@@ -31,7 +31,7 @@ def examine(
     options: ReadOptions,
     *,
     reports: Sequence[SubjectReport] = (),
-    checks: Sequence[FaultCheck] | None = None,
+    checks: Sequence[Check] | None = None,
     earlier: Sequence[Evidence] = (),
 ) -> tuple[Diagnosis, Evidence | None]:
     """Diagnose a dataset, a run, or recordings; also returns the evidence, None if nothing can be opened.
@@ -49,7 +49,7 @@ def examine(
     from demorec.runs.find import find
 
     chosen = all_checks() if checks is None else checks
-    extra = list(_integrity_findings(reports))
+    extra = list(_of_files(reports))
     try:
         evidence = _evidence(path, options)
     except ExportError as error:
@@ -60,10 +60,12 @@ def examine(
     diagnosis = diagnose(evidence, chosen, extra)
     if found.kind == "run" and evidence.folder is None:
         diagnosis = _with_dataset(diagnosis, path, options, chosen)
-    integrity = [result for report in reports for result in report.results]
-    unmade = {result.check: result.detail for result in integrity if _is_unmade(result)}
-    passed = {result.check for result in integrity if result.level == "pass"}
-    not_measured = {**diagnosis.not_measured, **unmade}
+    results = [result for report in reports for result in report.results]
+    not_measured = {
+        **diagnosis.not_measured,
+        **{each.check: each.not_measured for each in results if each.not_measured},
+    }
+    passed = {each.check for each in results if each.verdict == "good"}
     return replace(diagnosis, not_measured=not_measured, num_checks=diagnosis.num_checks + len(passed)), evidence
 
 
@@ -80,7 +82,7 @@ def _evidence(path: Path, options: ReadOptions) -> Evidence:
     return evidence_of_recordings(path, (*found.recordings, *rollouts), open_recording, options)
 
 
-def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[FaultCheck]) -> Diagnosis:
+def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[Check]) -> Diagnosis:
     """Add the findings about the files of a run's own dataset; its numbers and images are those of the recordings."""
     from demorec.core.errors import ExportError
     from demorec.extensions.doctor.diagnosis import diagnose
@@ -103,14 +105,12 @@ def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen:
     return replace(diagnosis, findings=(*found, *diagnosis.findings), not_measured={**unmade, **files.not_measured})
 
 
-def _of(finding: DiagnosedFault) -> str:
+def _of(finding: Finding) -> str:
     return "" if finding.episode is None else f"episode {finding.episode}: "
 
 
-def _unopened(error: Exception, path: Path) -> DiagnosedFault:
-    from demorec.extensions.doctor.base import DiagnosedFault
-
-    return DiagnosedFault(
+def _unopened(error: Exception, path: Path) -> Finding:
+    return Finding(
         check="unreadable_episodes",
         severity="broken",
         message=str(error).removesuffix(f": {path}"),
@@ -119,32 +119,13 @@ def _unopened(error: Exception, path: Path) -> DiagnosedFault:
     )
 
 
-def _integrity_findings(reports: Iterable[SubjectReport]) -> Iterator[DiagnosedFault]:
-    """Convert results of the file checks to findings; those of a recording belong to its episode."""
-    from demorec.extensions.doctor.base import DiagnosedFault
-
+def _of_files(reports: Iterable[SubjectReport]) -> Iterator[Finding]:
+    """Yield the findings of the file checks; those of a recording belong to its episode."""
     recordings = [report.path for report in reports if report.kind == "recording"]
     for report in reports:
         number = recordings.index(report.path) if report.kind == "recording" else None
-        for result in report.results:
-            if result.level in ("warn", "fail"):
-                value = "" if result.value is None else f"{result.value:.4g} {result.unit}".strip()
-                yield DiagnosedFault(
-                    check=result.check,
-                    severity="broken" if result.level == "fail" else "look",
-                    episode=number,
-                    frames=None if result.frame is None else (result.frame, result.frame),
-                    value=value,
-                    message=f"{report.path.name}: {result.detail or value}",
-                    why=result.why,
-                    do=result.do.format(path=report.path),
-                )
-
-
-def _is_unmade(result: Result) -> bool:
-    from demorec.check.base import BLOCKED, NOTHING
-
-    return result.level == "skip" and result.detail not in (BLOCKED, NOTHING)
+        for finding in report.findings:
+            yield replace(finding, episode=number, message=f"{report.path.name}: {finding.message}")
 
 
 def lines_of(diagnosis: Diagnosis, *, everything: bool = False) -> Iterator[str]:
@@ -192,16 +173,16 @@ def _by_reason(not_measured: Mapping[str, str]) -> dict[str, list[str]]:
     return found
 
 
-def _folded(findings: Sequence[DiagnosedFault]) -> Iterator[list[DiagnosedFault]]:
+def _folded(findings: Sequence[Finding]) -> Iterator[list[Finding]]:
     """Group findings of one check and severity, in order; those of the whole set stay separate."""
-    groups: dict[tuple[str, str, str], list[DiagnosedFault]] = {}
+    groups: dict[tuple[str, str, str], list[Finding]] = {}
     for finding in findings:
         own = finding.message if finding.episode is None else ""
         groups.setdefault((finding.check, finding.severity, own), []).append(finding)
     yield from groups.values()
 
 
-def _finding(same: Sequence[DiagnosedFault]) -> Iterator[str]:
+def _finding(same: Sequence[Finding]) -> Iterator[str]:
     worst = same[0]
     numbers = list(dict.fromkeys(each.episode for each in same if each.episode is not None))
     where = ""

@@ -13,7 +13,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.registry import nearest_match
 
 if TYPE_CHECKING:
-    from demorec.extensions.doctor.base import FaultCheck
+    from demorec.check.base import Check
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -49,7 +49,7 @@ def _row(name: str, text: str, width: int) -> Iterator[str]:
     yield from textwrap.wrap(text, width, initial_indent=f"{name:<7}", subsequent_indent=" " * 7)
 
 
-def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[FaultCheck, ...]]:
+def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ...]]:
     """Find the named checks: names of file integrity checks, and checks of the doctor; all of them without names.
 
     Raises:

@@ -9,8 +9,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.errors import NotMeasuredError
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.extensions.doctor.robust import finest
 

@@ -61,16 +61,16 @@ class ReportCommand:
             raise ConfigError(f"--out: folder {self.out.parent} is missing.")
         refuse_inside([self.out])
         from demorec.check.report import CheckOptions
+        from demorec.extensions.doctor.examine import examine
         from demorec.extensions.doctor.from_dataset import ReadOptions
         from demorec.extensions.report.gather import gather
-        from demorec.extensions.report.judgement import results_of
         from demorec.extensions.report.page import write_page
 
         named = self.roles.named
         checks = CheckOptions(images=self.images) if self.checks else None
         with atomic_write(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path])) as part:
             with reading([self.path], self.mapping) as (path,), ProgressBar("reading", unit="item") as bar:
-                judged = results_of(path, ReadOptions(images=self.images, named=named)) if self.checks else ()
+                judged = examine(path, ReadOptions(images=self.images, named=named))[0] if self.checks else None
                 report = gather(
                     path,
                     camera=self.camera,

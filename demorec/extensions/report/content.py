@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.check.base import Level, Result
+from demorec.check.base import CheckResult, Finding
 from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome
 from demorec.episode.roles import Roles
+from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.policies.statistics import Rate
 from demorec.extensions.report.filmstrip import Filmstrip
 
-LEVELS: tuple[Level, ...] = ("skip", "pass", "warn", "fail")
+VERDICTS = ("not measured", "good", "look", "broken")
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
 """State of an episode. "flagged" is a success with a check that failed or warned."""
 
@@ -36,7 +37,8 @@ class ReportedEpisode:
         num_frames, fps: Length and frame rate.
         seed: Root seed of the run.
         phases: (name, first frame, frame after the last) of each phase, in order.
-        flags: Results of checks that failed or warned, failures first.
+        flags: Findings of checks, broken ones first.
+        score: Score by the doctor; 1 for a good or unjudged episode.
         filmstrip: None without images, and for some successes in a long report.
         facts: (name, value) for the summary of all episodes: robot, cameras, ...
     """
@@ -50,7 +52,8 @@ class ReportedEpisode:
     fps: int = 1
     seed: int | None = None
     phases: tuple[tuple[str, int, int], ...] = ()
-    flags: tuple[Result, ...] = ()
+    flags: tuple[Finding, ...] = ()
+    score: float = 1.0
     filmstrip: Filmstrip | None = None
     facts: tuple[tuple[str, str], ...] = ()
 
@@ -116,64 +119,55 @@ def add_components(into: Components, found: Components) -> None:
         into.setdefault(key, []).extend(parts)
 
 
-class EpisodeResult(NamedTuple):
-    """A result of the doctor with its episode number; None for the whole dataset."""
+def judged_episode(episode: ReportedEpisode, number: int, judged: Diagnosis | None) -> ReportedEpisode:
+    """Add the doctor's findings and score of an episode."""
+    if judged is None:
+        return episode
+    flags = [*episode.flags, *(finding for finding in judged.findings if finding.episode == number)]
+    scores = [each.score for each in judged.episodes if each.episode == number and each.verdict != "good"]
+    return replace(episode, flags=broken_first(flags), score=min(scores, default=1.0))
 
-    episode: int | None
-    result: Result
 
-
-def flags_of(judged: Iterable[EpisodeResult]) -> dict[int, tuple[Result, ...]]:
-    """Episode number -> its results."""
-    found: dict[int, tuple[Result, ...]] = {}
-    for episode, result in judged:
-        if episode is not None:
-            found[episode] = (*found.get(episode, ()), result)
-    return found
+def broken_first(findings: Iterable[Finding]) -> tuple[Finding, ...]:
+    """Sort findings by severity."""
+    return tuple(sorted(findings, key=lambda finding: finding.severity != "broken"))
 
 
 class CheckSummaries:
     """Results of the checks over all subjects, in the order of the first results.
 
     Attributes:
-        worst: Name of a check -> its result with the highest level and, within that, the largest value, and the
-        subject.
-        counts: Name of a check -> number of its results of each level.
+        worst: Name of a check -> its first result of the worst verdict, and the subject.
+        counts: Name of a check -> number of its results of each verdict.
         num_subjects: Number of recordings, runs and datasets.
     """
 
     def __init__(self) -> None:
-        self.worst: dict[str, tuple[Result, str]] = {}
-        self.counts: dict[str, Counter[Level]] = {}
+        self.worst: dict[str, tuple[CheckResult, str]] = {}
+        self.counts: dict[str, Counter[str]] = {}
         self.num_subjects = 0
 
-    def add(self, results: Iterable[Result], where: str) -> None:
+    def add(self, results: Iterable[CheckResult], where: str) -> None:
         """Count the results of one recording, run or dataset."""
         self.num_subjects += 1
         for result in results:
-            self.counts.setdefault(result.check, Counter())[result.level] += 1
-            if result.check not in self.worst or _rank(result) > _rank(self.worst[result.check][0]):
-                self.worst[result.check] = result, where
+            self._count(result, where)
 
-    def count(self, result: Result, where: str) -> None:
-        """Count one more result of a subject that was counted before."""
-        self.num_subjects -= 1
-        self.add([result], where)
+    def add_judged(self, judged: Diagnosis | None) -> None:
+        """Count the doctor's findings."""
+        for finding in () if judged is None else judged.findings:
+            where = "the whole set" if finding.episode is None else f"episode {finding.episode}"
+            self._count(CheckResult(check=finding.check, findings=(finding,)), where)
 
-    def of(self, *levels: Level) -> list[tuple[Result, str]]:
-        """The worst results with one of these levels, level by level, each with its subject."""
-        return [item for level in levels for item in self.worst.values() if item[0].level == level]
+    def _count(self, result: CheckResult, where: str) -> None:
+        self.counts.setdefault(result.check, Counter())[result.verdict] += 1
+        known = self.worst.get(result.check)
+        if known is None or VERDICTS.index(result.verdict) > VERDICTS.index(known[0].verdict):
+            self.worst[result.check] = result, where
 
-
-def add_judged(summaries: CheckSummaries, judged: Iterable[EpisodeResult]) -> None:
-    """Count the doctor's findings."""
-    for episode, result in judged:
-        summaries.count(result, "the whole set" if episode is None else f"episode {episode}")
-
-
-def _rank(result: Result) -> tuple[int, float]:
-    unknown = float("inf") if result.level == "fail" else float("-inf")
-    return LEVELS.index(result.level), unknown if result.value is None else result.value
+    def of(self, *verdicts: str) -> list[tuple[CheckResult, str]]:
+        """The worst results with one of these verdicts, verdict by verdict, each with its subject."""
+        return [item for verdict in verdicts for item in self.worst.values() if item[0].verdict == verdict]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

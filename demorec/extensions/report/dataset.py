@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -20,17 +20,16 @@ from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.roles import NamedRoles, Roles
+from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.report.content import (
     MAX_COMPONENTS,
     CheckSummaries,
     Components,
-    EpisodeResult,
     Report,
     ReportedEpisode,
     add_components,
-    add_judged,
     common_facts,
-    flags_of,
+    judged_episode,
     motion_components,
 )
 from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
@@ -47,7 +46,7 @@ def dataset_report(
     root: Path,
     camera: str,
     checks: CheckOptions | None,
-    judged: Sequence[EpisodeResult],
+    judged: Diagnosis | None,
     named: NamedRoles,
     advance: Callable[[int, int], None],
 ) -> Report:
@@ -66,19 +65,19 @@ def dataset_report(
     stride = max(1, -(-len(folder.places) // MAX_SHOWN))
     components: Components = {}
     episodes: list[ReportedEpisode] = []
-    flags = flags_of(judged)
+    flagged = set() if judged is None else {finding.episode for finding in judged.findings}
     for number, place in enumerate(folder.places):
         columns: Mapping[str, NDArray[Any]] = {}
         strip: Filmstrip | None = None
         problems: list[str] = []
-        odd = flags.get(place.episode_index, ())
         with noted(problems, root):
             columns = {} if reader is None else reader.numbers(place)
             add_components(components, motion_components(roles, columns))
-            if key is not None and (odd or number % stride == 0):
+            if key is not None and (place.episode_index in flagged or number % stride == 0):
                 strip = _strip(folder, key, place)
         episode = _episode(place, info.fps, columns, rows.get(place.episode_index))
-        episodes.append(replace(episode, filmstrip=strip, problem="; ".join(problems), flags=odd))
+        episode = replace(episode, filmstrip=strip, problem="; ".join(problems))
+        episodes.append(judged_episode(episode, place.episode_index, judged))
         advance(len(episodes), total)
     episodes += [_left_out(row) for row in left_out]
     summaries = CheckSummaries()
@@ -86,7 +85,7 @@ def dataset_report(
         missing.append("No checks were run (--no-checks).")
     else:
         summaries.add(check_subject(Subject(path=root, kind="dataset"), checks).results, "the dataset")
-        add_judged(summaries, judged)
+        summaries.add_judged(judged)
     advance(total, total)
     return Report(
         title=root.resolve().name,

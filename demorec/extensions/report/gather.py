@@ -13,17 +13,17 @@ from demorec.core.processes import in_turn
 from demorec.episode.episode import Outcome, consecutive_runs
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
+from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.report.content import (
     CheckSummaries,
     Components,
-    EpisodeResult,
     Report,
     ReportedEpisode,
     add_components,
-    add_judged,
+    broken_first,
     common_facts,
     few,
-    flags_of,
+    judged_episode,
     motion_components,
 )  # fmt: skip
 from demorec.extensions.report.dataset import dataset_report
@@ -56,7 +56,7 @@ def gather(
     *,
     camera: str = "",
     checks: CheckOptions | None = None,
-    judged: Sequence[EpisodeResult] = (),
+    judged: Diagnosis | None = None,
     workers: int = 1,
     named: NamedRoles = NO_NAMES,
     advance: Callable[[int, int], None] = lambda done, total: None,
@@ -67,7 +67,7 @@ def gather(
         path: Path of the source.
         camera: Camera of the filmstrips; "" for the first one.
         checks: Selected checks of files; None for none.
-        judged: Findings of the doctor.
+        judged: The doctor's diagnosis.
         workers: Number of processes that read and check recordings.
         named: Features whose role the user names, in data that demorec did not simulate.
         advance: Called with the number of finished items and of all items.
@@ -86,7 +86,7 @@ def _recordings_report(
     found: Found,
     camera: str,
     checks: CheckOptions | None,
-    judged: Sequence[EpisodeResult],
+    judged: Diagnosis | None,
     workers: int,
     named: NamedRoles,
     advance: Callable[[int, int], None],
@@ -106,9 +106,8 @@ def _recordings_report(
     total = len(subjects) + len(folders)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    flags = flags_of(judged)
     for number, (episode, found_in, checked) in enumerate(_read_all(path, camera, checks, subjects, workers, named)):
-        episodes.append(replace(episode, flags=(*episode.flags, *flags.get(number, ()))))
+        episodes.append(judged_episode(episode, number, judged))
         add_components(components, found_in)
         if checked is not None:
             summaries.add(checked.results, episode.name)
@@ -119,7 +118,7 @@ def _recordings_report(
         for number, subject in enumerate(folders, len(subjects) + 1):
             summaries.add(check_subject(subject, checks).results, f"the {subject.kind}")
             advance(number, total)
-        add_judged(summaries, judged)
+        summaries.add_judged(judged)
         if not checks.images:
             missing.append("The checks that decode all images were not run; --images runs them, too.")
     if run is not None:
@@ -158,8 +157,7 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, named: NamedRole
     """
     subject, strip_bytes = given
     checked = None if checks is None else check_subject(subject, checks)
-    flags = [result for result in checked.results if result.level in ("warn", "fail")] if checked else []
-    flags.sort(key=lambda result: result.level != "fail")
+    flags = broken_first(() if checked is None else checked.findings)
     path = subject.path
     source = path.name if path == root else path.relative_to(root).as_posix()
     try:
@@ -168,7 +166,7 @@ def _read(root: Path, camera: str, checks: CheckOptions | None, named: NamedRole
             components = motion_components(roles_of_recording(recording.info, named), recording.table().features)
     except RecordingError as error:
         episode, components = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
-    return replace(episode, source=source, flags=tuple(flags)), components, checked
+    return replace(episode, source=source, flags=flags), components, checked
 
 
 def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> ReportedEpisode:

@@ -20,12 +20,12 @@ from jinja2.environment import TemplateStream
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from demorec.check.base import Result
+from demorec.check.base import Finding
 from demorec.core.replacing import REPORT_MARK
 from demorec.core.text import printable
 from demorec.extensions.report import charts
 from demorec.extensions.report.charts import Chart, css_color
-from demorec.extensions.report.content import LEVELS, MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
+from demorec.extensions.report.content import MAX_SAMPLES, VERDICTS, Report, ReportedEpisode, State, success_rate
 from demorec.extensions.report.filmstrip import MAX_SHOWN
 from demorec.view.style import phase_colors
 
@@ -83,9 +83,9 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(charts=charts, levels=LEVELS[::-1], max_samples=MAX_SAMPLES, states=_STATES)
+    environment.globals.update(charts=charts, verdicts=VERDICTS[::-1], max_samples=MAX_SAMPLES, states=_STATES)
     environment.filters.update(
-        fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, measured=measured, words=_words
+        fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, place=place, words=_words
     )
     return environment
 
@@ -110,8 +110,7 @@ def _shown(episodes: Sequence[ReportedEpisode]) -> list[tuple[int, ReportedEpiso
     ]
 
     def urgency(item: tuple[int, ReportedEpisode]) -> tuple[int, float]:
-        scores = [flag.value for flag in item[1].flags if flag.check == "score" and flag.value is not None]
-        return list(_STATES).index(item[1].state), min(scores, default=1.0)
+        return list(_STATES).index(item[1].state), item[1].score
 
     return sorted(chosen, key=urgency)[:MAX_SHOWN]
 
@@ -132,13 +131,9 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
     return sorted(groups.items(), key=lambda item: (item[0] in _GOOD, -len(item[1]), item[0]))
 
 
-def measured(result: Result) -> tuple[str, str, str]:
-    """Value, limit and place of a result."""
-    unit = f"\u00a0{result.unit}" if result.unit else ""
-    value = "" if result.value is None else f"{result.value:.4g}{unit}"
-    frame = "" if result.frame is None else f"frame {result.frame}"
-    where = ": ".join(filter(None, (frame, result.detail)))
-    return value, f"{result.allowed:.4g}{unit}" if result.level in ("warn", "fail", "pass") else "", where
+def place(finding: Finding) -> str:
+    """Frame and message of a finding."""
+    return finding.message if finding.frames is None else f"frame {finding.frames[0]}: {finding.message}"
 
 
 def _about(episode: ReportedEpisode) -> str:

@@ -7,10 +7,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotMeasuredError
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.scores import score_episodes
 from demorec.extensions.doctor.units import other_units

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
+from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, Severity, check
 from demorec.datasets.lerobot.files import open_table, read_table, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
 from demorec.datasets.lerobot.videos import opened_video
-from demorec.extensions.doctor.base import DROP, Fault, Severity, check
-from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import DROP, Evidence
 
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),

@@ -8,11 +8,10 @@ from typing import Literal
 
 import numpy as np
 
+from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.base import DROP, Fault, check
 from demorec.extensions.doctor.checks.numbers import MIN_OTHERS, element_name
-from demorec.extensions.doctor.errors import NotMeasuredError
-from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import runs
 from demorec.extensions.doctor.units import state_bounds

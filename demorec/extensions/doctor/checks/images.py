@@ -7,10 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.robust import runs
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.extensions.doctor.visible_motion import visible_motion

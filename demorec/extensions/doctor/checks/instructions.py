@@ -7,8 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator
 
-from demorec.extensions.doctor.base import Fault, check
-from demorec.extensions.doctor.errors import NotMeasuredError
+from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.extensions.doctor.evidence import Evidence
 
 _PLACEHOLDERS = frozenset(("", "none", "null", "nan", "task", "todo", "test", "unknown", "n/a", "default"))

@@ -12,12 +12,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.episode.features import EE_POSE
 from demorec.extensions.doctor.arm import arm_of
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotMeasuredError
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.robots.urdf import Urdf, UrdfJoint
 
 KNOWN_ERROR_M = 0.05

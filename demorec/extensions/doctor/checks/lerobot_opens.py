@@ -11,12 +11,11 @@ import sys
 import tempfile
 from collections.abc import Iterator
 
+from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.errors import MissingDependencyError, ResourceError
 from demorec.datasets.lerobot.inspect import dataset_problems
 from demorec.datasets.lerobot.verify import LEROBOT, lerobot_is_installed
-from demorec.extensions.doctor.base import Fault, check
 from demorec.extensions.doctor.checks.files import folder_of
-from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
 from demorec.extensions.doctor.evidence import Evidence
 
 _TIMEOUT_S = 600

@@ -6,11 +6,10 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
+from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.arm import arm_of
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
-from demorec.extensions.doctor.evidence import Evidence, joined, quaternion_places
+from demorec.extensions.doctor.evidence import DROP, Evidence, joined, quaternion_places
 from demorec.extensions.doctor.robust import usual, without_gaps
 
 VELOCITY_WINDOW_S = 0.3

@@ -7,11 +7,10 @@ from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
+from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.episode.element_names import joint_of
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotMeasuredError
-from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, number_in_words
+from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence, number_in_words
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.units import MIN_UNIT_RATIO, other_units, state_bounds
 

@@ -8,15 +8,14 @@ from typing import Any
 
 import numpy as np
 
+from demorec.check.base import Fault, NotMeasuredError, Severity, check
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.episode_records import OLD_STATS, episode_statistics
 from demorec.datasets.lerobot.files import open_table, rows_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
-from demorec.extensions.doctor.base import Fault, Severity, check
 from demorec.extensions.doctor.checks.files import folder_of
-from demorec.extensions.doctor.errors import NotMeasuredError
 from demorec.extensions.doctor.evidence import Evidence
 
 _RENUMBERED = ("index", "episode_index")

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotApplicableError, NotMeasuredError
-from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
 
 MAX_GAP_PERIODS = 2.5
 """Maximum periods between two frames without missing ones; one late frame takes two."""

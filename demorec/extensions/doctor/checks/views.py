@@ -10,9 +10,8 @@ from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from demorec.extensions.doctor.base import DROP, Fault, check
-from demorec.extensions.doctor.errors import NotMeasuredError
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.check.base import Fault, NotMeasuredError, check
+from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.view_fit import MAX_UNRELATED_RATIO, MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
 
