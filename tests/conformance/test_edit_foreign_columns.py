@@ -22,7 +22,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from support.commands import exit_code
-from support.drawn_datasets import DrawnDataset, write_drawn
+from support.drawn_datasets import STATE, DrawnDataset, write_drawn
 from support.export import recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
@@ -320,3 +320,20 @@ def test_a_merge_keeps_the_files_that_are_the_same_in_all(tmp_path: Path, capsys
         assert f"eft out: {different} (not the same in all datasets: copy it if it still applies)." in printed
     assert {name: (tmp_path / "new" / name).read_bytes() for name in kept} == kept
     assert not (tmp_path / "new/meta/notes of ours.txt").exists()
+
+
+def test_nothing_is_appended_to_a_table_of_episodes_with_other_columns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """LeRobot would read none of the episodes."""
+    first, second = (write_drawn(tmp_path / str(seed), replace(PLAIN, version="v3.0"), seed) for seed in range(2))
+    assert exit_code("import", "lerobot", second, "--out", tmp_path / "run") == 0
+    before = {path: path.read_bytes() for path in first.rglob("*") if path.is_file()}
+    words = ["export", "lerobot", tmp_path / "run", "--append", "--no-verify", "--out"]
+    assert exit_code(*words, first) == 1
+    error = capsys.readouterr().err
+    assert f"lacks columns that new episodes have, such as stats/{STATE}/min" in error
+    assert f"demorec dataset select {first} --where 'num_frames > 0' --out NEW" in error
+    assert {path: path.read_bytes() for path in first.rglob("*") if path.is_file()} == before
+    assert exit_code("dataset", "select", first, "--where", "num_frames > 0", "--out", tmp_path / "new") == 0
+    assert exit_code(*words, tmp_path / "new") == 0

@@ -26,8 +26,11 @@ from demorec.datasets.lerobot.layout import (
 )
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
-from demorec.datasets.lerobot.stats import Statistics
+from demorec.datasets.lerobot.stats import NAMES, Statistics
 from demorec.datasets.lerobot.writer import DatasetStart
+
+_CONVERT = "demorec dataset select {} --where 'num_frames > 0' --out NEW"
+"""Command that writes all episodes in the current format."""
 
 
 def start_after(folder: LeRobotFolder) -> DatasetStart:
@@ -40,7 +43,7 @@ def start_after(folder: LeRobotFolder) -> DatasetStart:
     if info.is_old:
         raise ExportError(
             f"The dataset has format {info.version}, and only {CODEBASE_VERSION} can be appended to. This converts it "
-            f"to {CODEBASE_VERSION}: demorec dataset select {shlex.quote(str(root))} --where 'num_frames > 0' --out NEW"
+            f"to {CODEBASE_VERSION}: {_CONVERT.format(shlex.quote(str(root)))}"
         )
     episodes, frames = len(folder.places), sum(place.length for place in folder.places)
     rows = sum(open_table(path).metadata.num_rows for path in tables_in(root, "data"))
@@ -48,6 +51,14 @@ def start_after(folder: LeRobotFolder) -> DatasetStart:
         raise ExportError(
             f"The dataset is incomplete: its episodes have {frames} frames, its data files {rows}: {root}"
         )
+    keys = [name for name, feature in info.features.items() if feature.is_numeric or feature.is_camera]
+    needed = [f"stats/{key}/{name}" for key in keys for name in NAMES]
+    for path in folder.episode_tables:
+        if absent := [name for name in needed if name not in open_table(path).schema_arrow.names]:
+            raise ExportError(
+                f"The table of episodes lacks columns that new episodes have, such as {absent[0]}. This adds them: "
+                f"{_CONVERT.format(shlex.quote(str(root)))}"
+            )
     try:
         tasks = tuple(folder.tasks) if info.total_tasks else ()
         found = folder.statistics if (root / STATS_PATH).exists() else {}
