@@ -103,19 +103,21 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
     return path
 
 
-def write_isaac(path: Path, *, robot: str = "robot", count: int = 6) -> Path:
+def write_isaac(
+    path: Path, *, robot: str = "robot", count: int = 6, joints: int = 9, demos: tuple[str, ...] = ("demo_0", "demo_1")
+) -> Path:
     """Write a file like Isaac Lab's recorder: joint_pos relative to the default pose, quaternions with w first."""
     rng = np.random.default_rng(2)
-    default = rng.normal(size=9)
+    default = rng.normal(size=joints)
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs["env_args"] = json.dumps({"env_name": "Isaac-Stack-Cube-Franka-v0", "type": 2})
-        for name in ("demo_0", "demo_1"):
+        for name in demos:
             demo = data.create_group(name)
-            absolute = rng.normal(size=(count, 9)).astype(np.float32)
+            absolute = rng.normal(size=(count, joints)).astype(np.float32)
             demo["actions"] = rng.uniform(-1, 1, (count, 7)).astype(np.float32)
             demo["obs/joint_pos"] = absolute - default.astype(np.float32)
-            demo["obs/joint_vel"] = rng.normal(size=(count, 9)).astype(np.float32)
+            demo["obs/joint_vel"] = rng.normal(size=(count, joints)).astype(np.float32)
             demo["obs/eef_pos"] = rng.normal(size=(count, 3)).astype(np.float32)
             quaternions = rng.normal(size=(count, 4))
             demo["obs/eef_quat"] = quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -125,12 +127,18 @@ def write_isaac(path: Path, *, robot: str = "robot", count: int = 6) -> Path:
 
 
 def write_groups_at_root(
-    path: Path, *, action: str = "action", state: str = "observation", others: tuple[str, ...] = (), count: int = 5
+    path: Path,
+    *,
+    action: str = "action",
+    state: str = "observation",
+    others: tuple[str, ...] = (),
+    count: int = 5,
+    demos: tuple[str, ...] = ("demo_0", "demo_2", "demo_10"),
 ) -> Path:
     """Write a file whose groups at the root are the episodes."""
     rng = np.random.default_rng(3)
     with h5py.File(path, "w") as file:
-        for name in ("demo_0", "demo_2", "demo_10"):
+        for name in demos:
             file[f"{name}/{action}"] = rng.normal(size=(count, 2)).astype(np.float32)
             for key in (state, *others):
                 file[f"{name}/{key}"] = rng.normal(size=(count, 4)).astype(np.float32)
