@@ -64,7 +64,7 @@ def files_of(root: Path) -> dict[str, bytes]:
     return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
-def test_no_part_is_written_into_the_source_and_none_where_one_is_in_the_way(
+def test_parts_are_written_neither_into_the_source_nor_over_existing_files(
     cups: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = files_of(cups)
@@ -115,7 +115,7 @@ def test_a_dry_run_refuses_what_the_run_would(cups: Path, capsys: pytest.Capture
         (("set-task", "--task", "pull it", "--where", "num_frames > 8"), "No episode is selected"),
     ],
 )
-def test_a_mistake_is_named_with_what_to_do(
+def test_mistakes_are_named_with_a_remedy(
     cups: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
 ) -> None:
     assert exit_code("dataset", words[0], "cups", *words[1:], "--out", "new") == 2
@@ -123,14 +123,14 @@ def test_a_mistake_is_named_with_what_to_do(
     assert not (cups.parent / "new").exists()
 
 
-def test_a_column_that_is_not_as_info_json_says_ends_an_edit(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_column_that_differs_from_info_json_ends_an_edit(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
     edit_json(cups / "meta/info.json", lambda info: info["features"]["action"].update(shape=[2]))
     assert exit_code("dataset", "shuffle", "cups", "--out", "new") == 1
     assert "The column action of the new episode 0 does not match meta/info.json" in capsys.readouterr().err
     assert not (cups.parent / "new").exists()
 
 
-def test_what_is_chosen_is_counted(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_selected_episodes_are_counted(cups: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("--task", "pull it", "--where", "episode_index in (1, 2)", "--out", "new")
     assert exit_code("dataset", "set-task", "cups", *words) == 0
     assert capsys.readouterr().out.splitlines()[0] == "New instruction: 2 of 5 episodes"
@@ -152,7 +152,7 @@ def test_a_merge_prints_a_mapping_that_can_be_saved(cups: Path, capsys: pytest.C
     assert "action" in json.loads(Path("both/meta/info.json").read_text())["features"]
 
 
-def test_the_home_folder_within_quotes(
+def test_a_quoted_tilde_is_the_home_folder(
     cups: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setenv("HOME", str(cups.parent))

@@ -30,7 +30,7 @@ def test_an_export(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert "# me/cubes" in (out / "README.md").read_text()
 
 
-def test_what_was_moved_into_failed_stays_out(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recordings_moved_into_failed_stay_out(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     sorted_run = tmp_path / "run"
     shutil.copytree(run, sorted_run)
     good = min((sorted_run / "episodes").glob("*.mcap"))
@@ -41,7 +41,9 @@ def test_what_was_moved_into_failed_stays_out(run: Path, tmp_path: Path, capsys:
     assert "2 failed attempts left out" in printed
 
 
-def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recordings_left_out_by_flags_are_counted(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     words = ("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", "--corrected-only", "--episodes", "0")
     assert exit_code(*words) == 0
     printed = capsys.readouterr()
@@ -59,7 +61,7 @@ def test_what_was_not_asked_for_is_counted(run: Path, tmp_path: Path, capsys: py
         (("--action", "velocity"), "joint_increment"),
     ],
 )
-def test_a_mistake_is_told_in_one_sentence(
+def test_mistakes_are_one_sentence(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...], message: str
 ) -> None:
     assert exit_code("export", "lerobot", run, "--out", tmp_path / "d", "--no-verify", *arguments) == 2

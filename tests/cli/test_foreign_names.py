@@ -139,9 +139,7 @@ def test_allowed_modules_are_imported(
     assert "add --allow" not in capsys.readouterr().err
 
 
-def test_generate_goes_to_work_with_an_allowed_module(
-    tmp_path: Path, marker: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_generate_runs_with_an_allowed_module(tmp_path: Path, marker: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[GenerateConfig] = []
 
     class Reached(BaseException):
@@ -180,7 +178,7 @@ def test_harmful_names_are_one_sentence_even_if_their_module_is_allowed(
 
 
 @pytest.mark.parametrize("name", ["my_tasks:Mine", "my tasks", "", "../my_tasks", "my_tasks.py:"])
-def test_what_can_be_no_module_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_module_names_are_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("replay", tmp_path / "any.mcap", "--allow", name) == 2
     assert "--allow names a module or package, for example my_tasks, found" in capsys.readouterr().err
 
@@ -221,7 +219,7 @@ def test_a_policy_cannot_name_the_code_of_its_steps_nor_its_cameras(tmp_path: Pa
 @pytest.mark.parametrize(
     "file", ["/etc/hostname", "../../secret.urdf", "demorec:../robots/panda.py", "stranger:abort.urdf"]
 )
-def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
+def test_models_named_by_a_file_must_be_in_known_folders(file: str) -> None:
     from demorec.core.errors import DemorecError
     from demorec.robots.assets import asset_path
 
@@ -229,7 +227,7 @@ def test_models_that_a_file_names_lie_in_known_folders(file: str) -> None:
         asset_path(file)
 
 
-def test_run_files_are_not_touched_by_being_refused(tmp_path: Path, marker: Path) -> None:
+def test_refused_run_files_are_unchanged(tmp_path: Path, marker: Path) -> None:
     run = run_of(f"{MODULE}:Mine", tmp_path / "run")
     before = (run / RUN_NAME).read_bytes()
     assert exit_code("generate", "--config", run / RUN_NAME, "--out", tmp_path / "again") == 2

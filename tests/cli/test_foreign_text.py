@@ -138,7 +138,7 @@ def test_recordings(hostile: Path, name: str, tmp_path: Path) -> None:
         _spoken(arguments)
 
 
-def test_that_the_fields_are_printed_at_all(hostile: Path) -> None:
+def test_the_fields_are_printed(hostile: Path) -> None:
     text = _spoken(["info", hostile / NAME])
     assert text.count("\\x1b[2Jx\\n\\u202ey\\x9b31m") >= 9
     assert "\\x1b[31mred\\u202e.mcap" in text
@@ -186,7 +186,7 @@ def test_warnings_of_python() -> None:
     assert "\x1b" not in done.stderr
 
 
-def test_an_unforeseen_error_leaves_a_report(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_an_unexpected_error_leaves_a_report(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     from dataclasses import dataclass
 
     @dataclass(frozen=True, kw_only=True)

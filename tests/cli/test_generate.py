@@ -44,7 +44,7 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
         (["--config", "missing.toml"], "The config file cannot be read (No such file or directory): missing.toml"),
     ],
 )
-def test_impossible_requests_end_with_one_sentence_and_leave_nothing(
+def test_impossible_requests_are_one_sentence_and_leave_nothing(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, args: list[str], message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -91,7 +91,7 @@ def test_unknown_options_name_the_nearest(
         ('out = "x"\ntempo = 1\nwidht = 3', "an unknown key 'widht'. Did you mean 'width'?"),
     ],
 )
-def test_bad_config_files_are_told(
+def test_bad_config_files_are_refused(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: str, message: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -115,7 +115,7 @@ def parsed(monkeypatch: pytest.MonkeyPatch, args: list[str]) -> Generate:
     return seen[0]
 
 
-def test_a_flag_wins_over_the_file_and_the_file_over_the_default(
+def test_flags_override_the_file_and_the_file_overrides_defaults(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     file = tmp_path / "run.toml"
@@ -158,7 +158,7 @@ def test_the_demo_file_is_valid(monkeypatch: pytest.MonkeyPatch) -> None:
         ("exporters", "lerobot"),
     ],
 )
-def test_list_tells_every_row_in_one_line(capsys: pytest.CaptureFixture[str], what: str, names: str) -> None:
+def test_list_describes_every_row_in_one_line(capsys: pytest.CaptureFixture[str], what: str, names: str) -> None:
     from demorec.core import tables
 
     assert exit_code("list", what) == 0

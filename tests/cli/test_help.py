@@ -68,7 +68,7 @@ def test_help_fits_a_page_and_the_rest_is_under_help_all(
     assert hidden == [f"{command} --help-all shows {len(all_flags - flags)} more options."] * (flags != all_flags)
 
 
-def test_options_that_the_help_leaves_out_are_taken(capsys: pytest.CaptureFixture[str]) -> None:
+def test_hidden_options_are_accepted(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         generate_dataset_main(["--gop", "601", "--no-check"])
     assert ended.value.code == 2

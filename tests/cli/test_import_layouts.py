@@ -32,7 +32,7 @@ def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int, layout: La
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(LAYOUTS))
-def test_a_suggestion_is_right_unedited(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_suggested_mapping_works_unedited(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     layout = LAYOUTS[name]
     notes = layout.notes()
     bag = layout.write(notes, tmp_path)
@@ -64,7 +64,7 @@ def test_a_suggestion_is_right_unedited(name: str, tmp_path: Path, capsys: pytes
             assert set(table.image_stamps[camera.name].tolist()) == stamps
 
 
-def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unrecognised_arm_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """A gripper alone is not the state of an arm. Unrecognised topics are listed with their types."""
     moments = bags.times(50, 1.0)
     notes = bags.joints("/franka_gripper/joint_states", bags.FRANKA_FINGERS, moments)
@@ -87,7 +87,7 @@ def test_an_arm_that_is_not_recognised_is_loud(tmp_path: Path, capsys: pytest.Ca
     assert "missing feature 'observation.state'" in capsys.readouterr().err
 
 
-def test_joints_that_stop_coming_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_joints_that_stop_sending_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     late, lost = bags.EPOCH_NS + bags.NS, "robotiq_85_left_knuckle_joint"
     notes = [
         note

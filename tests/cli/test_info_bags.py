@@ -44,7 +44,7 @@ def test_topics_types_counts_rates_and_span(
         assert any(line.split()[:2] == [topic, str(count)] and type_name in line for line in printed.splitlines())
 
 
-def test_a_bag_that_is_cut_off_is_listed_as_far_as_it_goes(
+def test_a_truncated_bag_is_listed_up_to_its_end(
     notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     whole = bags.write_mcap(notes, tmp_path / "x.mcap", chunk_size=10_000)
@@ -76,7 +76,7 @@ def test_messages_without_a_log_time_are_named_and_not_in_the_length(
 
 
 @pytest.mark.parametrize("command", ["info", "check", "view", "import"])
-def test_a_text_file_is_no_mcap(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_text_file_is_not_mcap(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "Dockerfile.mcap"
     path.write_text("FROM ros:jazzy\nRUN apt-get update\n")
     flags: dict[str, list[object]] = {"view": ["--save", tmp_path / "x.rrd"], "import": ["--suggest"]}

@@ -134,7 +134,7 @@ def drop_tasks(dataset: Path) -> None:
         (drop_tasks, "meta/tasks.parquet"),
     ],
 )
-def test_info_says_what_a_dataset_lacks(
+def test_info_lists_missing_parts_of_a_dataset(
     dataset: Path, tmp_path: Path, spoil: Callable[[Path], None], words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("info", dataset) == 0
@@ -160,7 +160,7 @@ def test_an_empty_path_is_not_the_current_folder(capsys: pytest.CaptureFixture[s
     assert "One of the paths is empty" in capsys.readouterr().err
 
 
-def test_a_path_that_looks_like_a_flag_is_told_how_to_be_written(
+def test_a_path_like_a_flag_gets_advice(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -189,7 +189,7 @@ def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str
     assert run("recover", part, "--out", tmp_path / "d.mcap") == 0
 
 
-def test_a_whole_recording_is_not_made_twice(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_complete_recording_is_not_copied(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "a.mcap"
     source.write_bytes((folder / "a.mcap").read_bytes())
     assert run("recover", source) == 0
@@ -199,7 +199,7 @@ def test_a_whole_recording_is_not_made_twice(folder: Path, tmp_path: Path, capsy
 
 @pytest.mark.parametrize("mark", ["run.json", "evaluation.json", ""])
 @pytest.mark.parametrize("is_inside", [True, False])
-def test_what_is_recovered_is_no_further_episode_of_its_run(
+def test_a_recovered_recording_does_not_count_as_another_episode(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mark: str, is_inside: bool
 ) -> None:
     damaged = tmp_path / "run" / "episodes" / "a.mcap"
@@ -217,7 +217,7 @@ def test_what_is_recovered_is_no_further_episode_of_its_run(
         assert find(tmp_path / "run").recordings == (damaged,)
 
 
-def test_recover_of_nothing(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_recover_without_intact_data(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cut = (folder / "c.mcap.part").read_bytes()[:3000]
     assert run("recover", tmp_path / "nothing.mcap.part") == 2
     for content, words in ((b"", "the file is empty"), (cut, "Nothing can be recovered")):

@@ -96,7 +96,7 @@ TARGETS = {
 
 @pytest.mark.parametrize("command", ["export lerobot runs/run --no-verify", "dataset select dataset --episodes 0"])
 @pytest.mark.parametrize("target", TARGETS)
-def test_nothing_but_a_dataset_is_replaced_by_one(
+def test_a_dataset_replaces_only_datasets(
     place: Path, capsys: pytest.CaptureFixture[str], command: str, target: str
 ) -> None:
     before = files_of(place.parent)
@@ -111,7 +111,7 @@ def test_nothing_but_a_dataset_is_replaced_by_one(
     assert files_of(place.parent) == before
 
 
-def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_home_folder_is_never_a_target(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     before = files_of(place.parent)
     elsewhere = write_episode(place.parent / "other.mcap", num_frames=3, cameras=())
     for target, word in (
@@ -125,7 +125,7 @@ def test_the_home_folder_is_no_target(place: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("target", ["mixed", "repository", "thesis", "thesis.tex", "noted"])
-def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) -> None:
+def test_append_keeps_existing_files_or_refuses(place: Path, target: str) -> None:
     """Third-party files are replaced when appending; where that is impossible, and in a repository, nothing changes."""
     before = files_of(place)
     other = make_run(place.parent / "other", (6,), cameras=("front",), seed=1)
@@ -137,7 +137,7 @@ def test_append_takes_over_what_is_there_or_refuses(place: Path, target: str) ->
     assert (place / "mixed/data/notes.txt").read_text() == "years of work"
 
 
-def test_a_workshop_of_somebody_else_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_third_party_workshop_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
     workshop = place / ".new.demorec-part"
     (workshop / "new").mkdir(parents=True)
     (workshop / "new" / "chapter_2.tex").write_text("years of work")
@@ -188,7 +188,7 @@ SPOILERS: dict[str, Callable[[Path, Path], object]] = {
 
 
 @pytest.mark.parametrize("foreign", SPOILERS)
-def test_a_run_with_something_foreign_is_not_overwritten(run: Path, made: Path, foreign: str) -> None:
+def test_a_run_with_foreign_files_is_not_overwritten(run: Path, made: Path, foreign: str) -> None:
     SPOILERS[foreign](run, made)
     before = {name: data for name, data in files_of(run).items() if name != ".lock"}
     with pytest.raises(ConfigError, match="not part of a run") as error:
@@ -200,7 +200,7 @@ def test_a_run_with_something_foreign_is_not_overwritten(run: Path, made: Path, 
     assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
 
 
-def test_a_run_where_somebody_works_is_not_overwritten(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_that_contains_the_current_folder_is_not_overwritten(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = {name: data for name, data in files_of(run).items() if name != ".lock"}
     with monkeypatch.context() as patch:
         patch.setenv("HOME", str(run))
@@ -216,7 +216,7 @@ def test_a_run_where_somebody_works_is_not_overwritten(run: Path, monkeypatch: p
     assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
 
 
-def test_folders_named_as_a_runs_are_not_overwritten(tmp_path: Path) -> None:
+def test_folders_with_a_runs_names_are_not_overwritten(tmp_path: Path) -> None:
     for name in ("episodes", "dataset"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "pilot.mkv").write_text("a series")
@@ -252,7 +252,7 @@ def test_episodes_that_were_not_generated_are_not_overwritten(
     assert {name: data for name, data in files_of(folder).items() if name != ".lock"} == before
 
 
-def test_an_overwriting_that_fails_puts_the_run_back(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_overwrite_restores_the_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     import demorec.generate.folder as module
 
     def fail(*arguments: object) -> None:
@@ -267,7 +267,7 @@ def test_an_overwriting_that_fails_puts_the_run_back(run: Path, monkeypatch: pyt
 
 
 @pytest.mark.parametrize("aside", ["notes.txt", "what-this-is.txt", ""])
-def test_somebodys_folder_that_is_called_like_what_was_set_aside(
+def test_a_third_party_folder_with_the_name_of_set_aside_files_stays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], aside: str
 ) -> None:
     """A run that is refused leaves nothing in the folder, not even a lock."""
@@ -306,7 +306,7 @@ def test_a_crash_while_overwriting_loses_nothing(tmp_path: Path, moment: str) ->
     assert not aside.exists()
 
 
-def test_a_folder_of_somebody_else_is_not_taken_for_what_was_set_aside(tmp_path: Path) -> None:
+def test_a_third_party_folder_does_not_count_as_set_aside_files(tmp_path: Path) -> None:
     (tmp_path / ".demorec-replaced").mkdir()
     (tmp_path / ".demorec-replaced" / "mine").touch()
     (tmp_path / "run.json").touch()
@@ -339,7 +339,7 @@ SETTINGS = Settings(
 
 
 @pytest.mark.parametrize("foreign", ["episodes/notes.txt", "failed/thesis.mcap", "episodes/deep/er.txt"])
-def test_an_evaluation_with_something_foreign_is_not_overwritten(evaluation: Path, foreign: str) -> None:
+def test_an_evaluation_with_foreign_files_is_not_overwritten(evaluation: Path, foreign: str) -> None:
     (evaluation / foreign).parent.mkdir(exist_ok=True)
     (evaluation / foreign).write_text("mine")
     before = files_of(evaluation)
@@ -352,13 +352,13 @@ def test_an_evaluation_with_something_foreign_is_not_overwritten(evaluation: Pat
     assert files_of(evaluation) == before
 
 
-def test_an_evaluation_is_overwritten_and_what_lies_beside_stays(evaluation: Path) -> None:
+def test_overwriting_an_evaluation_keeps_other_files(evaluation: Path) -> None:
     (evaluation / "notes.txt").write_text("mine")
     opened(SETTINGS, evaluation, overwrite=True)
     assert files_of(evaluation).keys() == {EVALUATION_NAME, LOCK_NAME, "notes.txt"}
 
 
-def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) -> None:
+def test_an_evaluation_records_its_versions(evaluation: Path) -> None:
     plain = json.loads((evaluation / EVALUATION_NAME).read_text())
     for package in ("demorec", "numpy", "lerobot", "torch"):
         assert plain["versions"][package] == version(package)
@@ -372,7 +372,7 @@ def test_an_evaluation_says_with_which_versions_it_was_made(evaluation: Path) ->
 
 
 @pytest.mark.parametrize("content", ["{}", "[]", "", '{"settings": 1, "rollouts": []}'])
-def test_what_only_has_the_name_of_an_evaluation_is_kept(evaluation: Path, content: str) -> None:
+def test_a_file_with_the_name_of_an_evaluation_is_kept(evaluation: Path, content: str) -> None:
     (evaluation / EVALUATION_NAME).write_text(content)
     before = files_of(evaluation)
     with pytest.raises(ConfigError, match="not an evaluation"):
@@ -459,9 +459,7 @@ OWN = {
 
 
 @pytest.mark.parametrize("command", OWN)
-def test_its_own_file_is_replaced_when_that_is_asked_for(
-    full: Path, capsys: pytest.CaptureFixture[str], command: str
-) -> None:
+def test_own_files_are_replaced_on_request(full: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     (full / "dataset/report.html").unlink()
     *words, source, flag = command.split()
     for flags, code in (((), 0), ((), 2), (("--overwrite",), 0)):
@@ -476,7 +474,7 @@ def test_a_screenshot_is_replaced_only_when_asked_for(full: Path, capsys: pytest
     assert files_of(full) == before
 
 
-def test_what_a_recovery_of_somebody_else_writes_stays(full: Path) -> None:
+def test_the_output_of_another_recovery_stays(full: Path) -> None:
     (full / "x.mcap.recovering").write_text("years of work")
     before = files_of(full)
     assert exit_code("recover", full / "broken.mcap", "--out", full / "x.mcap") == 2
@@ -484,7 +482,7 @@ def test_what_a_recovery_of_somebody_else_writes_stays(full: Path) -> None:
 
 
 @pytest.mark.parametrize("command", ["render", "replay"])
-def test_render_and_replay_never_replace_what_they_read(
+def test_render_and_replay_never_replace_their_inputs(
     place: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     """The command refuses before it simulates or renders, so stand-in recordings suffice."""
@@ -557,7 +555,7 @@ def test_nothing_is_written_into_another_run_or_dataset(
     assert files_of(place) == before
 
 
-def test_what_is_made_beside_the_parts_of_a_run_is_taken(place: Path) -> None:
+def test_new_files_next_to_the_parts_of_a_run_are_accepted(place: Path) -> None:
     (place / "runs/run/run.json").write_text("{}")
     for target in (place / "runs/run/v.rrd", place / "v.rrd"):
         assert exit_code("view", place / "alone.mcap", "--save", target) == 0
@@ -575,7 +573,7 @@ def test_special_files_are_never_replaced(tmp_path: Path, kind: object) -> None:
             check_replaceable(target, kind, overwrite=True)  # type: ignore[arg-type]
 
 
-def test_an_unfinished_file_of_somebody_else_is_kept(tmp_path: Path) -> None:
+def test_a_third_party_unfinished_file_is_kept(tmp_path: Path) -> None:
     part = tmp_path / ".x.png.demorec-part"
     part.write_text("mine")
     with pytest.raises(ConfigError, match="not made by demorec"), atomic_write(tmp_path / "x.png", IMAGE):
@@ -589,7 +587,7 @@ def original(**changes: Any) -> reproducing.Original:
 
 
 @pytest.mark.parametrize("out", ["runs/run", "runs/run/copy", "runs"])
-def test_a_copy_needs_a_place_beside_its_original(
+def test_a_copy_needs_a_folder_outside_its_original(
     place: Path, out: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     source = place / "runs" / "run"
@@ -600,7 +598,7 @@ def test_a_copy_needs_a_place_beside_its_original(
     assert files_of(place / "runs") == before
 
 
-def test_a_copy_does_not_go_on_with_another_run(
+def test_a_copy_does_not_continue_another_run(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     config = GenerateConfig(seed=1, cameras=())

@@ -28,7 +28,7 @@ def recordings(out: Path) -> dict[str, int]:
 
 
 @pytest.mark.slow
-def test_the_same_command_keeps_what_is_drawn(
+def test_the_same_command_keeps_finished_renderings(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     out = tmp_path / "out"
@@ -90,7 +90,7 @@ def test_another_request_is_refused(
     assert files_of(out) != before
 
 
-def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None:
+def test_a_damaged_rendering_does_not_count_as_finished(run: Path, tmp_path: Path) -> None:
     source, target = run / "episodes" / "episode_000000.mcap", tmp_path / "new.mcap"
     command = ("render", source, "--out", target, "--looks", 1)
     assert exit_code(*command) == 0
@@ -105,7 +105,7 @@ def test_a_damaged_one_is_not_taken_for_drawn(run: Path, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     "number", [signal.SIGINT, pytest.param(signal.SIGKILL, marks=[pytest.mark.slow, pytest.mark.long])]
 )
-def test_ended_from_outside_it_is_quiet_and_goes_on(tmp_path: Path, number: signal.Signals) -> None:
+def test_an_interrupted_command_is_quiet_and_continues(tmp_path: Path, number: signal.Signals) -> None:
     """Two workers hold semaphores, which Python might report as leaked. The last recording takes seconds."""
     run, out = make_run(tmp_path / "run", (3, 3, 40), cameras=("front",)), tmp_path / "out"
     options = ("--width", "512", "--height", "512", "--looks", "1", "--workers")

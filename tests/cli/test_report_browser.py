@@ -60,7 +60,7 @@ def show(page: Chromium, path: Path, *, width: int, scheme: str) -> dict[str, An
 
 @pytest.mark.slow  # Chromium takes seconds; tests/unit/test_report.py reads the same page with a parser
 @pytest.mark.viewer
-def test_a_browser_shows_it_and_nothing_foreign_runs(report: Path) -> None:
+def test_a_browser_shows_it_and_runs_no_foreign_code(report: Path) -> None:
     program = need_chromium()
     brightness = {}
     with chromium(program, "about:blank") as page:

@@ -71,7 +71,7 @@ def source(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("sensors", [(), (SLIP,), (SLIP, FT)], ids=["none", "unknown", "two unknown"])
-def test_every_command_goes_by_the_sensors_that_a_recording_lists(
+def test_every_command_uses_the_sensors_listed_in_a_recording(
     source: Path, sensors: tuple[Feature, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = with_sensors(source, tmp_path / "episode_000000.mcap", sensors)
@@ -114,7 +114,7 @@ def test_every_command_goes_by_the_sensors_that_a_recording_lists(
         ({"units": ["m/s"]}, "has 3 elements, but 1 units"),
     ],
 )
-def test_a_sensor_that_cannot_be_is_refused(
+def test_an_impossible_sensor_is_refused(
     source: Path, changes: dict[str, object], message: str, tmp_path: Path
 ) -> None:
     def edit(name: str, values: dict[str, str]) -> dict[str, str]:

@@ -52,7 +52,7 @@ def make(checkout: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.mark.slow
-def test_without_a_compiler_a_fork_takes_pybullets_place(checkout: Path) -> None:
+def test_without_a_compiler_a_fork_replaces_pybullet(checkout: Path) -> None:
     done = make(checkout, "setup")
     assert done.returncode == 0, done.stderr
     assert "pybullet-arm64==3.2.8" in done.stdout
@@ -70,7 +70,7 @@ def test_without_a_compiler_a_fork_takes_pybullets_place(checkout: Path) -> None
     assert make(checkout, "setup").stdout == "make: Nothing to be done for 'setup'.\n"
 
 
-def test_a_compiler_is_asked_for_where_pybullet_shall_be_compiled(checkout: Path) -> None:
+def test_a_compiler_is_required_for_compiling_pybullet(checkout: Path) -> None:
     done = make(checkout, "setup", "PYBULLET=source")
     assert done.returncode == 2
     assert "install g++ or clang, or use PYBULLET=wheel" in done.stderr

@@ -44,7 +44,7 @@ def test_closed_streams_change_nothing_else(words: str, code: int) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", ["--help", "--version", "list --help", "list tasks", f"info {SAMPLE}"])
-def test_a_reader_that_has_left_is_exit_code_1_without_a_word(words: str) -> None:
+def test_a_reader_that_has_exited_is_a_silent_exit_code_1(words: str) -> None:
     assert shell(words, "| true") == Ended(1, "", "")
 
 
@@ -54,7 +54,7 @@ def test_a_full_disk_behind_the_answer_is_one_sentence() -> None:
     assert ended.err == "demorec: The answer cannot be written (No space left on device): <stdout>\n"
 
 
-def test_a_file_does_not_take_the_number_of_a_closed_stream(tmp_path: Path) -> None:
+def test_a_file_does_not_reuse_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     """Text that a library prints to a closed stream must not end up in the file that reuses its number."""
     code = (
         "from demorec.core.streams import open_closed_streams; open_closed_streams(); import os;"

@@ -77,7 +77,7 @@ def test_an_unwritable_target_is_exit_code_2(
 
 
 @pytest.mark.parametrize("name", CALLS)
-def test_the_file_of_a_user_is_exit_code_2(
+def test_an_existing_file_is_exit_code_2(
     name: str, sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = call(name, sources, tmp_path / "thesis")

@@ -69,7 +69,7 @@ def test_bad_requests_are_one_sentence(
         ("episode.mcap", ("--screenshot", "x.png", "--at", "999"), "--at 999 is out of range: choose 0 to 0.133 s"),
     ],
 )
-def test_what_cannot_be_shown_is_said(
+def test_unavailable_parts_are_reported(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],

@@ -82,7 +82,7 @@ def test_every_command_is_tried() -> None:
         if make is not make_hdf5 or command not in ON_EVERYTHING
     ],
 )
-def test_every_command_tells_the_same_about_a_path(
+def test_every_command_describes_a_path_in_the_same_words(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     command: str,
@@ -117,7 +117,7 @@ def test_names_that_are_not_utf8(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_what_cannot_be_seen_is_not_called_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreadable_path_does_not_count_as_missing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "run" / "meta").mkdir(parents=True)
 
     def forbidden(self: Path) -> os.stat_result:
@@ -167,7 +167,7 @@ def a_recording(name: str) -> Callable[[Path], Path]:
         (write("other/x.txt"), "nothing"),
     ],
 )
-def test_what_there_is_gets_its_name(tmp_path: Path, make: Callable[[Path], Path], kind: PathKind) -> None:
+def test_unexpected_content_is_named(tmp_path: Path, make: Callable[[Path], Path], kind: PathKind) -> None:
     assert find(make(tmp_path)).kind == kind
 
 
@@ -182,7 +182,7 @@ def test_a_run_has_the_recordings_of_its_folders_alone(tmp_path: Path) -> None:
     assert found.failed == (tmp_path / "failed/c.mcap",)
 
 
-def test_what_is_not_taken_is_named_with_what_is(tmp_path: Path) -> None:
+def test_rejected_paths_come_with_accepted_alternatives(tmp_path: Path) -> None:
     write(INFO_PATH)(tmp_path)
     with pytest.raises(ConfigError) as refused:
         expect(tmp_path, "recording", "run", "recordings")
@@ -203,7 +203,7 @@ def after_a_kill(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("command", ["info", "check", "view"])
-def test_what_a_kill_left_is_named_with_what_to_do(
+def test_leftovers_of_a_kill_are_named_with_a_remedy(
     after_a_kill: Path, capsys: pytest.CaptureFixture[str], command: str
 ) -> None:
     flags = {"view": ["--save", str(after_a_kill.parent / "x.rrd")]}.get(command, [])
@@ -217,7 +217,7 @@ def test_what_a_kill_left_is_named_with_what_to_do(
 
 @pytest.mark.parametrize("command", ["info", "check", "view"])
 @pytest.mark.parametrize("asked", ["", "episodes/episode_000001.mcap"])
-def test_where_nothing_else_is_it_is_named_too(
+def test_leftovers_alone_are_named_too(
     after_a_kill: Path, capsys: pytest.CaptureFixture[str], command: str, asked: str
 ) -> None:
     (after_a_kill / "episodes/episode_000000.mcap").unlink()
@@ -227,7 +227,7 @@ def test_where_nothing_else_is_it_is_named_too(
     assert ("a recording is unfinished" if asked else "2 recordings are unfinished") in told
 
 
-def test_a_folder_of_parts_that_may_not_be_seen_hides_nothing_else(after_a_kill: Path) -> None:
+def test_an_unreadable_folder_hides_nothing_else(after_a_kill: Path) -> None:
     (after_a_kill / "unfinished" / "loop").symlink_to("loop")
     assert len(find(after_a_kill).recordings) == 1
     assert len(find(after_a_kill).unfinished) == 1

@@ -73,7 +73,7 @@ def test_collapsed_rollouts_come_apart_where_the_state_jumps(slow: int, tmp_path
     assert pq.read_table(tmp_path / "again/meta/episodes").num_rows == len(lengths)
 
 
-def test_a_gripper_that_closes_is_no_jump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_closing_gripper_is_not_a_jump(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arm = np.linspace(0, 1, 40)
     state = {"shoulder": arm, "gripper": (arm > 0.5).astype(float)}
     root = write_foreign(tmp_path / "d", episodes=1, length=40, state={name: list(v) for name, v in state.items()})
@@ -83,7 +83,7 @@ def test_a_gripper_that_closes_is_no_jump(tmp_path: Path, capsys: pytest.Capture
     assert "2 parts of 40 frames, 0:20, 20:40" in capsys.readouterr().out
 
 
-def test_pauses_are_taken_out_and_moving_frames_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_pauses_are_removed_and_moving_frames_stay(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     moving = [np.linspace(begin, begin + 1, 20) for begin in range(3)]
     motion = [*moving[0], *np.full(30, 1.0), *moving[1], *np.full(5, 2.0), *moving[2]]
     root = write_foreign(tmp_path / "d", episodes=1, length=95, state={"shoulder": motion})

@@ -99,7 +99,7 @@ def statistics_are_exact(root: Path) -> None:
             assert np.allclose(found[name][quantity], value, rtol=1e-9, atol=1e-12), (name, quantity)
 
 
-def test_what_is_kept_is_kept_bit_for_bit(dataset: Path, tmp_path: Path) -> None:
+def test_kept_data_is_bit_exact(dataset: Path, tmp_path: Path) -> None:
     before, fps = items(dataset), json.loads((dataset / "meta/info.json").read_text())["fps"]
     word = str(before[0][0]["task"]).split()[-1]
     there = [number for number in range(4) if word in str(before[number][0]["task"])]

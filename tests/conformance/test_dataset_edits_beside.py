@@ -93,7 +93,7 @@ def test_a_new_instruction_keeps_the_scene(simulated: Path, tmp_path: Path, caps
     assert failing(tmp_path / "d") <= failing(simulated)
 
 
-def test_what_does_not_go_along_is_named_before_and_after(
+def test_omissions_are_named_before_and_after(
     simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for flags in (("--dry-run",), ()):

@@ -139,7 +139,7 @@ def test_measured_timestamps_are_imported_as_stamps(
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 10.0, 1500.0, 3000.0])
-def test_the_grid_of_a_long_episode_is_one(begin_s: float) -> None:
+def test_timestamps_of_a_long_episode_are_a_grid(begin_s: float) -> None:
     """float32 rounds times beyond 1,024 s by more than LeRobot's tolerance."""
     seconds = (begin_s + np.arange(300) / 30).astype(np.float32).astype(np.float64)
     assert are_on_grid(seconds, 30, float(seconds[0]))
@@ -227,7 +227,7 @@ def test_counters_that_are_absent_or_doubles_are_read(
     assert exit_code("dataset", "shuffle", source, "--out", tmp_path / "new") == 0
 
 
-def test_files_in_other_folders_than_info_json_says_are_found(tmp_path: Path) -> None:
+def test_files_in_folders_that_differ_from_info_json_are_found(tmp_path: Path) -> None:
     source = write_drawn(tmp_path / "set", PLAIN)
     info = json.loads((source / "meta/info.json").read_text())
     info["data_path"] = info["data_path"].replace("{episode_chunk", "{episode_index")
@@ -239,7 +239,7 @@ def test_files_in_other_folders_than_info_json_says_are_found(tmp_path: Path) ->
     assert not (tmp_path / "new/video").exists()  # its images are in videos/
 
 
-def test_a_camera_without_videos_is_named_with_what_to_do(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_camera_without_videos_is_named_with_a_remedy(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = write_drawn(tmp_path / "set", PLAIN)
     shutil.rmtree(source / "videos")
     for words in (["import", "lerobot"], ["dataset", "shuffle"]):
@@ -295,7 +295,7 @@ def test_numbers_of_tasks_with_gaps_keep_their_texts(tmp_path: Path) -> None:
     assert said(tmp_path / "new", "task_index") == ["push it"] * 6 + ["open it"] * 5
 
 
-def test_what_an_edit_leaves_out_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_omissions_of_an_edit_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = write_drawn(tmp_path / "set", replace(PLAIN, has_unlisted=True))
     shutil.copy(source / "data/chunk-000/episode_000001.parquet", source / "data/chunk-000/episode_000009.parquet")
     assert exit_code("dataset", "shuffle", source, "--out", tmp_path / "new") == 0

@@ -38,7 +38,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> RunResult:
     return make(tmp_path_factory.mktemp("reference") / "run", workers=1)
 
 
-def test_the_run_is_what_was_asked_for(reference: RunResult) -> None:
+def test_the_run_matches_the_request(reference: RunResult) -> None:
     assert len(reference.run.successes) == NUM_EPISODES
     assert load_run_file(reference.folder) == reference.run
     assert sorted(p.name for p in (reference.folder / "episodes").iterdir()) == [
@@ -60,7 +60,7 @@ def test_two_workers_in_reversed_order_make_the_same_bytes(tmp_path: Path, refer
         assert (result.folder / attempt.file).read_bytes() == (reference.folder / attempt.file).read_bytes()
 
 
-def test_recordings_know_the_run_that_they_belong_to(tmp_path: Path, reference: RunResult) -> None:
+def test_recordings_contain_the_data_of_their_run(tmp_path: Path, reference: RunResult) -> None:
     """Everything in run.json that matters can be restored from the recordings."""
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
@@ -71,7 +71,7 @@ def test_recordings_know_the_run_that_they_belong_to(tmp_path: Path, reference: 
     assert [a.sha256 for a in result.run.attempts] == [a.sha256 for a in reference.run.attempts]
 
 
-def test_a_run_knows_the_versions_that_its_recordings_know(reference: RunResult) -> None:
+def test_run_and_recordings_have_the_same_versions(reference: RunResult) -> None:
     from demorec.loop import prepare
 
     assert reference.run.versions == deciding_versions()
@@ -80,7 +80,7 @@ def test_a_run_knows_the_versions_that_its_recordings_know(reference: RunResult)
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("without_lerobot")
-def test_runs_and_datasets_are_made_again_and_a_difference_is_seen(
+def test_runs_and_datasets_are_regenerated_and_differences_found(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], reference: RunResult
 ) -> None:
     source = tmp_path / "source"
@@ -144,7 +144,7 @@ def test_the_export_is_made_once_and_again_when_the_run_has_grown(tmp_path: Path
     assert grown.dataset_digest != first.dataset_digest
 
 
-def test_the_command_does_it_all_and_says_so(
+def test_the_command_generates_checks_and_exports(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     verified: list[int] = []

@@ -192,7 +192,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
     assert [bag["name"] for bag in skipped] == [f"run_{2 * number + 1}.mcap" for number in range(1, len(BAD))]
 
 
-def test_what_is_no_bad_bag_stops_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_errors_other_than_bad_bags_stop_a_batch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mistyped name, a full disk and too little memory stop the batch."""
     bag, run = _bag(tmp_path / "a.mcap"), tmp_path / "run"
     mapping = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml")
@@ -227,7 +227,7 @@ def test_the_same_bag_twice_is_imported_once(tmp_path: Path) -> None:
     assert import_bags([copy, first], mapping, tmp_path / "other").num_new == 1
 
 
-def test_a_folder_stands_for_the_bags_in_it_in_their_natural_order(tmp_path: Path) -> None:
+def test_a_folder_means_its_bags_in_natural_order(tmp_path: Path) -> None:
     folder, notes = tmp_path / "day", bags.in_order(bags.so101(0.5))
     folder.mkdir()
     bags.write_mcap(notes, folder / "run_10.mcap")
@@ -260,7 +260,7 @@ def test_only_bags_and_episodes_of_datasets_are_skipped(
     assert "--workers is for bags" in capsys.readouterr().err
 
 
-def test_a_killed_import_goes_on_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+def test_a_killed_import_continues_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     words = ["import", *map(str, (batch[0], "--mapping", batch[1], "--out", run)), "--skip-bad", "--workers", "2"]
     with subprocess.Popen([sys.executable, "-m", "demorec", *words], stdout=subprocess.DEVNULL) as program:

@@ -122,7 +122,7 @@ def _with_gripper(**keys: str) -> str:
     return MAPPING + f'[[features."observation.state"]]\ntopic = "{GRIPPER}"\nfield = "data"\nprefix = "g"\n{lines}'
 
 
-def test_only_the_source_without_headers_goes_by_times_of_recording(imports: Imports, tmp_path: Path) -> None:
+def test_only_the_source_without_headers_uses_recording_times(imports: Imports, tmp_path: Path) -> None:
     notes = real()
     code, told, _ = imports(notes, _with_gripper(stamp="log"))
     assert code == 0
@@ -145,7 +145,7 @@ def test_headers_far_from_times_of_recording_are_found_where_both_are_used(impor
     assert "clock_offset" in told.splitlines()[-1]
 
 
-def test_simulated_headers_beside_none_are_suggested_by_one_clock(imports: Imports, tmp_path: Path) -> None:
+def test_simulated_headers_next_to_missing_ones_are_suggested_by_one_clock(imports: Imports, tmp_path: Path) -> None:
     gripper = [
         replace(note, log_ns=WALL_NS + round((note.log_ns - bags.EPOCH_NS + 500_000_000) * SLOWDOWN))
         for note in real(3.0)
@@ -159,7 +159,7 @@ def test_simulated_headers_beside_none_are_suggested_by_one_clock(imports: Impor
     assert "No findings." in told
 
 
-def test_simulated_headers_beside_none_are_refused(imports: Imports) -> None:
+def test_simulated_headers_next_to_missing_ones_are_refused(imports: Imports) -> None:
     gripper = [
         replace(note, log_ns=note.log_ns - bags.EPOCH_NS + WALL_NS) for note in real(3.0) if note.topic == GRIPPER
     ]
@@ -233,7 +233,7 @@ def test_simulated_time_without_a_camera(rate: int, factor: float, imports: Impo
         assert recording.num_frames >= len(notes) - 2
 
 
-def test_numbers_that_are_in_no_row_are_told(imports: Imports) -> None:
+def test_numbers_in_no_row_are_reported(imports: Imports) -> None:
     notes = bags.in_order(bags.joints(STATE, ("a", "b"), bags.times(25, 6.0, jitter=0, seed=1)))
     mapping = MAPPING.partition("[[features.action]]")[0].replace("fps = 30", "fps = 10")
     mapping += '[[features.action]]\nnext = "observation.state"\n'

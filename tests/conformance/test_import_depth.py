@@ -127,7 +127,7 @@ def held(recording: Recording, moments: Sequence[int]) -> list[int]:
     [("16UC1", False), ("16UC1", True), ("big endian", False), ("32FC1", False), ("32FC1", True), ("png", False),
      ("png", True), ("rvl", False)],
 )  # fmt: skip
-def test_every_distance_stays(kind: str, is_ros1: bool, tmp_path: Path) -> None:
+def test_every_distance_is_kept(kind: str, is_ros1: bool, tmp_path: Path) -> None:
     run, moments = imported(kind, tmp_path, is_ros1=is_ros1)
     with Recording(recording_of(run)) as recording:
         assert (recording.cameras, recording.depth_cameras) == (("wrist",), ("wrist_depth",))
@@ -163,7 +163,7 @@ def test_other_readers_find_it(kind: str, tmp_path: Path) -> None:
             assert message.format == "16UC1; compressedDepth rvl"
 
 
-def test_the_commands_take_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_accepts_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run, _ = imported("32FC1", tmp_path)
     report = check_subject(Subject(path=recording_of(run), kind="recording"), CheckOptions())
     assert not [result.check for result in report.results if result.verdict == "broken"]
@@ -184,7 +184,7 @@ FAULTS: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("name", sorted(FAULTS))
-def test_what_is_no_depth_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_other_images_are_refused_as_depth(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     change, told = FAULTS[name]
     notes = notes_with_depth("png", bags.times(30, 0.6))
     for note in notes:

@@ -91,7 +91,7 @@ def nearest(shown: NDArray[np.uint8], candidates: NDArray[np.uint8]) -> int:
     return int(np.abs(candidates.astype(int) - shown).mean(axis=(1, 2, 3)).argmin())
 
 
-def test_a_mask_chooses_and_a_dataset_tells_the_outcome(tmp_path: Path) -> None:
+def test_a_mask_selects_episodes_and_a_dataset_sets_the_outcome(tmp_path: Path) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5")
     changes = {'# mask = "train"': 'mask = "train"', '# success = "rewards"': 'success = "rewards"'}
     with h5py.File(file, "r+") as opened:
@@ -131,7 +131,7 @@ def test_aloha_becomes_a_run(is_compressed: bool, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("is_compressed", [False, True])
-def test_exchanged_colours_are_put_right(is_compressed: bool, tmp_path: Path) -> None:
+def test_swapped_colours_are_corrected(is_compressed: bool, tmp_path: Path) -> None:
     file = write_aloha(tmp_path / "episode_0.hdf5", is_compressed=is_compressed)
     dataset = 'dataset = "observations/images/cam_high"'
     result, run = imported(file, changes={dataset: f'{dataset}\ncolors = "bgr"'})
@@ -181,7 +181,7 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", ["uint8", "float32", "float64", "float16", "255"])
 @pytest.mark.parametrize("has_channels_first", [False, True])
-def test_pixels_of_other_forms_are_those_of_the_usual_one(kind: str, has_channels_first: bool, tmp_path: Path) -> None:
+def test_pixels_in_other_layouts_give_the_same_recording(kind: str, has_channels_first: bool, tmp_path: Path) -> None:
     """The same images in other layouts than (height, width, RGB) uint8 make the same recording, apart from its
     description.
     """
@@ -232,7 +232,7 @@ def test_one_observation_more_than_actions_is_left_out(tmp_path: Path, capsys: p
 
 
 @pytest.mark.parametrize("camera", ["jpeg", "pixels", "depth", "floats", "next"])
-def test_a_camera_is_left_out_only_where_the_mapping_says_so(
+def test_a_camera_is_left_out_only_by_the_mapping(
     camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5")
@@ -419,7 +419,7 @@ def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
     assert 'dataset = "observations/qpos"' in lines
 
 
-def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_truncated_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5")
     mapping = suggested(file)
     data = file.read_bytes()
@@ -428,7 +428,7 @@ def test_a_file_that_is_cut_off_is_refused(tmp_path: Path, capsys: pytest.Captur
         _refused(file, mapping, told, capsys)
 
 
-def test_compression_that_is_damaged_is_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_damaged_compression_is_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5", compression="gzip")
     mapping = suggested(file)
     with h5py.File(file) as opened:

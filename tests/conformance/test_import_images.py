@@ -128,7 +128,7 @@ def test_no_image_is_lost(name: str, rows: str, tmp_path: Path, capsys: pytest.C
         assert {time for time in times if begin <= time <= end} <= set(stamps)
 
 
-def test_images_that_no_row_has_are_told(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_images_in_no_row_are_reported(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Rows follow the camera that lost images, so as many images of the other camera have no row."""
     side = [time for k, time in enumerate(ticks(30, 300, phase=0.1)) if k % 50 != 20]
     told, shown = imported(

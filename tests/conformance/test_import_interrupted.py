@@ -45,7 +45,7 @@ def info(run: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
 
 @pytest.mark.parametrize("kind", ["lerobot", "hdf5", "bags"])
 @pytest.mark.parametrize("num_done", [0, 1, 2])
-def test_an_interrupted_import_says_what_is_missing(
+def test_an_interrupted_import_lists_missing_episodes(
     kind: str,
     num_done: int,
     calls: dict[str, tuple[list[object], tuple[str, ...]]],
@@ -91,7 +91,7 @@ def test_an_interrupted_import_says_what_is_missing(
     assert exit_code("check", run, "--no-images", "--strict", "--only", "run_complete") == 0
 
 
-def test_what_is_planned_is_what_the_last_import_was_given(
+def test_the_plan_is_that_of_the_last_import(
     calls: dict[str, tuple[list[object], tuple[str, ...]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """An import without the broken bag makes the run complete."""

@@ -61,7 +61,7 @@ def rows_of(dataset: Path) -> list[dict[str, Any]]:
     ("change", "expected"),
     [({"style": "memory"}, "all but its subtasks"), ({"content": "a\nb"}, "a subtask is not a single line")],
 )
-def test_what_else_a_dataset_says_is_left_out(
+def test_other_language_of_a_dataset_is_left_out(
     change: dict[str, str], expected: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
@@ -83,7 +83,7 @@ def test_what_else_a_dataset_says_is_left_out(
 
 
 @pytest.mark.usefixtures("without_lerobot")
-def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_dataset_has_exactly_the_recorded_subtasks(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     (recording,) = recordings(tmp_path / "run")
     begun = ((0.41, "grasp the cup"), (1.013, "lift the cup"), (2.2, "put it down"))
@@ -105,7 +105,7 @@ def test_a_dataset_has_exactly_what_was_said(tmp_path: Path, capsys: pytest.Capt
 
 
 @pytest.mark.parametrize("kind", ["recording", pytest.param("dataset", marks=pytest.mark.slow)])
-def test_what_was_said_is_shown_when_it_was_said(kind: str, tmp_path: Path) -> None:
+def test_subtasks_are_shown_at_their_time(kind: str, tmp_path: Path) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     (recording,) = recordings(tmp_path / "run")
     place = recording
@@ -146,7 +146,7 @@ def test_a_suggestion_names_the_texts(tmp_path: Path, capsys: pytest.CaptureFixt
         assert [said for _, said in opened.subtasks] == ["grasp the cup", "lift the cup", "put it down"]
 
 
-def test_all_kinds_are_as_much_as_is_known(tmp_path: Path) -> None:
+def test_all_kinds_means_the_known_ones(tmp_path: Path) -> None:
     assert imported(texts("/subtask", SAID), SUBTASKS, tmp_path) == 0
     export(tmp_path / "run", tmp_path / "all", language=())
     assert {entry["style"] for row in rows_of(tmp_path / "all") for entry in row["language_persistent"]} == {"subtask"}
@@ -173,7 +173,7 @@ def test_markers_with_other_texts_are_subtasks(tmp_path: Path, capsys: pytest.Ca
     )
 
 
-def test_where_nobody_says_anything_none_is_invented(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_subtasks_are_never_invented(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert imported([], "", tmp_path) == 0
     words = ("export", "lerobot", tmp_path / "run", "--out", tmp_path / "dataset", "--language", "subtask")
     capsys.readouterr()
@@ -206,7 +206,7 @@ def test_bad_input_is_refused(name: str, tmp_path: Path, capsys: pytest.CaptureF
     assert not recordings(tmp_path / "run")
 
 
-def test_recovery_keeps_what_was_said(tmp_path: Path) -> None:
+def test_recovery_keeps_subtasks(tmp_path: Path) -> None:
     from dataclasses import replace
 
     from support.external import make_external

@@ -169,7 +169,7 @@ def test_depth_of_another_scale_is_read_by_it_and_without_one_left_out(tmp_path:
     assert "scale of depth" in import_lerobot([tmp_path / "d"], None, tmp_path / "other").left_out[key]
 
 
-def test_whole_numbers_that_no_recording_holds_are_left_out(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+def test_integers_beyond_float64_are_left_out(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
     _, dataset, _ = imported
     shutil.copytree(dataset, tmp_path / "d")
     file = sorted((tmp_path / "d" / "data").rglob("*.parquet"))[-1]
@@ -209,7 +209,7 @@ CASES = [(kind, fault) for kind in ("image", "long_gops") for fault in FAULTS if
 
 
 @pytest.mark.parametrize(("imported", "fault"), CASES, indirect=["imported"])
-def test_what_cannot_be_imported_is_one_sentence(fault: str, imported: tuple[str, Path, Path], tmp_path: Path) -> None:
+def test_impossible_imports_are_one_sentence(fault: str, imported: tuple[str, Path, Path], tmp_path: Path) -> None:
     _, dataset, _ = imported
     shutil.copytree(dataset, tmp_path / "d")
     change, words = FAULTS[fault]

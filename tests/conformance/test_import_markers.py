@@ -48,7 +48,7 @@ def _begins(run: Path) -> list[float]:
         ([*TAKES, (0.1, "discard"), (0.95, "")], [0.2, 1.1, 2.0], []),  # outside of episodes, and an empty marker
     ],
 )
-def test_what_is_discarded_is_no_episode(
+def test_discarded_takes_are_not_imported(
     marks: list[tuple[float, str]],
     kept: list[float],
     left_out: list[str],
@@ -86,6 +86,6 @@ def test_an_unknown_marker_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
         ('failure = "abort"\ndiscard = ["abort"]', [0.2, 1.1, 2.0]),  # a verdict, not a discard
     ],
 )
-def test_what_the_refusal_says_helps(keys: str, kept: list[float], tmp_path: Path) -> None:
+def test_the_advice_of_the_refusal_works(keys: str, kept: list[float], tmp_path: Path) -> None:
     assert _import(tmp_path, [*TAKES, (1.9, "abort")], keys=keys) == 0
     assert _begins(tmp_path / "run") == kept

@@ -55,7 +55,7 @@ def write_bag(path: Path, seconds: float, *, rate: float) -> Path:
 
 
 @pytest.mark.slow
-def test_what_is_kept_of_messages(tmp_path: Path) -> None:
+def test_memory_kept_for_messages(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(MAPPING)
     mapping = read_mapping(tmp_path / "robot.toml")
     kept = []
@@ -75,7 +75,7 @@ def test_what_is_kept_of_messages(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.timeout(600)
-def test_the_peak_of_an_import_is_little_more_than_what_is_kept(tmp_path: Path) -> None:
+def test_the_peak_of_an_import_is_little_more_than_the_kept_memory(tmp_path: Path) -> None:
     (tmp_path / "robot.toml").write_text(MAPPING)
     peaks = []
     for seconds in (2, 60, 300):

@@ -198,13 +198,13 @@ def test_two_publishers_on_one_topic(tmp_path: Path) -> None:
         (lambda k: k < 10, "ends 1.2"),
     ],
 )
-def test_a_stream_that_is_not_there_all_the_time(keep: Callable[[int], bool], told: str, tmp_path: Path) -> None:
+def test_a_stream_with_a_gap(keep: Callable[[int], bool], told: str, tmp_path: Path) -> None:
     notes = bags.changed(bags.so101(1.5), "/leader/joint_states", lambda k, note: note if keep(k) else None)
     with pytest.raises(BagError, match=told):
         import_bags([_so101(tmp_path, notes)], _mapping(tmp_path), tmp_path / "run")
 
 
-def test_an_import_that_was_killed_goes_on(tmp_path: Path) -> None:
+def test_a_killed_import_continues(tmp_path: Path) -> None:
     """The import is killed between two episodes of a bag, and within one."""
     bag = _so101(tmp_path, bags.so101(2.0))
     cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.7]]\n'
@@ -220,7 +220,7 @@ def test_an_import_that_was_killed_goes_on(tmp_path: Path) -> None:
     assert {path.name: path.read_bytes() for path in run.glob("episodes/*")} == whole
 
 
-def test_an_episode_that_lacks_something_is_dropped_where_the_mapping_says_so(tmp_path: Path) -> None:
+def test_an_incomplete_episode_is_dropped_if_the_mapping_asks_for_it(tmp_path: Path) -> None:
     notes = bags.changed(bags.so101(2.0), "/leader/joint_states", lambda k, note: None if 60 <= k < 80 else note)
     cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.9]]\n'
     mapping = _mapping(
@@ -256,7 +256,7 @@ def test_raw_images_of_other_encodings(encoding: str, tmp_path: Path) -> None:
     assert np.abs(raw_image(values).astype(int) - expected).max() <= (5 if "bayer" in encoding else 0)
 
 
-def test_a_image_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
+def test_an_undecodable_image_is_a_finding(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(buffer, format="PNG")
     good, bad = bytearray(buffer.getvalue()), bytearray(buffer.getvalue())
@@ -278,7 +278,7 @@ def test_a_image_that_cannot_be_decoded_is_a_finding(tmp_path: Path) -> None:
         )
 
 
-def test_a_run_whose_recording_was_exchanged_is_refused(tmp_path: Path) -> None:
+def test_a_run_with_a_replaced_recording_is_refused(tmp_path: Path) -> None:
     bag, run = _so101(tmp_path, bags.so101(1.0)), tmp_path / "run"
     other = _so101(tmp_path, bags.so101(1.3), "other")
     mapping = _mapping(tmp_path)

@@ -14,7 +14,7 @@ EVENT = "std_srvs/srv/SetBool_Event"
 DEFINITION = f"{'=' * 80}\nSRV: std_srvs/srv/SetBool\nbool data\n---\nbool success\nstring message\n"
 
 
-def test_events_of_services_are_no_obstacle(tmp_path: Path) -> None:
+def test_events_of_services_are_ignored(tmp_path: Path) -> None:
     arm = [note for note in bags.so101(2.0) if "joint_states" in note.topic]
     time_ns, data = arm[5].log_ns, b"\0\1\0\0" + bytes(64)
     event = bags.Note(topic="/record/_service_event", type=EVENT, log_ns=time_ns, header_ns=time_ns, data=data)

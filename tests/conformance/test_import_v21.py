@@ -162,7 +162,7 @@ def test_an_export_that_would_append_names_the_command_that_converts_it(
         ("tasks.jsonl", '"task_index": 0|"task_index": 0}{', "The table cannot be read"),
     ],
 )
-def test_a_damaged_one_is_refused_in_a_sentence(
+def test_a_damaged_dataset_is_refused_in_a_sentence(
     name: str, text: str, words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = write_v21(tmp_path / "cups")

@@ -96,7 +96,7 @@ def test_a_folder_of_ros_1_bags(notes: bags.Notes, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("compression", [None, *Ros1Writer.CompressionFormat])
 @pytest.mark.parametrize("damage", ["no index", "cut off", "half a chunk", "half a file"])
-def test_a_bag_of_ros_1_that_was_not_finished(
+def test_an_unfinished_bag_of_ros_1(
     damage: str, compression: Ros1Writer.CompressionFormat | None, notes: bags.Notes, tmp_path: Path
 ) -> None:
     """An unfinished bag is read as far as it lasts, record by record where the index is missing."""
@@ -161,7 +161,7 @@ def test_json(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("part", [0.05, 0.3, 0.7, 0.98])
 @pytest.mark.parametrize("use_chunking", [True, False])
-def test_a_bag_that_is_cut_off_is_read_up_to_there(
+def test_a_truncated_bag_is_read_up_to_its_end(
     notes: bags.Notes, part: float, use_chunking: bool, tmp_path: Path
 ) -> None:
     path = bags.write_mcap(notes, tmp_path / "bag.mcap", use_chunking=use_chunking, chunk_size=20_000)
@@ -173,7 +173,7 @@ def test_a_bag_that_is_cut_off_is_read_up_to_there(
     assert len(found) >= len(notes) * (part - 0.3)
 
 
-def test_a_damaged_chunk_is_told(notes: bags.Notes, tmp_path: Path) -> None:
+def test_a_damaged_chunk_is_reported(notes: bags.Notes, tmp_path: Path) -> None:
     path = bags.write_mcap(notes, tmp_path / "bag.mcap", chunk_size=20_000)
     data = bytearray(path.read_bytes())
     middle = len(data) // 3

@@ -126,7 +126,7 @@ def test_one_subtask_holds_at_every_frame_and_changes_with_the_phase(runs: list[
             assert plans == [0.0, times[retry]]
 
 
-def test_subtasks_name_the_thing_that_rises_and_the_place_where_it_ends(runs: list[Path], dataset: Path) -> None:
+def test_subtasks_name_the_lifted_object_and_its_final_place(runs: list[Path], dataset: Path) -> None:
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
             trajectory, scene, fps = recording.trajectory(), recording.info.simulated.scene, recording.info.fps
@@ -195,7 +195,7 @@ def test_motions_are_those_of_the_tcp(runs: list[Path], dataset: Path) -> None:
                 assert abs(opened) < 0.0026
 
 
-def test_memories_come_when_it_is_done(runs: list[Path], dataset: Path) -> None:
+def test_memories_follow_completed_actions(runs: list[Path], dataset: Path) -> None:
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
             goals, tutorial = recording.info.simulated.scene.goals, recording.info.simulated.task == "tutorial"
@@ -220,7 +220,7 @@ def test_fewer_frames_begin_a_subtask_at_the_first_frame_that_is_left(runs: list
     assert [row["timestamp"] for row in rows] == [float(np.float32(start / 10)) for start in starts]
 
 
-def test_the_same_seed_says_the_same_and_nothing_else_of_the_dataset_changes(
+def test_the_same_seed_gives_the_same_language_and_changes_nothing_else(
     runs: list[Path], dataset: Path, tmp_path: Path
 ) -> None:
     export(runs, tmp_path / "again", language=(), progress=True)
@@ -250,7 +250,7 @@ def test_unknown_kinds_are_refused(runs: list[Path], tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", list(THINGS))
-def test_things_are_called_as_the_instructions_call_them(kind: str) -> None:
+def test_objects_have_the_names_of_the_instructions(kind: str) -> None:
     shape = Shape(kind="mesh", size=(0.03, 0.03, 0.03))
     for name in (kind, f"red_{kind}", f"other_red_{kind}", f"red_{kind}_2"):
         body = Body(name=name, role="object", shape=shape, world_from_body=Pose(), mass=0.1)
@@ -309,7 +309,7 @@ def test_sample_weighting_gives_no_weight_to_a_miss(dataset: Path) -> None:
     assert (weights[missed + 1 :] > 0).all()
 
 
-def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], dataset: Path) -> None:
+def test_episodes_are_filtered_by_facts(runs: list[Path], dataset: Path) -> None:
     from lerobot.datasets import LeRobotDataset
 
     meta = LeRobotDataset("local/all", root=dataset).meta
@@ -338,7 +338,7 @@ def test_episodes_are_filtered_by_what_is_known_of_them(runs: list[Path], datase
 
 
 @pytest.mark.slow
-def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None:
+def test_lerobots_tools_keep_the_language(runs: list[Path], tmp_path: Path) -> None:
     from lerobot.datasets import LeRobotDataset
     from lerobot.datasets.aggregate import aggregate_datasets
     from lerobot.datasets.dataset_tools import delete_episodes, split_dataset
@@ -362,7 +362,7 @@ def test_lerobots_tools_keep_the_words(runs: list[Path], tmp_path: Path) -> None
         assert not (tmp_path / out / "sarm_progress.parquet").exists()
 
 
-def test_progress_goes_on_where_a_dataset_ends(runs: list[Path], tmp_path: Path) -> None:
+def test_progress_continues_at_the_end_of_a_dataset(runs: list[Path], tmp_path: Path) -> None:
     out = tmp_path / "grown"
     export(runs[0], out, progress=True)
     with pytest.raises(ConfigError, match="has the stages of --progress: export with it"):

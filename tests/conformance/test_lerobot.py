@@ -258,7 +258,7 @@ def test_lerobots_editing_command_deletes_and_splits(dataset: Path, tmp_path: Pa
 
 
 @pytest.mark.slow
-def test_lerobot_goes_on_recording_and_then_demorec_appends(run: Path, tmp_path: Path) -> None:
+def test_lerobot_continues_recording_and_then_demorec_appends(run: Path, tmp_path: Path) -> None:
     from lerobot.configs.video import RGBEncoderConfig
     from lerobot.datasets import LeRobotDataset
 

@@ -92,7 +92,7 @@ def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> No
 
 
 @pytest.mark.long
-def test_evaluate_records_every_rollout_goes_on_and_refuses_another(
+def test_evaluate_records_every_rollout_continues_and_refuses_another(
     trained: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     policy = trained / "train"
@@ -136,7 +136,7 @@ def test_evaluate_records_every_rollout_goes_on_and_refuses_another(
 
 
 @pytest.mark.long
-def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_correct_finishes_a_policys_attempt(trained: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ["correct", "--policy", str(trained / "train"), "--episode-length", "9", "--workers", "1", "--seed", "3"]
     words += ["--stray-metres", "0", "--stray-radians", "0"]  # it deviates from its first action on
     for count in ("1", "2"):  # the second command resumes
@@ -153,7 +153,7 @@ def test_correct_finishes_what_a_policy_has_begun(trained: Path, capsys: pytest.
     assert "takeover stuck_seconds is 2.0 there and 1.0 here" in capsys.readouterr().err
 
 
-def test_what_is_no_policy_is_refused(tmp_path: Path) -> None:
+def test_other_folders_are_refused_as_policies(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="Not a policy saved by LeRobot"):
         find_checkpoint(tmp_path)
     (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')

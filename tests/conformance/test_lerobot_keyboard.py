@@ -44,7 +44,7 @@ def teleoperator(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.parametrize(("key", "axis", "sign"), [("w", 0, 1), ("s", 0, -1), ("a", 1, 1), ("r", 2, 1)])
-def test_a_key_that_is_held_moves_the_hand(key: str, axis: int, sign: int, teleoperator: Any, tmp_path: Path) -> None:
+def test_a_held_key_moves_the_hand(key: str, axis: int, sign: int, teleoperator: Any, tmp_path: Path) -> None:
     robot = DemorecSO101(DemorecSO101Config(calibration_dir=tmp_path, cameras=[]))
     teleoperator.connect()
     robot.connect()

@@ -45,9 +45,7 @@ def actions(dataset: Path) -> Array:
 
 
 @pytest.mark.slow
-def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
-    run: Path, dataset: Path, tmp_path: Path
-) -> None:
+def test_the_experts_actions_succeed_through_lerobots_interface(run: Path, dataset: Path, tmp_path: Path) -> None:
     home: dict[str, Any] = {
         "calibration_dir": tmp_path / "calibration",
         "cameras": ["front"],
@@ -77,7 +75,7 @@ def test_what_the_expert_did_succeeds_again_through_lerobots_interface(
     assert exit_code("replay", recording) == 0
 
 
-def test_an_own_calibration_and_other_units(dataset: Path, tmp_path: Path) -> None:
+def test_a_custom_calibration_and_other_units(dataset: Path, tmp_path: Path) -> None:
     own = json.loads(CALIBRATION.read_text())
     own["elbow_flex"] |= {"range_min": 1047, "range_max": 3047}
     (tmp_path / "mine.json").write_text(json.dumps(own))
@@ -96,7 +94,7 @@ def test_an_own_calibration_and_other_units(dataset: Path, tmp_path: Path) -> No
     robot.disconnect()
 
 
-def test_panda_has_the_elements_of_our_datasets(tmp_path: Path) -> None:
+def test_panda_has_the_elements_of_exported_datasets(tmp_path: Path) -> None:
     robot = DemorecPanda(DemorecPandaConfig(calibration_dir=tmp_path, cameras=[]))
     robot.connect()
     before = robot.get_observation()
@@ -167,7 +165,7 @@ slow = pytest.mark.slow
 
 @slow
 @pytest.mark.long  # in real time
-def test_lerobot_replay_plays_our_dataset_in_the_simulator(ran: Path, dataset: Path) -> None:
+def test_lerobot_replay_plays_an_exported_dataset_in_the_simulator(ran: Path, dataset: Path) -> None:
     with Recording(ran / "replayed" / "episode_000000.mcap") as recording:
         assert recording.success
         assert recording.num_frames == len(actions(dataset))
@@ -185,7 +183,7 @@ def test_lerobot_teleoperate_drives_the_simulated_arm(ran: Path, run: Path) -> N
 
 
 @slow
-def test_lerobot_record_writes_what_the_recording_has(ran: Path) -> None:
+def test_lerobot_record_writes_the_data_of_the_recording(ran: Path) -> None:
     table = data_table(ran / "simulated")
     found = info(ran / "simulated")
     assert (found["robot_type"], found["fps"]) == ("demorec_so101", 30)
@@ -198,7 +196,7 @@ def test_lerobot_record_writes_what_the_recording_has(ran: Path) -> None:
 
 
 @slow
-def test_ours_and_a_real_arms_merge_unedited(ran: Path, dataset: Path) -> None:
+def test_simulated_and_real_datasets_merge_unedited(ran: Path, dataset: Path) -> None:
     both, real = info(ran / "both"), info(ran / "real")
     assert real["robot_type"] == both["robot_type"] == info(dataset)["robot_type"]
     assert both["total_episodes"] == 2
@@ -206,7 +204,7 @@ def test_ours_and_a_real_arms_merge_unedited(ran: Path, dataset: Path) -> None:
 
 
 @slow
-def test_a_real_arm_can_do_what_we_export(ran: Path, dataset: Path) -> None:
+def test_a_real_arm_can_execute_exported_actions(ran: Path, dataset: Path) -> None:
     """Check every goal sent to the servos: within their range, and no faster than they turn."""
     goals = np.array([line.split() for line in (ran / "goals.txt").read_text().splitlines()], dtype=int)
     counts = np.stack([goals[goals[:, 0] == servo, 1] for servo in range(1, 7)], axis=1)

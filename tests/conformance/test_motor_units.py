@@ -126,7 +126,7 @@ def radians(run: Path) -> np.ndarray[Any, Any]:
 
 
 @pytest.mark.parametrize("units", UNITS)
-def test_lerobot_makes_the_same_of_what_the_servos_count(
+def test_lerobot_converts_servo_counts_to_the_same_values(
     run: Path, tmp_path: Path, calibration: Path, units: MotorUnits, driver: Callable[[Path, MotorUnits], Any]
 ) -> None:
     out = tmp_path / "d"
@@ -150,7 +150,7 @@ def test_lerobot_makes_the_same_of_what_the_servos_count(
 
 
 @pytest.mark.parametrize("units", UNITS)
-def test_what_lerobot_recorded_is_read_as_radians(
+def test_a_dataset_of_lerobot_is_read_as_radians(
     run: Path, tmp_path: Path, calibration: Path, units: MotorUnits
 ) -> None:
     """As with a real arm, the dataset has nothing but names and numbers."""
@@ -204,7 +204,7 @@ def test_a_real_arm_beyond_its_limits_is_found(
         ({"elbow_flex": {"id": 3}}, "drive_mode"),
     ],
 )
-def test_what_is_no_calibration_is_refused(
+def test_an_invalid_calibration_is_refused(
     run: Path, tmp_path: Path, change: dict[str, Any], said: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     wrong = {name: entry for name, entry in {**OWN, **change}.items() if entry is not None}
@@ -222,7 +222,7 @@ def test_check_is_clean_and_knows_degrees(dataset: Path) -> None:
     assert results["joint_limits"] == "good"
 
 
-def test_what_cannot_be_in_motor_units_is_refused(
+def test_other_robots_are_refused_in_motor_units(
     run: Path, dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     panda = simulate(tmp_path / "panda.mcap", seed=11)
@@ -252,7 +252,7 @@ def test_a_recording_cut_off_by_a_crash_stays_out(run: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.slow
-def test_recordings_that_differ_are_told_apart_by_what_differs(run: Path, tmp_path: Path) -> None:
+def test_differences_between_recordings_are_named(run: Path, tmp_path: Path) -> None:
     (path,) = (run / "episodes").glob("*.mcap")
     other = simulate(tmp_path / "other.mcap", robot="so101", seed=11, cameras=("wrist",))
     with pytest.raises(ConfigError, match="cameras is wrist instead of front") as refused:

@@ -83,7 +83,7 @@ def test_the_mcap_reader_finds_every_checksum_right(recorded: Recorded) -> None:
         assert data_end[0].data_section_crc not in (0, zlib.crc32(stream.read()))
 
 
-def test_mcap_decodes_what_was_written(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
+def test_mcap_decodes_the_written_messages(path: Path, episode: tuple[EpisodeInfo, list[Frame], Outcome]) -> None:
     _, frames, _ = episode
     with path.open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
@@ -263,7 +263,7 @@ def rerun_entities(path: Path, folder: Path) -> dict[str, set[str]]:
     return entities
 
 
-def test_rerun_shows_everything_without_code_of_ours(path: Path, tmp_path: Path) -> None:
+def test_rerun_shows_everything_without_demorec(path: Path, tmp_path: Path) -> None:
     entities = rerun_entities(path, tmp_path)
     expected = {
         "/camera/front/h264": "VideoStream",

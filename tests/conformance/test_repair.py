@@ -162,7 +162,7 @@ DAMAGES: dict[str, tuple[Damage, str]] = {
 
 @pytest.mark.slow
 @pytest.mark.parametrize("fault", DAMAGES)
-def test_lerobot_gives_every_frame_of_what_was_repaired(
+def test_lerobot_reads_every_frame_of_a_repaired_dataset(
     fault: str, whole: Path, frames: list[list[dict[str, Any]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(whole, tmp_path / "d"))
@@ -203,7 +203,7 @@ def test_float64_rows_stay_float64(whole: Path, tmp_path: Path, capsys: pytest.C
     "names", [[["x", "y", "z"]], {"motors": ["x", "y", "z"]}, {"axes": ["x", "y", "z"]}, ["x", "y"]]
 )
 @pytest.mark.parametrize("shape", [[3], [5]])
-def test_names_keep_the_form_that_was_read(
+def test_names_keep_their_form(
     names: Any, shape: list[int], whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(whole, tmp_path / "d"))
@@ -314,7 +314,7 @@ REFUSED: dict[str, tuple[Damage, str]] = {
 
 
 @pytest.mark.parametrize("fault", REFUSED)
-def test_what_would_be_invented_is_refused(
+def test_repairs_that_need_invented_data_are_refused(
     fault: str, whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(whole, tmp_path / "d"))

@@ -64,7 +64,7 @@ def changed(dataset: Path, out: Path, change: Any) -> Path:
     return out
 
 
-def test_what_the_simulator_did_itself_is_tracked(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_actions_of_the_simulator_are_tracked(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
     found = replayed(capsys, dataset, *DEGREES)
     assert len(found) == 2
     for tracking in found:
@@ -75,7 +75,7 @@ def test_what_the_simulator_did_itself_is_tracked(dataset: Path, capsys: pytest.
 
 
 @pytest.mark.slow
-def test_an_imported_recording_says_its_units_itself(
+def test_an_imported_recording_states_its_units(
     dataset: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code("import", "lerobot", dataset, "--motor-units", "degrees", "--out", tmp_path / "run") == 0
@@ -121,7 +121,7 @@ def test_an_offset_and_a_lag_show_in_their_joints(
         ((), "--robot replays a real arm's actions"),
     ],
 )
-def test_what_does_not_fit_is_refused_in_one_sentence(
+def test_unsuitable_datasets_are_refused_in_one_sentence(
     dataset: Path, capsys: pytest.CaptureFixture[str], flags: tuple[str, ...], said: str
 ) -> None:
     capsys.readouterr()

@@ -66,7 +66,9 @@ def imported(exporter: str, source: Path, out: Path) -> Path:
 
 
 @pytest.mark.parametrize("exporter", ["lerobot", "hdf5"])
-def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_round_trip_of_another_robot(
+    exporter: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     options: dict[str, Any] = {"depth": True, "include_failures": True}
     options |= {"language": ()} if exporter == "lerobot" else {}
     export(run, tmp_path / "a", exporter, **options)
@@ -119,7 +121,7 @@ def test_of_another_robot(exporter: str, run: Path, tmp_path: Path, capsys: pyte
 
 
 @pytest.mark.slow
-def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_round_trip_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Colour and depth of two cameras, subtasks and outcome come back; scene, boxes and the rest are named."""
     made = make_run(tmp_path / "run", (4, 6), depth=True, segmentation=True)
     export(made, tmp_path / "a", depth=True, language=(), boxes=True, progress=True)
@@ -145,7 +147,7 @@ def test_of_a_simulated_episode(tmp_path: Path, capsys: pytest.CaptureFixture[st
         assert [path.read_bytes() for path in a] == [path.read_bytes() for path in b]
 
 
-def test_what_nobody_would_keep_beside_a_dataset_is_not_believed(run: Path, tmp_path: Path) -> None:
+def test_implausible_sidecar_data_is_ignored(run: Path, tmp_path: Path) -> None:
     """An unknown camera, a pose without a rotation, control characters in a reason."""
     export(run, tmp_path / "a", include_failures=True)
     (path,) = (tmp_path / "a" / "demorec" / "episodes").glob("*/*.parquet")

@@ -50,7 +50,7 @@ def test_programs_run_and_are_short(name: str, run_folder: Path, tmp_path: Path)
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", PROGRAMS)
-def test_programs_say_what_is_missing(name: str, tmp_path: Path) -> None:
+def test_programs_name_missing_requirements(name: str, tmp_path: Path) -> None:
     program = [sys.executable, str(VIEWERS / "rerun" / name)]
     words = [str(tmp_path / "nothing"), str(tmp_path / "x.rrd")]
     done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
@@ -60,7 +60,7 @@ def test_programs_say_what_is_missing(name: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("layout", sorted((VIEWERS / "foxglove").glob("*.json")), ids=lambda path: path.stem)
-def test_foxglove_layouts_ask_for_what_a_recording_has(layout: Path, run_folder: Path) -> None:
+def test_foxglove_layouts_use_topics_of_recordings(layout: Path, run_folder: Path) -> None:
     content = json.loads(layout.read_text())
     panels = content["configById"]
     assert set(_leaves(content["layout"])) == set(panels)

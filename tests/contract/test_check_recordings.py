@@ -146,7 +146,7 @@ NUMBERS: dict[str, tuple[Fault, str]] = {
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-def test_spoilt_numbers(name: str, good: Path, tmp_path: Path) -> None:
+def test_damaged_numbers(name: str, good: Path, tmp_path: Path) -> None:
     fault, check = NUMBERS[name]
     spoilt = Spoilt(good)
     fault(spoilt)
@@ -223,7 +223,7 @@ FILES: dict[str, tuple[Callable[[Message], list[Message]], set[str]]] = {
 
 
 @pytest.mark.parametrize("name", FILES)
-def test_a_spoilt_file(name: str, good: Path, tmp_path: Path) -> None:
+def test_a_damaged_file(name: str, good: Path, tmp_path: Path) -> None:
     edit, checks = FILES[name]
     spoilt = rewrite_messages(good, tmp_path / "s.mcap", edit)
     assert checks <= {check for check, verdict in findings(spoilt) if verdict == "broken"}
@@ -308,7 +308,7 @@ def test_the_command(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[s
             assert found["taken"]["observation.state"] == "state"
 
 
-def test_what_is_not_measured_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_unmeasured_checks_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = simulate(tmp_path / "e.mcap", task="support.odd_tasks:FarAway", fps=10)
     assert exit_code("check", path) == 0
     (line,) = (line for line in capsys.readouterr().out.splitlines() if "action_lag" in line)

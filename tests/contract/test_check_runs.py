@@ -102,7 +102,7 @@ def test_info_and_check_agree_whether_run_json_is_damaged(run: Path) -> None:
 
 
 @pytest.mark.parametrize("name", LINES)
-def test_a_line_that_lies(name: str, run: Path) -> None:
+def test_a_wrong_line_in_run_json(name: str, run: Path) -> None:
     edit_json(run / "run.json", LINES[name])
     assert verdict_of(run, "run_agrees", "run") == "broken"
 
@@ -211,7 +211,7 @@ def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.Monke
     assert {results[name].verdict for name in ("opens", "checksums", "missing_numbers")} == {"good"}
 
 
-def test_the_command_goes_on_after_a_bad_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_continues_after_a_bad_recording(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (run / "episodes" / "episode_000000.mcap").write_bytes(b"")
     assert exit_code("check", run, "--json", "--no-images") == 1
     found = json.loads(capsys.readouterr().out)

@@ -110,12 +110,12 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     assert report.is_identical, report
 
 
-def test_no_check_fails_on_a_correction(rollout: tuple[Attempt, Path]) -> None:
+def test_every_check_passes_on_a_correction(rollout: tuple[Attempt, Path]) -> None:
     report = check_subject(Subject(path=rollout[1], kind="recording"), CheckOptions())
     assert [result.check for result in report.results if result.verdict == "broken"] == []
 
 
-def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Path) -> None:
+def test_the_dataset_marks_the_experts_frames(rollout: tuple[Attempt, Path], tmp_path: Path) -> None:
     """As LeRobot's own DAgger does: a boolean column, true where the expert acted."""
     export(rollout[1], tmp_path / "plain")
     assert "intervention" not in info(tmp_path / "plain")["features"]
@@ -131,7 +131,7 @@ def test_the_dataset_tells_who_acted(rollout: tuple[Attempt, Path], tmp_path: Pa
 
 
 @pytest.mark.parametrize("exporter", EXPORTERS.names())
-def test_what_a_policy_did_alone_can_be_left_out(
+def test_episodes_without_corrections_can_be_left_out(
     rollout: tuple[Attempt, Path], expert_poses: Array, tmp_path: Path, exporter: str
 ) -> None:
     alone, uncorrected = roll_out(
@@ -189,7 +189,7 @@ def situations(speed: float) -> list[Situation]:
         (TakeOver(stuck_seconds=0.0, after_seconds=4.0), 0.0, (120, "the policy has had its time")),
     ],
 )
-def test_the_moment(takeover: TakeOver, speed: float, expected: tuple[int, str]) -> None:
+def test_the_moment_of_a_takeover(takeover: TakeOver, speed: float, expected: tuple[int, str]) -> None:
     episode = prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=0))
     watch = Watch(takeover, episode, max_frames=300)
     told = enumerate(watch.reason(situation, UNSEEN) for situation in situations(speed))
@@ -235,14 +235,14 @@ def act_in_turns(policy: Any, rules: TakeOver) -> tuple[Turns, list[Frame]]:
     return turns, frames
 
 
-def test_who_does_as_the_expert_does_is_left_alone(expert_poses: Array) -> None:
+def test_a_policy_that_acts_like_the_expert_is_left_alone(expert_poses: Array) -> None:
     turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=10_000, drift=0.0), TakeOver(stray_metres=0.02))
     assert turns.success
     assert {frame.phase for frame in frames} == {POLICY_PHASE}
 
 
 @pytest.mark.parametrize("hand_back", [False, True])
-def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
+def test_a_deviating_policy_is_corrected(expert_poses: Array, hand_back: bool) -> None:
     """It leaves the expert's path at frame 20 by 1 cm a frame: beyond 5 cm from frame 26, for 6 frames at frame 31."""
     rules = TakeOver(stray_metres=0.05, stray_seconds=0.2, hand_back=hand_back)
     turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=20, drift=0.01), rules)
@@ -257,7 +257,7 @@ def test_who_strays_is_corrected(expert_poses: Array, hand_back: bool) -> None:
     assert np.array_equal(before.action.joint_target, before.command.joint_target)  # the policy's output
 
 
-def test_who_is_handed_back_to_is_told_and_the_episode_replays(expert_poses: Array, tmp_path: Path) -> None:
+def test_a_policy_is_notified_when_handed_back_to_and_the_episode_replays(expert_poses: Array, tmp_path: Path) -> None:
     """With noise on the expert's commands: labels and commands differ in the expert's frames only."""
     rules = TakeOver(hand_back=True)
     attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), rules, action="ee")

@@ -310,7 +310,7 @@ def test_cut_episodes_are_recognised(
     assert len(found["differences"]) == len(lines) == len(LENGTHS)  # the images of these frames are equal
 
 
-def test_our_own_datasets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_datasets_of_demorec(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     export(make_run(tmp_path / "run", (20, 15, 17)), tmp_path / "d")
     export(make_run(tmp_path / "again", (20, 15, 17)), tmp_path / "e")
     assert compared(tmp_path / "d", tmp_path / "d", capsys)["same"]
@@ -319,7 +319,7 @@ def test_our_own_datasets(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
     assert named(compared(tmp_path / "d", tmp_path / "less", capsys)) == [("episodes", "missing", 1, None)]
 
 
-def test_what_cannot_be_compared_is_an_error(
+def test_incomparable_paths_are_an_error(
     bases: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(bases["video"], tmp_path / "d"))

@@ -119,7 +119,7 @@ def _with_column(table: pa.Table, name: str, values: list[int]) -> pa.Table:
 @pytest.mark.long
 @pytest.mark.parametrize("spoil", [without_table, wrong_files])
 @pytest.mark.parametrize("command", READERS)
-def test_what_the_table_lacks_is_found_by_the_rows(
+def test_episodes_missing_from_the_table_are_found_by_the_rows(
     command: str, spoil: Callable[[Path], None], apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(apart, tmp_path / "d"))
@@ -149,9 +149,7 @@ def test_an_old_dataset_without_its_table_is_found_by_the_rows(
     assert tables[0].equals(tables[1])
 
 
-def test_rows_that_do_not_say_enough_are_refused(
-    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_ambiguous_rows_are_refused(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """One image fewer than rows: no file identifies the episode that lacks it (AgiBot-World#149)."""
     root = Path(shutil.copytree(exported, tmp_path / "d"))
     without_table(root)
@@ -160,7 +158,7 @@ def test_rows_that_do_not_say_enough_are_refused(
     assert "32 images for 33 rows" in capsys.readouterr().err
 
 
-def test_a_dataset_without_episodes_shows_nothing_and_says_so(exported: Path, tmp_path: Path) -> None:
+def test_a_dataset_without_episodes_is_reported_as_empty(exported: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(exported, tmp_path / "d"))
     for place in ("meta/episodes", "data"):
         change_table(root, place, lambda table: table.slice(0, 0))
@@ -168,7 +166,7 @@ def test_a_dataset_without_episodes_shows_nothing_and_says_so(exported: Path, tm
     assert exit_code("view", root, "--save", tmp_path / "new.rrd") == 2
 
 
-def test_rows_without_frame_index_are_no_fault(
+def test_rows_without_frame_index_are_accepted(
     exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(exported, tmp_path / "d"))
@@ -180,7 +178,7 @@ def test_rows_without_frame_index_are_no_fault(
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("command", READERS)
-def test_a_dataset_that_is_not_whole_is_refused(
+def test_an_incomplete_dataset_is_refused(
     command: str, fault: str, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(exported, tmp_path / "d"))
@@ -198,7 +196,7 @@ def test_a_dataset_that_is_not_whole_is_refused(
 
 
 @pytest.mark.slow
-def test_the_commands_succeed_on_the_whole_one(
+def test_the_commands_succeed_on_the_complete_dataset(
     exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     codes = {name: exit_code(*words_of(call, exported, tmp_path / name)) for name, call in READERS.items()}
@@ -206,7 +204,7 @@ def test_the_commands_succeed_on_the_whole_one(
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_dataset_that_is_not_whole_is_not_appended_to(
+def test_an_incomplete_dataset_is_not_appended_to(
     fault: str, run: Path, exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(exported, tmp_path / "d"))
@@ -305,7 +303,7 @@ def test_chosen_episodes_are_imported(
     [("9", "--episodes 9 is out of range: choose from 0 to 3."), ("2:1", "--episodes 2:1 is out of range"),
      ("-1", "--episodes -1 is out of range"), ("first", "expected numbers and ranges like 7 or 0:20.")],
 )  # fmt: skip
-def test_episodes_that_a_dataset_lacks_are_one_sentence(
+def test_missing_episodes_are_one_sentence(
     words: str, told: str, apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code("import", "lerobot", apart, f"--episodes={words}", "--out", tmp_path / "run") == 2

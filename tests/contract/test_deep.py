@@ -61,14 +61,14 @@ def found(report: DeepReport) -> set[tuple[str, str, tuple[int, ...]]]:
     return {(d.stream, d.field, d.frames) for d in report.differences}
 
 
-def test_good_recordings_come_out_the_same(filmed: Path, blind: Path, simulators: SimulatorCache) -> None:
+def test_good_recordings_are_reproduced(filmed: Path, blind: Path, simulators: SimulatorCache) -> None:
     for path in (filmed, blind):
         report = deep_check(path, simulators)
         assert (report.level, report.differences, report.versions, report.error) == ("pass", (), (), "")
         assert report.num_frames > 40
 
 
-def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, simulators: SimulatorCache) -> None:
+def test_a_failed_attempt_is_reproduced(tmp_path: Path, simulators: SimulatorCache) -> None:
     path = simulate(tmp_path / "failed.mcap", seed=7, fps=FPS, max_episode_seconds=2.0)
     with Recording(path) as recording:
         assert recording.outcome is not None
@@ -77,7 +77,7 @@ def test_a_failed_attempt_comes_out_the_same(tmp_path: Path, simulators: Simulat
 
 
 @pytest.mark.slow
-def test_a_rendering_comes_out_the_same(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
+def test_a_rendering_is_reproduced(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     path = tmp_path / "rendered.mcap"
     rerender(blind, path, RerenderOptions(cameras=("front",), width=64, height=64, looks=3))
     report = deep_check(path, simulators)
@@ -180,7 +180,7 @@ def test_one_bit_of_one_number(blind: Path, tmp_path: Path, simulators: Simulato
 
 
 @pytest.mark.slow
-def test_a_topic_that_no_recording_has(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
+def test_an_unknown_topic(blind: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     spoilt = tmp_path / "spoilt.mcap"
     rewrite_messages(blind, spoilt, lambda m: (m, ("/mine", *m[1:])) if m[0] == "/wrench" else (m,))
     assert ("/mine", "messages", ()) in found(deep_check(spoilt, simulators))
@@ -254,7 +254,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("also_differs", [False, True])
-def test_what_another_version_or_cpu_made_is_not_provable_here(
+def test_recordings_of_another_version_or_cpu_are_not_provable_here(
     change: dict[str, Any],
     line: str,
     also_differs: bool,
@@ -389,7 +389,7 @@ def test_a_run_makes_a_sample_again(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_recording_that_a_crash_cut_off_is_compared_as_far_as_it_goes(
+def test_a_truncated_recording_is_compared_up_to_its_end(
     filmed: Path, tmp_path: Path, simulators: SimulatorCache
 ) -> None:
     part = tmp_path / "cut.mcap.part"

@@ -204,7 +204,7 @@ def test_every_command_has_a_row() -> None:
 
 
 @pytest.mark.parametrize("row", OF_IMPORTED)
-def test_what_was_imported_works_or_it_is_said_why_not(
+def test_commands_work_on_imports_or_give_the_reason(
     row: str, places: dict[str, list[Path | str]], scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (run,), (dataset,), (bag, _, mapping) = (places[kind] for kind in ("imported run", "imported dataset", "trossen"))
@@ -229,7 +229,7 @@ def _num_frames(recording: Path) -> int:
 
 @pytest.mark.parametrize(("kind", "word"), [("robomimic", "hdf5"), ("aloha", "hdf5"), ("lerobot v3.0", "lerobot")])
 @pytest.mark.parametrize("flags", [(), ("--mapping", "MAPPING", "--out", "NEW"), ("--suggest",)])
-def test_what_is_given_as_a_bag_gets_its_word(
+def test_bags_get_their_import_word(
     kind: str,
     word: str,
     flags: tuple[str, ...],
@@ -256,7 +256,7 @@ def test_numbers_are_those_of_the_file(
             np.testing.assert_array_equal(old[f"data/{theirs}/actions"], new[f"data/{ours}/actions"])
 
 
-def test_what_was_left_out_and_the_mapping_are_reported(
+def test_omissions_and_the_mapping_are_reported(
     places: dict[str, list[Path | str]], scratch: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (source,) = places["robomimic"]
@@ -295,7 +295,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
         ),
     ],
 )
-def test_a_mapping_that_does_not_belong_there(
+def test_a_mapping_of_another_format(
     kind: str,
     words: list[str],
     sentence: str,
@@ -309,7 +309,7 @@ def test_a_mapping_that_does_not_belong_there(
     assert not list(scratch.iterdir())
 
 
-def test_a_bag_that_leaves_something_to_the_user_needs_a_mapping(
+def test_a_bag_with_open_decisions_needs_a_mapping(
     scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     notes = bags.of_topic(bags.in_order(bags.so101(1.0)), "/follower/cam_front/image_raw/compressed")
@@ -322,7 +322,7 @@ def test_a_bag_that_leaves_something_to_the_user_needs_a_mapping(
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))])
-def test_nothing_stays_where_reading_is_cut_off(
+def test_an_interrupted_reading_leaves_nothing(
     error: BaseException,
     places: dict[str, list[Path | str]],
     scratch: Path,
@@ -356,7 +356,7 @@ def test_a_signal_leaves_nothing_behind(number: int, tmp_path: Path) -> None:
     assert not list((tmp_path / "scratch").iterdir())
 
 
-def test_a_disk_that_is_too_small_is_said_before_anything_is_read(
+def test_a_disk_that_is_too_small_is_reported_before_reading(
     places: dict[str, list[Path | str]],
     scratch: Path,
     monkeypatch: pytest.MonkeyPatch,

@@ -29,7 +29,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return make_run(tmp_path_factory.mktemp("run") / "run", (6, 5, 4), failures=(1,))
 
 
-def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: Path, tmp_path: Path) -> None:
+def test_only_selected_episodes_are_exported_and_nothing_else_changes(exporter: str, run: Path, tmp_path: Path) -> None:
     before = files_of(run)
     row = EXPORTERS.load(exporter)
     calls: list[tuple[int, int]] = []
@@ -43,7 +43,7 @@ def test_the_wanted_episodes_go_in_and_nothing_else_changes(exporter: str, run: 
 
 
 @pytest.mark.parametrize("name", [*ON_REQUEST, "command"])
-def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run: Path, tmp_path: Path) -> None:
+def test_sensor_features_are_exported_by_name(exporter: str, name: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, features=(name,), episodes="0")
     with Recording(run / "episodes" / "episode_000000.mcap") as recording:
         trajectory = recording.trajectory()
@@ -64,7 +64,7 @@ def test_what_was_sensed_goes_in_when_it_is_named(exporter: str, name: str, run:
     export(run, tmp_path / "d", exporter, overwrite=True)  # files with it are still recognised
 
 
-def test_what_it_makes_is_known(exporter: str, run: Path, tmp_path: Path) -> None:
+def test_its_result_is_recognised(exporter: str, run: Path, tmp_path: Path) -> None:
     """Every command that is given the result recognises it; in a folder, none writes anything else."""
     out = tmp_path / "d"
     export(run, out, exporter)
@@ -76,7 +76,7 @@ def test_what_it_makes_is_known(exporter: str, run: Path, tmp_path: Path) -> Non
             refuse_inside([out / "inner"])
 
 
-def test_a_recovered_recording_is_no_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
+def test_a_recovered_recording_is_not_a_failed_attempt(exporter: str, run: Path, tmp_path: Path) -> None:
     sources = [run / "episodes" / "episode_000000.mcap", tmp_path / "recovered.mcap"]
     info, frames, _ = make_episode(num_frames=70, episode_index=7)
     with suppress(InterruptedError), EpisodeWriter(tmp_path / "cut.mcap", info) as writer:
@@ -96,7 +96,7 @@ def test_the_same_recordings_give_the_same_bytes(exporter: str, run: Path, tmp_p
     assert content_of(tmp_path / "a") == content_of(tmp_path / "b")
 
 
-def test_a_dataset_is_replaced_only_when_asked_for(exporter: str, run: Path, tmp_path: Path) -> None:
+def test_a_dataset_is_replaced_only_on_request(exporter: str, run: Path, tmp_path: Path) -> None:
     export(run, tmp_path / "d", exporter, episodes="0")
     before = content_of(tmp_path / "d")
     with pytest.raises(ConfigError, match="exists already"):
@@ -108,7 +108,7 @@ def test_a_dataset_is_replaced_only_when_asked_for(exporter: str, run: Path, tmp
 
 
 @pytest.mark.parametrize("kind", ["file", "folder", "recording"])
-def test_what_is_no_dataset_is_never_replaced(exporter: str, run: Path, tmp_path: Path, kind: str) -> None:
+def test_other_files_are_never_replaced(exporter: str, run: Path, tmp_path: Path, kind: str) -> None:
     out = tmp_path / "d"
     if kind == "file":
         out.write_text("years of work")

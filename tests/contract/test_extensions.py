@@ -82,7 +82,7 @@ def run(site: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_lists_and_help_show_what_a_package_brings(site: Path) -> None:
+def test_lists_and_help_show_the_names_of_a_package(site: Path) -> None:
     for table, name in (
         ("tasks", "lab_pick"),
         ("robots", "lab_panda"),

@@ -46,7 +46,7 @@ def with_cube(made: PreparedEpisode, *, side: float, mass: float, friction: floa
 @pytest.mark.parametrize(
     ("side", "mass", "friction"), [(0.0328, 0.030, 0.42), (0.0318, 0.038, 0.42), (0.0328, 0.102, 0.456)]
 )
-def test_fingers_stand_as_far_apart_as_the_cube_is_wide(robot: str, side: float, mass: float, friction: float) -> None:
+def test_the_gap_between_fingers_equals_the_cubes_width(robot: str, side: float, mass: float, friction: float) -> None:
     """Small, light, slippery cubes: fingers with one contact each would rock and sink in by up to 13 mm."""
     scale = ROBOTS.load(robot).task_scale
     made = episode(957, robot=robot, seed=2718, split="train")
@@ -54,21 +54,21 @@ def test_fingers_stand_as_far_apart_as_the_cube_is_wide(robot: str, side: float,
     assert smallest_opening(with_cube(made, side=side, mass=mass, friction=friction)) > side - 2 * SINKING
 
 
-def test_an_episode_that_crushes_something_is_a_failure() -> None:
+def test_an_episode_that_crushes_an_object_is_a_failure() -> None:
     frames, outcome = run(episode(0, task="support.odd_tasks:HeavyHanded"))
     assert max(frame.observation.contact_force for frame in frames) > 50  # N; a frame later it would be above 100
     assert (outcome.success, outcome.failure_phase, outcome.failure_reason) == (False, "press", "crush")
     assert frames[-1].events[-1].message == "pressed on red_cube harder than a hand can"
 
 
-def test_a_hand_that_opens_lets_go_at_any_rate() -> None:
+def test_an_opening_hand_lets_go_at_any_frame_rate() -> None:
     """At 60 frames a second the fingers still touch the cube one frame after they begin to open."""
     frames, outcome = run(episode(0, task="tutorial", robot="iiwa", variation="full", fps=60, seed=72008))
     assert outcome.success
     assert frames[-1].observation.object_poses["red_cube"].position[2] < 0.3  # on the table, not in the hand at 0.8 m
 
 
-def test_what_was_dropped_rests_in_the_last_recorded_frames() -> None:
+def test_a_dropped_object_rests_in_the_last_recorded_frames() -> None:
     frames, outcome = run(episode(0, task="tutorial", variation="full", fps=10, seed=72019))
     before, last = (frame.observation.object_poses["red_cube"].position for frame in frames[-2:])
     assert outcome.success

@@ -50,7 +50,7 @@ def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
 
 
 @pytest.mark.slow
-def test_things_are_drawn_from_the_named_shelves_and_their_split() -> None:
+def test_objects_are_drawn_from_the_named_shelves_and_their_split() -> None:
     """The environment draws the same objects as `generate` for these flags, and for the flags of LeRobot's plug-in."""
     flags: dict[str, Any] = {"objects": ("blocks",), "object_split": "eval", "split": "all"}
     env = make("pick_anything", **flags)
@@ -103,7 +103,7 @@ def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_pa
 
 
 @pytest.mark.slow
-def test_what_is_asked_for_by_name_is_what_the_export_writes(tmp_path: Path) -> None:
+def test_features_requested_by_name_equal_the_export(tmp_path: Path) -> None:
     """Every feature of `export --features`, row by row; the command is that of the step that leads to the next row."""
     path = simulate(tmp_path / "e.mcap", episode_index=3)
     export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False, features=(*ON_REQUEST, "command")))
@@ -195,7 +195,7 @@ def test_a_varying_number_of_objects_is_refused_where_a_vector_must_hold_them() 
     env.close()
 
 
-def test_time_is_limited_and_nonsense_is_refused() -> None:
+def test_time_is_limited_and_invalid_actions_are_refused() -> None:
     env = make(episode_length=3)
     with pytest.raises(RuntimeError, match="reset"):
         env.step(env.action_space.sample())

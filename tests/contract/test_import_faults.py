@@ -52,7 +52,7 @@ def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
         assert len(list(run.glob("episodes/*.mcap"))) == 1
 
 
-def test_copies_are_counted_beside_messages_without_a_time(notes: bags.Notes, tmp_path: Path) -> None:
+def test_copies_are_counted_next_to_messages_without_a_time(notes: bags.Notes, tmp_path: Path) -> None:
     """Every third message is repeated, and the last header has no time; `copied_episodes` must not count it."""
     topic = "/follower/joint_states"
     twice = hurt(notes, "duplicated messages")
@@ -69,7 +69,7 @@ def test_copies_are_counted_beside_messages_without_a_time(notes: bags.Notes, tm
     assert "1 of " in found["unstamped"]
 
 
-def test_a_bag_that_is_cut_off_is_named(notes: bags.Notes, tmp_path: Path) -> None:
+def test_a_truncated_bag_is_named(notes: bags.Notes, tmp_path: Path) -> None:
     bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap", chunk_size=20_000)
     data = bag.read_bytes()
     bag.write_bytes(data[: len(data) * 3 // 4])
@@ -125,7 +125,7 @@ def test_images_that_come_unevenly_are_not_lost(notes: bags.Notes, tmp_path: Pat
     assert _findings(bags.write_mcap(uneven, tmp_path / "bag.mcap"), tmp_path) == {"jitter"}
 
 
-def test_headers_without_time_are_no_finding_where_the_mapping_knows(notes: bags.Notes, tmp_path: Path) -> None:
+def test_headers_without_time_are_accepted_if_the_mapping_expects_them(notes: bags.Notes, tmp_path: Path) -> None:
     """As with JointTrajectory, where time 0 means "at once"."""
     unstamped = bags.changed(notes, ACTION, lambda k, note: replace(note, header_ns=0))
     bag = bags.write_mcap(unstamped, tmp_path / "bag.mcap")
@@ -148,7 +148,7 @@ def test_check_reads_the_report(kind: str, notes: bags.Notes, tmp_path: Path) ->
     assert result_of(tmp_path / "run", "import_dropped", "run").verdict == "good"
 
 
-def test_dropped_episodes_are_told(notes: bags.Notes, tmp_path: Path) -> None:
+def test_dropped_episodes_are_reported(notes: bags.Notes, tmp_path: Path) -> None:
     bag = bags.write_mcap(hurt(notes, "a long pause"), tmp_path / "bag.mcap")
     cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.6], [0.6, 1.3]]\n'
     text = MAPPING.replace("fps = 30", 'fps = 30\nwhen_old = "drop_episode"')

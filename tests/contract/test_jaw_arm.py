@@ -54,14 +54,14 @@ ARM = ArmKinematics(
         ("pick_shapes", 165),  # a mug that rocks after its release
     ],
 )
-def test_a_small_arm_finds_a_clear_grasp_a_yaw_in_reach_and_waits_for_what_rocks(task: str, index: int) -> None:
+def test_a_small_arm_finds_a_clear_grasp_a_reachable_yaw_and_waits_for_rocking_objects(task: str, index: int) -> None:
     _, outcome = run_expert(task, "so101", 0, index)
     assert outcome.success
     assert outcome.num_retries == 0
 
 
 @pytest.mark.parametrize(("robot", "least"), [(PANDA, 0.015), (SO101, 0.0022 + 0.38 * 0.015)])
-def test_the_thinnest_thing_that_is_grasped_is_as_thin_as_the_hand_is_small(robot: RobotSpec, least: float) -> None:
+def test_the_minimum_width_of_an_object_scales_with_the_hand(robot: RobotSpec, least: float) -> None:
     def found(width: float) -> bool:
         box = trimesh.creation.box(extents=(0.12, width, 0.03))
         corners, faces = np.array(box.vertices), np.array(box.faces)
@@ -93,7 +93,7 @@ def test_the_jaw_opens_as_far_as_its_tip_is_away(q: float, speed: float) -> None
 
 
 @pytest.mark.parametrize("rows", [(), ((0.0, 0.01),), ((0.0, 0.02), (0.1, 0.01)), ((0.0, 0.0), (0.2, 0.1), (0.1, 0.2))])
-def test_an_opening_that_is_no_function_is_refused(rows: tuple[tuple[float, float], ...]) -> None:
+def test_an_ambiguous_opening_is_refused(rows: tuple[tuple[float, float], ...]) -> None:
     with pytest.raises(ValueError, match="from closed to open"):
         replace(JAW, opening=rows)
     plain = json.loads(to_json(JAW_ARM))
@@ -132,7 +132,7 @@ def test_position_and_roll_are_reached_and_the_hand_leans_within_the_cone(
         (hand_down((0.2, 0.0, 0.25), 0.0), Freedom(cone=math.pi, roll=math.pi), ""),
     ],
 )
-def test_what_cannot_be_reached_is_said_in_words(wanted: Pose, freedom: Freedom | None, words: str) -> None:
+def test_unreachable_poses_are_explained(wanted: Pose, freedom: Freedom | None, words: str) -> None:
     rest = ARM.turned_towards(HOME, wanted.position)
     why = ARM.why_unreachable(wanted, start=rest, rest=rest, freedom=freedom)
     assert (words in why) if words else why == ""
@@ -156,7 +156,7 @@ def test_a_motion_that_takes_a_joint_to_its_limit_is_slowed_down_until_it_fits()
 @pytest.mark.parametrize(
     ("home", "is_low"), [(JAW_ARM.home_q, True), ((0.0, -0.0426, 0.0715, 1.5419, 0.0), False)], ids=["low", "high"]
 )
-def test_nothing_lies_where_the_hand_rests_unless_it_rests_above(
+def test_objects_are_not_placed_below_a_low_resting_hand(
     home: tuple[float, ...], *, is_low: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("demorec.robots.assets._modules_with_models", {"my_arms"})

@@ -74,9 +74,7 @@ def test_a_bug_in_a_task_is_named_by_its_line(
 
 
 @pytest.mark.slow
-def test_the_line_may_be_in_a_module_beside_it(
-    module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_line_may_be_in_another_module(module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     module.write_text(module.read_text() + HELPER)
     (tmp_path / "left_helpers.py").write_text("def half(x):\n    return 1 / x\n")
     flags = ["--task", "left_tasks:ToTheLeft", "--num-episodes", "1", "--workers", "1", "--cameras", "none"]
@@ -121,9 +119,7 @@ def test_other_commands_name_the_line_too(
 
 
 @pytest.mark.slow
-def test_a_layout_that_is_not_returned_is_said(
-    module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_layout_is_reported(module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     text = module.read_text()
     module.write_text(text.replace("        return Scene(", "        Scene("))
     flags = ["--task", "left_tasks:ToTheLeft", "--num-episodes", "1", "--workers", "1", "--cameras", "none"]

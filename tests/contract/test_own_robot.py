@@ -244,7 +244,7 @@ def test_a_plug_in_of_gazebo_is_not_a_mesh_and_ros_names_lead_to_the_package(fol
 
 
 @pytest.mark.slow
-def test_a_run_is_not_gone_on_with_when_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
+def test_a_run_does_not_continue_after_its_task_was_edited(folder: Path, tmp_path: Path) -> None:
     source = "from demorec.tasks.pick import PickPlace\n\n\nclass Mine(PickPlace):\n    speed = 1.0\n"
     (folder / "my_tasks.py").write_text(source)
     config = GenerateConfig(task="my_tasks:Mine", cameras=())
@@ -315,7 +315,7 @@ def test_a_module_counts_with_its_file_and_a_package_with_all_of_its_files(folde
 
 
 @pytest.mark.parametrize("where", ["absolute", "pybullet_data", "absolute in pybullet_data"])
-def test_models_are_found_wherever_they_may_lie(where: str, folder: Path) -> None:
+def test_models_are_found_in_every_allowed_place(where: str, folder: Path) -> None:
     from demorec.robots.assets import data_folder, model_name
 
     name, wanted = {

@@ -26,7 +26,7 @@ pytestmark = pytest.mark.slow
         pytest.param("sort_by_color", "panda", "full", 82000, 135, id="it cannot rise to the intended height"),
     ],
 )
-def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed: int, index: int) -> None:
+def test_episodes_that_once_failed(task: str, robot: str, variation: Any, seed: int, index: int) -> None:
     frames, outcome = run(episode(index, task=task, robot=robot, variation=variation, seed=seed))
     assert outcome.success
     on_purpose = [event for frame in frames for event in frame.events if "on purpose" in event.message]
@@ -34,14 +34,14 @@ def test_episodes_that_were_given_up(task: str, robot: str, variation: Any, seed
     assert frames[-1].observation.contact_force == 0
 
 
-def test_a_line_on_which_the_joints_jump_is_given_up_for_another(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_line_with_a_jump_of_the_joints_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Slowing the line down again and again took minutes to plan; at another yaw the hand gets there."""
     monkeypatch.setattr("demorec.tasks.tutorial.SINKS", 0.0)  # otherwise the layout would be drawn again
     _, outcome = run(episode(230, task="tutorial", robot="iiwa", variation="full", seed=82000))
     assert outcome.success
 
 
-def test_a_blow_that_turns_the_cube_into_a_finger_is_no_success() -> None:
+def test_a_cube_turned_into_a_finger_is_not_a_success() -> None:
     """It lands on an edge: a finger is 1.36 mm inside it, although there was no overlap when contacts were computed."""
     _, outcome = run(episode(235, task="pick_place", robot="iiwa", variation="none", seed=82000))
     assert (outcome.success, outcome.failure_reason) == (False, "crush")
@@ -54,12 +54,12 @@ def farthest(index: int, **config: Any) -> float:
 
 
 @pytest.mark.parametrize("robot", ["panda", "iiwa"])
-def test_layouts_are_drawn_anew_until_the_arm_reaches_everything(robot: str) -> None:
+def test_layouts_are_redrawn_until_the_arm_reaches_everything(robot: str) -> None:
     """The Panda reaches 0.855 m from a shoulder 0.33 m up, with a hand of 0.21 m; the iiwa reaches no further."""
     assert max(farthest(index, robot=robot) for index in range(20)) < 0.83
 
 
-def test_a_layout_that_is_drawn_anew_is_in_the_held_out_rectangle_too() -> None:
+def test_a_redrawn_layout_is_in_the_held_out_rectangle_too() -> None:
     ranges = Ranges(held_out_x=(0.4, 1.1), held_out_y=(0.0, 0.1))
     for index in range(10):
         made = episode(index, task="support.odd_tasks:Wide", variation="none", split="eval", ranges=ranges)

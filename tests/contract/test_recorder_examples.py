@@ -58,7 +58,7 @@ def test_a_robots_loop(runs: Path) -> None:
     assert (table.image_age_ns("top") >= 0).all()  # captured before the frame was written
 
 
-def test_a_simulation_of_ones_own(runs: Path) -> None:
+def test_a_custom_simulation(runs: Path) -> None:
     with first_of(runs / "own_simulation") as recording:
         table = recording.table()
         state, action = recording.info.features

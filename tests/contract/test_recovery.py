@@ -105,7 +105,7 @@ def test_the_expert_finishes_from_any_state(spoil: Spoil) -> None:
 
 
 @pytest.mark.parametrize(("phase", "after"), [("descend", "close"), ("lower", "release")])
-def test_who_halts_above_the_place_is_shown_the_way_down(phase: str, after: str) -> None:
+def test_a_policy_stopped_above_the_place_continues_downwards(phase: str, after: str) -> None:
     """Rising and returning would contradict every demonstration, which moves down from there."""
     prepared = episode(2, variation="none")
     with make_world(prepared.info) as world:
@@ -129,7 +129,7 @@ def test_who_halts_above_the_place_is_shown_the_way_down(phase: str, after: str)
         assert min(heights[:until]) < height - 0.03, "it is not the state that the test is about"
 
 
-def test_what_is_served_is_left_alone() -> None:
+def test_finished_goals_are_left_alone() -> None:
     prepared = episode(0, variation="none")
     with make_world(prepared.info) as world:
         begin(world, prepared)
@@ -142,7 +142,7 @@ def test_what_is_served_is_left_alone() -> None:
 
 
 @pytest.mark.slow
-def test_a_bystander_in_the_hand_is_put_back() -> None:
+def test_a_wrong_object_in_the_hand_is_put_back() -> None:
     """An object grasped by mistake is put back in its place before the goal is pursued."""
     prepared = episode(0, task="pick_from_clutter", variation="none")
     with make_world(prepared.info) as world:
@@ -161,7 +161,7 @@ def test_a_bystander_in_the_hand_is_put_back() -> None:
 @pytest.mark.slow  # every task is simulated twice; pick_place above is quick
 @pytest.mark.parametrize("share", [0.5, *(pytest.param(share, marks=pytest.mark.long) for share in (0.25, 0.75))])
 @pytest.mark.parametrize("task", tasks_with_slow_ones())
-def test_every_task_goes_on_from_the_middle_of_its_script(task: str, share: float) -> None:
+def test_every_task_continues_from_the_middle_of_its_script(task: str, share: float) -> None:
     prepared = episode(1, task=task, variation="mild")
     with make_world(prepared.info) as world:
         session = Session.of_episode(world, prepared)

@@ -193,7 +193,7 @@ def test_nothing_is_background(stage: Stage) -> None:
     assert np.argsort(images.color.reshape(-1, 3).mean(0)).tolist() == [0, 1, 2]
 
 
-def test_what_lies_beyond_the_clipping_distances_is_not_drawn(stage: Stage) -> None:
+def test_objects_beyond_the_clipping_distances_are_not_drawn(stage: Stage) -> None:
     body = scenes.add(stage.client, "box", (0.2, 0.2, 0.2))
     camera = scenes.camera(64, 64)
     assert (_render(stage.renderer, stage.client, camera).segmentation == body).any()

@@ -114,7 +114,7 @@ def test_an_outcome_that_was_changed_is_found(
 
 
 @pytest.mark.slow
-def test_an_expert_that_gave_up_is_a_failure_whatever_the_conditions_say(recorded: Path, tmp_path: Path) -> None:
+def test_an_expert_that_gave_up_is_a_failure_even_if_the_conditions_hold(recorded: Path, tmp_path: Path) -> None:
     """As with an object that was misplaced three times and comes to rest after that."""
     spoilt = Spoilt(recorded)
     assert spoilt.outcome is not None
@@ -142,7 +142,7 @@ def test_noise_delay_and_rate_change_the_motion(recorded: Path) -> None:
     assert wild.success is False
 
 
-def test_options_that_cannot_be(recorded: Path) -> None:
+def test_impossible_options(recorded: Path) -> None:
     impossible: tuple[dict[str, Any], ...] = ({"noise": -1.0}, {"delay": -1}, {"states": True, "delay": 1})
     for options in impossible:
         with pytest.raises(ConfigError):
@@ -227,7 +227,7 @@ def test_a_dataset_with_noise_still_succeeds(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_dataset_differs_in_is_in_its_total(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_total_counts_the_differences_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     run = simulate_run(tmp_path / "run", 1, seed=5)
     export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
     assert exit_code("replay", tmp_path / "d") == 0
@@ -257,7 +257,7 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
     assert len([line for line in said.splitlines() if not line.startswith("Note: ")]) == 1
 
 
-def test_what_is_no_number_is_not_sent(recorded: Path) -> None:
+def test_nan_is_not_sent(recorded: Path) -> None:
     """An action of a damaged dataset: the arm stays in place, and the step is counted."""
     options = ReplayOptions()
     whole = open_file(recorded, options)

@@ -37,7 +37,7 @@ def one_bit(source: Path) -> bytes:
 
 
 @pytest.mark.slow
-def test_what_is_no_longer_what_was_made(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_changed_recordings_are_found(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     spoilt = tmp_path / "run"
     shutil.copytree(run, spoilt)
     names = [spoilt / f"episodes/episode_{index:06d}.mcap" for index in range(5)]
@@ -78,7 +78,7 @@ def test_a_single_recording_is_made_again(run: Path, tmp_path: Path, capsys: pyt
         (("--cameras", "none"), "--cameras"),
     ],
 )
-def test_another_episode_flag_beside_a_run_is_refused(
+def test_episode_flags_next_to_a_run_are_refused(
     flags: tuple[object, ...], named: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code("generate", "--config", run / "run.json", "--out", tmp_path / "copy", *flags) == 2
@@ -87,7 +87,7 @@ def test_another_episode_flag_beside_a_run_is_refused(
     assert not (tmp_path / "copy").exists()
 
 
-def test_allow_is_for_what_a_file_names(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_allow_is_for_names_in_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("generate", "--out", tmp_path / "run", "--allow", "my_tasks") == 2
     assert "--allow is for a --config that names a run" in capsys.readouterr().err
 
@@ -102,7 +102,9 @@ def test_another_digest_in_run_json(run: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_renderings_of_a_run_are_no_copy_of_it(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_renderings_of_a_run_do_not_count_as_a_copy(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "renderings"
     assert exit_code("render", run, "--out", out, "--cameras", "front", "--width", 16, "--height", 16) == 0
     there = {path.name: path.read_bytes() for path in out.rglob("*.mcap")}

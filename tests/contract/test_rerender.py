@@ -56,7 +56,7 @@ def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_
         assert b.info.origin == f"render of {a.digest()[:16]}"
 
 
-def test_calibration_errors_are_kept_a_second_time(tmp_path: Path) -> None:
+def test_calibration_errors_survive_a_second_rendering(tmp_path: Path) -> None:
     """The second calibration error is independent of the seed; as recorded, it leads to the camera's true pose."""
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
@@ -119,9 +119,7 @@ def test_impossible_requests(filmed: Path, tmp_path: Path, capsys: pytest.Captur
     assert exit_code("render", filmed, "--out", tmp_path, "--renderer", "rastr") == 2
 
 
-def test_a_camera_of_ones_own_stands_where_it_is_said(
-    filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_custom_camera_has_the_stated_pose(filmed: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(own_camera(tmp_path))
     twice = ("rerender_cameras:SIDE", "rerender_cameras:Side")
     assert exit_code("render", filmed, "--out", tmp_path / "out", "--cameras", *twice) == 2

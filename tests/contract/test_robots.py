@@ -48,7 +48,7 @@ def test_it_starts_within_its_limits(spec: RobotSpec) -> None:
     assert (np.array(starts) <= spec.position_upper).all()
 
 
-def test_the_wrench_holds_the_weight_of_the_hand(
+def test_the_wrench_balances_the_weight_of_the_hand(
     spec: RobotSpec, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     """At rest in a tilted pose, against statics; for any orientation of the hand's inertial axes.
@@ -118,7 +118,7 @@ def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> 
         world.reset(scene)
 
 
-def test_the_open_hand_is_no_larger_than_a_deliberate_miss_thinks(spec: RobotSpec) -> None:
+def test_the_open_hand_is_no_larger_than_a_deliberate_miss_assumes(spec: RobotSpec) -> None:
     """Bullet's bounding boxes (margin included), the hand pointing down along the world's axes."""
     with World(spec) as world:
         world.reset(episode(robot=spec.name).info.simulated.scene)

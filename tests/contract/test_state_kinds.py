@@ -100,13 +100,13 @@ def test_the_environment_gives_the_dataset_to_the_bit(run: Path, tmp_path: Path)
 
 
 @pytest.mark.parametrize(("length", "kind"), [(8, "joint"), (15, "joint_ee")])
-def test_a_policy_tells_which_state_it_takes(length: int, kind: str, tmp_path: Path) -> None:
+def test_a_policy_states_its_kind_of_state(length: int, kind: str, tmp_path: Path) -> None:
     plain = {"type": "act", "input_features": {STATE: {"type": "STATE", "shape": [length]}}}
     (tmp_path / CONFIG_NAME).write_text(json.dumps(plain))
     assert settings_for(tmp_path, GenerateConfig(cameras=()), action="ee_delta").state == kind
 
 
-def test_lerobot_is_told_of_the_state() -> None:
+def test_lerobot_gets_the_kind_of_state() -> None:
     from lerobot_env_demorec import DemorecEnvConfig
 
     assert DemorecEnvConfig(state="joint_ee").features["agent_pos"].shape == (15,)
@@ -138,7 +138,7 @@ def test_states_of_two_kinds_do_not_go_into_one_dataset(run: Path, dataset: Path
     assert np.array_equal(states(dataset), before)
 
 
-def test_the_state_of_a_external_episode_stays_as_it_came(tmp_path: Path) -> None:
+def test_the_state_of_an_external_episode_is_unchanged(tmp_path: Path) -> None:
     write_external(tmp_path / "e.mcap", make_external(cameras=()))
     with pytest.raises(ConfigError, match="exported unchanged"):
         export_lerobot([tmp_path / "e.mcap"], tmp_path / "ds", replace(SMALL, action="joint"))

@@ -89,7 +89,7 @@ def test_each_fault_of_a_robot_is_found(
         test(Contract())
 
 
-def test_the_robot_of_the_examples_holds_the_contract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_robot_of_the_examples_meets_the_contract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shutil.copytree(ROOT / "examples" / "own_robot", tmp_path / "mine")
     (tmp_path / "mine" / "my_robots.py").rename(tmp_path / "mine" / "my_tested_robots.py")
     monkeypatch.syspath_prepend(str(tmp_path / "mine"))

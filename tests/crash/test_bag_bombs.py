@@ -234,7 +234,7 @@ def test_a_keyframe_that_gives_no_image(codec: str, tmp_path: Path, commands: Li
     assert told.code == 0
 
 
-def test_a_database_with_a_journal_beside_it(tmp_path: Path, commands: LimitedCommands) -> None:
+def test_a_database_with_a_journal(tmp_path: Path, commands: LimitedCommands) -> None:
     """A recorder that was killed in SQLite's WAL mode has left its last messages in the journal."""
     path, copy = _database(tmp_path, ""), tmp_path / "copy" / "bag.db3"
     copy.parent.mkdir()

@@ -99,7 +99,7 @@ def test_metadata_nested_without_end(opening: str, depth: int, good: Path, tmp_p
     assert len(str(caught.value)) < 600
 
 
-def test_a_description_of_very_many_values(good: Path, commands: LimitedCommands, tmp_path: Path) -> None:
+def test_a_description_with_too_many_values(good: Path, commands: LimitedCommands, tmp_path: Path) -> None:
     path = tmp_path / "many.mcap"
     with Recording(good) as recording:
         found = recording._container.metadata("demorec.episode")
@@ -132,7 +132,7 @@ def _box(kind: bytes, content: bytes) -> bytes:
     ],
     ids=["images of a byte", "large images", "more images than sizes"],
 )
-def test_a_video_that_claims_very_many_images(table: bytes, commands: LimitedCommands, tmp_path: Path) -> None:
+def test_a_video_that_claims_too_many_images(table: bytes, commands: LimitedCommands, tmp_path: Path) -> None:
     recording = write_episode(tmp_path / "seen.mcap", num_frames=6, cameras=("front",))
     dataset = tmp_path / "dataset"
     export([recording], dataset)
@@ -157,7 +157,7 @@ def test_fifos_in_a_dataset(name: str, good: Path, commands: LimitedCommands, tm
     commands.refused("export", "lerobot", good, "--out", dataset, "--append", "--no-verify")
 
 
-def test_a_missing_lerobot_is_no_fault_of_a_dataset(
+def test_a_missing_lerobot_is_not_a_fault_of_a_dataset(
     good: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     export([good], tmp_path / "dataset")
@@ -183,6 +183,6 @@ def test_a_missing_lerobot_is_no_fault_of_a_dataset(
         ),
     ],
 )
-def test_urdfs_that_are_none(text: str, message: str) -> None:
+def test_invalid_urdfs(text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         check_primitives(text)

@@ -90,7 +90,7 @@ def run_on(executor: Executor, out: Path, monkeypatch: pytest.MonkeyPatch, heard
 @pytest.mark.slow
 @pytest.mark.parametrize("moments", MOMENTS)
 @pytest.mark.parametrize("in_flight", ["lost", "stuck", "finished"])
-def test_workers_that_do_not_come_back_end_the_run_with_an_error(
+def test_lost_workers_end_the_run_with_an_error(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: str, in_flight: InFlight, moments: Sequence[int]
 ) -> None:
     lost = 0
@@ -115,7 +115,7 @@ def test_workers_that_do_not_come_back_end_the_run_with_an_error(
 @pytest.mark.parametrize("moments", MOMENTS)
 @pytest.mark.parametrize("in_flight", ["lost", "stuck", "finished"])
 @pytest.mark.parametrize("back_after", [1, 7])
-def test_workers_that_come_back_make_the_same_run(
+def test_returning_workers_make_the_same_run(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     reference: str,
@@ -132,7 +132,7 @@ def test_workers_that_come_back_make_the_same_run(
     assert lost > 1
 
 
-def test_an_executor_that_forgets_a_plan_does_not_end_the_run_well(
+def test_an_executor_that_loses_a_plan_does_not_end_with_success(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Forgetful(Waning):

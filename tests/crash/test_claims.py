@@ -90,7 +90,7 @@ def features_of_very_many_numbers(root: Path) -> None:
         features_of_very_many_numbers,
     ],
 )
-def test_a_dataset_claims_very_much(claim: Callable[[Path], None], commands: LimitedCommands, tmp_path: Path) -> None:
+def test_a_dataset_with_huge_claims(claim: Callable[[Path], None], commands: LimitedCommands, tmp_path: Path) -> None:
     root = write_foreign(tmp_path / "dataset")
     claim(root)
     assert sum(path.stat().st_size for path in root.rglob("*") if path.is_file()) < 1_000_000
@@ -164,7 +164,7 @@ def one_episode_by_many_names(file: h5py.File) -> None:
         (one_episode_by_many_names, "the same group as data/demo_0"),
     ],
 )
-def test_an_hdf5_file_claims_very_much(
+def test_an_hdf5_file_with_huge_claims(
     claim: Callable[[h5py.File], None], said: str, commands: LimitedCommands, tmp_path: Path
 ) -> None:
     path, mapping = tmp_path / "file.hdf5", tmp_path / "mapping.toml"
@@ -176,7 +176,7 @@ def test_an_hdf5_file_claims_very_much(
     assert said in _told(commands, "import", "hdf5", path, "--mapping", mapping, "--out", tmp_path / "run")
 
 
-def test_whole_numbers_are_looked_at_within_limits(commands: LimitedCommands, tmp_path: Path) -> None:
+def test_whole_numbers_are_checked_within_limits(commands: LimitedCommands, tmp_path: Path) -> None:
     """A 64-bit column is searched for integers that float64 cannot hold; here every row has one text of 50 MB."""
     root = write_foreign(tmp_path / "dataset")
     info = json.loads((root / "meta/info.json").read_text())
@@ -218,7 +218,7 @@ def test_a_text_that_claims_gigabytes(file: Path, commands: LimitedCommands) -> 
 
 @pytest.mark.long
 @pytest.mark.timeout(400)
-def test_a_file_with_which_the_library_never_ends(file: Path, commands: LimitedCommands) -> None:
+def test_a_file_that_makes_the_library_hang(file: Path, commands: LimitedCommands) -> None:
     data = bytearray(file.read_bytes())
     assert data[heap_of(data) + _SIZE_OF_FIRST + 1] == 0
     data[heap_of(data) + _SIZE_OF_FIRST + 1] = 1

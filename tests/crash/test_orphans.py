@@ -65,7 +65,7 @@ def test_a_killed_command_leaves_no_orphans(run: Path, tmp_path: Path, name: str
 
 
 @pytest.mark.parametrize("name", COMMANDS)
-def test_a_command_whose_worker_is_killed_does_not_end_well(run: Path, tmp_path: Path, name: str) -> None:
+def test_a_command_with_a_killed_worker_fails(run: Path, tmp_path: Path, name: str) -> None:
     process = busy(run, tmp_path, name)
     workers_of(process)[0].kill()
     _, errors = process.communicate(timeout=240)

@@ -166,7 +166,7 @@ def test_a_node_that_is_killed_changes_nothing(tmp_path: Path, cluster: object, 
     assert {(a.episode_index, a.attempt): a.success for a in result.run.attempts} == expected_attempts(NUM_EPISODES)
 
 
-def test_killed_workers_are_made_up_for(tmp_path: Path, cluster: object, reference: str) -> None:
+def test_killed_workers_are_replaced(tmp_path: Path, cluster: object, reference: str) -> None:
     killer = Killer(tmp_path / "run")
     killer.worker_at(5, 15, 25, 35)
     result = run_on_ray(tmp_path / "run", maker="make_quickly")
@@ -175,7 +175,7 @@ def test_killed_workers_are_made_up_for(tmp_path: Path, cluster: object, referen
     assert result.run.digest == reference
 
 
-def test_the_real_job_is_the_same_in_every_way(tmp_path: Path, cluster: object) -> None:
+def test_a_complete_run_is_the_same_for_every_executor(tmp_path: Path, cluster: object) -> None:
     """One worker, and Ray on two nodes with workers and a third node killed."""
     one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=NUM_REAL, workers=1))
     killer = Killer(tmp_path / "ray")
@@ -235,7 +235,7 @@ def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path
     assert load_run_file(out).digest == one.run.digest
 
 
-def test_a_run_begun_on_ray_goes_on_without_it(tmp_path: Path, cluster: object, reference: str) -> None:
+def test_a_run_started_on_ray_continues_without_it(tmp_path: Path, cluster: object, reference: str) -> None:
     out = tmp_path / "run"
     with pytest.raises(GenerationError, match="the disk is full"):
         run_on_ray(out, maker="fill_the_disk")
@@ -249,7 +249,7 @@ def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nowhere.invalid:6379", "127.0.0.1:99999"])
-def test_an_unreachable_cluster_is_told_at_once(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unreachable_cluster_is_reported_at_once(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("ray.is_initialized", lambda: False)
     with (
         pytest.raises(ConfigError, match=r"cannot be reached .* give the address that `ray start --head` has printed"),

@@ -165,7 +165,7 @@ def test_recovering_damaged_files(tmp_path: Path) -> None:
         (b"\x89MCAP0\r\n" + bytes(500) + b"\x89MCAP0\r\n", "damaged"),
     ],
 )
-def test_files_that_are_no_recordings(tmp_path: Path, data: bytes, message: str) -> None:
+def test_files_that_are_not_recordings(tmp_path: Path, data: bytes, message: str) -> None:
     path = tmp_path / "a.mcap"
     path.write_bytes(data)
     with pytest.raises(RecordingError, match=message):

@@ -47,7 +47,7 @@ def test_other_errors_of_the_decompression_are_damage(tmp_path: Path, monkeypatc
         inspect_recording(path)
 
 
-def test_nor_is_one_that_cannot_be_opened_for_too_many_open_files(tmp_path: Path) -> None:
+def test_a_recording_is_not_called_damaged_for_too_many_open_files(tmp_path: Path) -> None:
     path = write_episode(tmp_path / "good.mcap", cameras=(), num_frames=5)
     before = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (3, before[1]))

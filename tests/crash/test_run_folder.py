@@ -72,7 +72,7 @@ def test_a_refused_request_writes_nothing(
     assert content_of(tmp_path) == before
 
 
-def test_neither_another_run_nor_a_strangers_folder_is_touched(tmp_path: Path) -> None:
+def test_neither_another_run_nor_a_foreign_folder_changes(tmp_path: Path) -> None:
     run, stranger = tmp_path / "run", tmp_path / "stranger"
     run_fake(run, num_episodes=1)
     (run / ".lock").unlink()  # as after a copy that skips such files
@@ -114,7 +114,7 @@ def make_dangling_link(path: Path) -> None:
 
 @pytest.mark.parametrize("known", [True, False])
 @pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, make_dangling_link])
-def test_whatever_has_the_name_of_a_recording_is_set_aside(
+def test_anything_with_the_name_of_a_recording_is_set_aside(
     tmp_path: Path, reference: RunResult, make: Callable[[Path], object], known: bool
 ) -> None:
     out = tmp_path / "run"
@@ -146,7 +146,9 @@ def test_other_files_among_the_recordings_stay_where_they_are(tmp_path: Path, re
 
 
 @pytest.mark.parametrize("make", [os.mkfifo, make_folder, make_socket, lambda path: path.symlink_to("run.json")])
-def test_a_lock_that_is_no_file_is_told(tmp_path: Path, reference: RunResult, make: Callable[[Path], object]) -> None:
+def test_a_lock_that_is_not_a_file_is_reported(
+    tmp_path: Path, reference: RunResult, make: Callable[[Path], object]
+) -> None:
     out = tmp_path / "run"
     shutil.copytree(reference.folder, out)
     (out / ".lock").unlink()
@@ -166,7 +168,7 @@ def test_a_lock_that_is_no_file_is_told(tmp_path: Path, reference: RunResult, ma
     ],
 )
 @pytest.mark.parametrize("known", [True, False])
-def test_nothing_is_set_aside_for_what_the_machine_lacks(
+def test_nothing_is_set_aside_for_lack_of_resources(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: RunResult, error: Exception, words: str, known: bool
 ) -> None:
     out = tmp_path / "run"
@@ -199,7 +201,7 @@ def test_a_run_json_that_cannot_be_read_is_one_sentence_for_every_command(
     assert not (tmp_path / "copy").exists()
 
 
-def test_what_a_lost_worker_left_goes_when_its_episode_is_made(tmp_path: Path, reference: RunResult) -> None:
+def test_leftovers_of_a_lost_worker_are_removed_with_its_episode(tmp_path: Path, reference: RunResult) -> None:
     """Files that are being written, third-party files and files of episodes that were not made are kept."""
     out = Path(shutil.copytree(reference.folder, tmp_path / "run"))
     left = {

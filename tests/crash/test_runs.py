@@ -136,7 +136,7 @@ def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path: Path
     assert result.run.digest == run_fake(tmp_path / "alone", num_episodes=3).run.digest
 
 
-def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path: Path) -> None:
+def test_overwrite_starts_again_and_keeps_foreign_files(tmp_path: Path) -> None:
     run_fake(tmp_path / "run")
     (tmp_path / "run/notes.txt").write_text("mine")
     result = run_fake(tmp_path / "run", seed=1, num_episodes=2, overwrite=True)
@@ -145,7 +145,7 @@ def test_overwrite_begins_anew_and_leaves_the_files_of_others(tmp_path: Path) ->
     assert (tmp_path / "run/notes.txt").read_text() == "mine"
 
 
-def test_a_dataset_of_somebody_else_is_refused_before_any_episode_is_made(tmp_path: Path) -> None:
+def test_a_foreign_dataset_is_refused_before_any_episode_is_made(tmp_path: Path) -> None:
     info = tmp_path / "run/dataset/meta/info.json"
     info.parent.mkdir(parents=True)
     info.write_text('{"codebase_version": "v3.0"}')
@@ -226,7 +226,7 @@ def test_an_episode_that_kills_every_worker_ends_the_run_with_a_sentence(tmp_pat
     assert num_finished(tmp_path / "run") > 0
 
 
-def test_a_bad_moment_of_the_file_system_is_survived(tmp_path: Path, reference: RunResult) -> None:
+def test_a_temporary_file_system_error_is_survived(tmp_path: Path, reference: RunResult) -> None:
     assert run_fake(tmp_path / "run", maker="flicker").run.digest == reference.run.digest
 
 
@@ -240,7 +240,7 @@ def test_a_bad_moment_of_the_file_system_is_survived(tmp_path: Path, reference: 
         ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),
     ],
 )
-def test_what_stops_a_run_is_told_and_the_same_command_goes_on(
+def test_the_cause_of_a_stop_is_reported_and_the_same_command_continues(
     tmp_path: Path, reference: RunResult, maker: str, error: type[DemorecError], message: str
 ) -> None:
     out = tmp_path / "run"
@@ -253,7 +253,7 @@ def test_what_stops_a_run_is_told_and_the_same_command_goes_on(
     assert run_fake(out).run.digest == reference.run.digest
 
 
-def test_a_vanished_folder_is_told(tmp_path: Path) -> None:
+def test_a_vanished_folder_is_reported(tmp_path: Path) -> None:
     with pytest.raises(GenerationError, match="has vanished"):
         run_fake(tmp_path / "run", maker="lose_the_folder")
     assert not (tmp_path / "run").exists(), "it must not be started again"
@@ -309,7 +309,7 @@ def test_a_signal_to_the_whole_group_is_left_to_the_driver(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("maker", [pytest.param("make_for_ever", marks=pytest.mark.long), "make_stubbornly"])
-def test_after_the_first_interrupt_nothing_goes_on_for_long(tmp_path: Path, maker: str) -> None:
+def test_after_the_first_interrupt_work_ends_soon(tmp_path: Path, maker: str) -> None:
     out = tmp_path / "run"
     process = driver(out, maker, 4, grace_s=0.3)
     wait_until_busy(process, out)

@@ -50,7 +50,7 @@ def _suggestion(bag: Path) -> str:
 @settings(max_examples=60)
 @given(TEXTS, st.lists(TEXTS, min_size=2, max_size=4, unique=True), TEXTS)
 @example("odd" + "".join(ODD), ODD, "".join(ODD))
-def test_a_suggestion_is_toml_and_names_what_is_there(topic: str, joints: list[str], frame: str) -> None:
+def test_a_suggestion_is_toml_and_names_existing_topics(topic: str, joints: list[str], frame: str) -> None:
     moments = [EPOCH_NS + k * 20_000_000 for k in range(3)]
     notes = bags.joints(topic, joints, moments)
     notes += [

@@ -176,7 +176,7 @@ def test_damaged_pngs_are_refused() -> None:
         decode_labels(good, (4, 4))
 
 
-def test_a_segmentation_image_owes_nothing_to_the_one_before() -> None:
+def test_segmentation_images_are_independent() -> None:
     """FFmpeg adds an image to the previous one unless it is marked as a keyframe."""
     decoder, table, cube = LabelDecoder((6, 8)), np.full((6, 8), 1, np.int32), np.full((6, 8), 2, np.int32)
     shown = [decoder.decode(encode_labels(image)) for image in (table, cube, cube, table)]

@@ -16,7 +16,7 @@ words = st.text(st.sampled_from("aZ09_-.é "), min_size=0, max_size=6)
 
 
 @given(st.one_of(st.builds("{}/{}".format, words, words), words, st.builds("{}/{}/{}".format, words, words, words)))
-def test_what_is_accepted_is_what_the_hub_accepts(name: str) -> None:
+def test_accepted_names_are_those_of_the_hub(name: str) -> None:
     hub = True
     with contextlib.suppress(HFValidationError):
         validate_repo_id(name)

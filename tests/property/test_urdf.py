@@ -62,7 +62,7 @@ def test_every_tree_is_read(choices: list[int], random: object) -> None:
         [("a", "a")],
     ],
 )
-def test_joints_that_are_no_tree_are_named(pairs: list[tuple[str, str]]) -> None:
+def test_joints_that_do_not_form_a_tree_are_named(pairs: list[tuple[str, str]]) -> None:
     with pytest.raises(ValueError, match=r"one tree.*joint"):
         Urdf.parse(urdf_text(pairs))
 

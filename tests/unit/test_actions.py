@@ -35,7 +35,7 @@ def test_a_pose_out_of_reach_keeps_the_targets_and_is_counted(
     assert sent.gripper_target == 0.04
 
 
-def test_after_a_pose_out_of_reach_a_policy_goes_on_from_where_it_is(world: World) -> None:
+def test_after_a_pose_out_of_reach_a_policy_continues_from_its_pose(world: World) -> None:
     """The policy's next delta is small again; recorded deltas add up to recorded poses, even out of reach."""
     deltas = np.array([[9.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04], [-0.01, 0.0, 0.0, 0.0, 0.0, 0.0, 0.04]])
     for is_limited, num_unreachable in ((True, 1), (False, 2)):

@@ -38,7 +38,7 @@ def text_of(path: Path) -> str:
 
 
 @pytest.mark.parametrize("kind", [FILE, FOLDER], ids=["file", "folder"])
-def test_a_new_one_and_one_that_replaces_it(tmp_path: Path, kind: ReplaceableKind) -> None:
+def test_a_new_file_and_its_replacement(tmp_path: Path, kind: ReplaceableKind) -> None:
     for text in ("first", "second"):
         with atomic_write(tmp_path / "x.txt", kind, overwrite=True) as part:
             fill(part, kind, text)
@@ -49,7 +49,7 @@ def test_a_new_one_and_one_that_replaces_it(tmp_path: Path, kind: ReplaceableKin
 
 @pytest.mark.parametrize("kind", [FILE, FOLDER], ids=["file", "folder"])
 @pytest.mark.parametrize("replaces", [False, True])
-def test_what_appears_meanwhile_stays_and_the_result_is_kept(
+def test_files_that_appear_meanwhile_stay_and_the_result_is_kept(
     tmp_path: Path, kind: ReplaceableKind, replaces: bool
 ) -> None:
     target = tmp_path / "x.txt"

@@ -21,7 +21,7 @@ from demorec.episode.camera_error import error_values, stated_error
         {"calibration_front_x": math.inf},
     ],
 )
-def test_numbers_that_contradict_each_other_tell_nothing(lie: dict[str, float]) -> None:
+def test_contradictory_numbers_give_no_calibration_error(lie: dict[str, float]) -> None:
     turn = Pose(position=np.array([1e-3, 0, 0]), quat_xyzw=np.array([0.003, 0.004, 0.0, math.sqrt(1 - 25e-6)]))
     values = error_values({"front": turn})
     assert values["calibration_front_angle"] == pytest.approx(2 * math.asin(0.005))

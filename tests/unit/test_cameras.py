@@ -96,7 +96,7 @@ def test_wrist_sees_the_space_between_the_fingers(world: World) -> None:
 
 
 @pytest.mark.parametrize("robot", ROBOTS.names())
-def test_a_camera_of_ones_own_on_the_hand_is_where_it_says(robot: str) -> None:
+def test_a_custom_camera_on_the_hand_has_the_stated_pose(robot: str) -> None:
     """For every camera mount of the arm."""
     preset = CameraPreset(
         summary="", mount="tcp", eye=(0.05, 0.01, -0.06), target=(0.0, 0.0, 0.02), up=(-1.0, 0.0, 0.0)

@@ -37,7 +37,7 @@ def test_a_flipped_bit_is_one_finding(damaged: Path, capsys: pytest.CaptureFixtu
     assert [finding.check for finding in report.findings] == ["checksums"]
 
 
-def test_what_is_wrong_in_a_dataset_is_said_without_pythons_words(
+def test_faults_of_a_dataset_are_described_without_pythons_messages(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     recording = write_episode(tmp_path / "e.mcap", num_frames=10, cameras=())
@@ -49,7 +49,7 @@ def test_what_is_wrong_in_a_dataset_is_said_without_pythons_words(
     assert line.strip() == "broken  missing_statistics  meta/stats.json is missing"
 
 
-def test_what_is_damaged_is_listed_and_what_is_good_is_not(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_damaged_parts_are_listed_and_good_ones_are_not(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     folder = make_run(tmp_path / "run", [4, 5, 6], cameras=()) / "episodes"
     only = ("--only", "opens", "checksums", "missing_numbers", "--no-images")
     code, out = check(folder, capsys, *only)

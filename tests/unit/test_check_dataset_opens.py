@@ -52,7 +52,7 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
         "class LeRobotDataset:\n    def __init__(self, **_): import os; os.kill(os.getpid(), 9)",
     ],
 )
-def test_too_little_memory_says_nothing_about_the_dataset(
+def test_too_little_memory_implies_nothing_about_the_dataset(
     module: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """A stand-in LeRobot fails as under `ulimit -v`, and as when the kernel kills it."""

@@ -27,7 +27,7 @@ def result_of(folder: Path) -> RunResult:
 
 
 @pytest.mark.parametrize("folder", ["/data/cubes", "/my data/it's; rm -rf $HOME `x`"])
-def test_a_shell_reads_them_as_they_are_meant(monkeypatch: pytest.MonkeyPatch, folder: str) -> None:
+def test_a_shell_parses_the_commands_correctly(monkeypatch: pytest.MonkeyPatch, folder: str) -> None:
     monkeypatch.chdir(ROOT)
     monkeypatch.setattr(shutil, "which", lambda name: f"/bin/{name}")
     monkeypatch.setattr(generate_report, "has_environment_state", lambda result: True)
@@ -49,7 +49,7 @@ def test_they_are_those_of_the_readme(monkeypatch: pytest.MonkeyPatch) -> None:
     assert {*export, train[1]} <= taught
 
 
-def test_modules_of_the_users_own_are_allowed_in_them() -> None:
+def test_the_users_modules_are_allowed_in_them() -> None:
     config = GenerateConfig(task="mytask:Mine", robot="lab.arms:A1", cameras=("front", "lab.arms:CORNER"))
     result = result_of(Path("/data"))
     result = replace(result, run=result.run.with_generation(config=config))
@@ -111,7 +111,7 @@ def test_a_run_has_an_environment_state_if_its_scenes_have_as_many_objects(
         (("notes.txt", "episode_notes.txt", "draft.part", "error_list.txt", "mine/episode_000001.mcap"), []),
     ],
 )
-def test_what_was_set_aside_is_told_by_what_it_is(tmp_path: Path, names: Sequence[str], words: list[str]) -> None:
+def test_files_set_aside_are_described(tmp_path: Path, names: Sequence[str], words: list[str]) -> None:
     for name in names:
         file = tmp_path / "unfinished" / name
         file.parent.mkdir(parents=True, exist_ok=True)

@@ -41,7 +41,7 @@ def test_impossible_values_are_refused(change: dict[str, Any], message: str) -> 
         GenerateConfig(**change).validate()
 
 
-def test_the_fork_in_pybullets_place_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_fork_that_replaces_pybullet_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     def version(name: str) -> str:
         if name == "pybullet":
             raise PackageNotFoundError(name)

@@ -187,7 +187,7 @@ def meshes_in(path: Path) -> set[str]:
     }
 
 
-def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
+def test_an_external_arm_moves_by_its_numbers(tmp_path: Path) -> None:
     given = two_joints(num_frames=12)
     degrees = [replace(feature, units=("deg", "rad", "")) for feature in given.info.features[:1]]
     given = replace(given, info=replace(given.info, features=(*degrees, *given.info.features[1:])))
@@ -201,7 +201,7 @@ def test_an_external_arm_moves_as_its_numbers_say(tmp_path: Path) -> None:
     assert meshes_in(tmp_path / "a.rrd") == {"base", "upper", "lower"}
 
 
-def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(exported: Path, tmp_path: Path) -> None:
+def test_a_third_party_dataset_is_shown_with_the_arm_of_its_joint_names(exported: Path, tmp_path: Path) -> None:
     """Without demorec's files: numbers, outcome and instruction come from LeRobot's own tables."""
     strange = tmp_path / "strange"
     shutil.copytree(exported, strange)
@@ -220,7 +220,7 @@ def test_a_dataset_of_somebody_else_is_shown_with_the_arm_that_its_joints_name(e
     assert {"panda_link0", "panda_link6", "panda_hand"} <= meshes_in(tmp_path / "a.rrd")
 
 
-def test_arms_that_differ_stand_in_one_dataset(tmp_path: Path) -> None:
+def test_one_dataset_holds_different_arms(tmp_path: Path) -> None:
     longer = URDF.replace('xyz="0.3 0 0"', 'xyz="0.4 0 0"')
     assert longer != URDF
     for number, urdf in enumerate((URDF, longer, URDF, "")):

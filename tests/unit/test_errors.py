@@ -28,9 +28,7 @@ from demorec.core.errors import RecordingError, describe_error, resource_error
         (OSError(errno.EIO, "Input/output error"), "storage"),
     ],
 )
-def test_what_the_machine_lacks_is_told_as_such_however_it_is_wrapped(
-    tmp_path: Path, error: Exception, words: str
-) -> None:
+def test_shortages_are_recognised_in_wrapped_errors(tmp_path: Path, error: Exception, words: str) -> None:
     def wrapped() -> RuntimeError:
         try:
             try:
@@ -86,7 +84,7 @@ def _raised(code: str) -> Exception:
         ("raise EOFError", "it ends too early"),
     ],
 )
-def test_errors_of_python_are_told_in_words(code: str, words: str) -> None:
+def test_errors_of_python_are_described_in_words(code: str, words: str) -> None:
     error = _raised(code)
     assert describe_error(error) == words
     assert describe_error(RecordingError("The recording is damaged: a.mcap")) == "The recording is damaged: a.mcap"

@@ -39,7 +39,7 @@ def test_an_edited_card_stays_when_the_dataset_is_replaced(tmp_path: Path) -> No
     assert "2 scripted demonstrations" in beside.read_text()
 
 
-def test_nothing_foreign_acts_in_a_card(tmp_path: Path) -> None:
+def test_foreign_text_has_no_effect_in_a_card(tmp_path: Path) -> None:
     """Markdown syntax, HTML and terminal control codes in the texts of a third-party recording."""
     hostile = "# <script>alert(1)</script> ![x](http://e.org) | `y` *z* \x1b[2J \u202e"
     good = write_episode(tmp_path / "good.mcap", num_frames=6, cameras=())

@@ -66,7 +66,7 @@ def test_an_mp4_file_holds_one_set_of_parameters(tmp_path: Path) -> None:
     assert coding["video.g"] == 2
 
 
-def test_jpeg_recordings_are_transcoded_and_it_is_said(tmp_path: Path) -> None:
+def test_transcoded_jpeg_recordings_are_reported(tmp_path: Path) -> None:
     write_episode(tmp_path / "e.mcap", num_frames=8, cameras=("front",), video=VideoConfig(codec="jpeg"))
     report = export(tmp_path, tmp_path / "d", transcode_codec="av1", transcode_crf=20)
     assert len(report.transcoded) == 1
@@ -123,7 +123,7 @@ def test_episode_ranges(text: str, expected: list[int]) -> None:
     assert [n for n in range(12) if parse_episodes(text)(n)] == list(expected)
 
 
-def test_all_differences_are_told_at_once(run: Path, tmp_path: Path) -> None:
+def test_all_differences_are_reported_at_once(run: Path, tmp_path: Path) -> None:
     write_episode(tmp_path / "slow.mcap", num_frames=8, fps=15)
     write_episode(tmp_path / "large.mcap", num_frames=8, width=80, video=VideoConfig(codec="av1"))
     write_episode(tmp_path / "blind.mcap", num_frames=8, cameras=("front",))
@@ -140,7 +140,7 @@ def test_all_differences_are_told_at_once(run: Path, tmp_path: Path) -> None:
     assert not (tmp_path / "d").exists()
 
 
-def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> None:
+def test_append_continues_at_the_end_of_the_dataset(run: Path, tmp_path: Path) -> None:
     whole, grown = tmp_path / "whole", tmp_path / "grown"
     export(run, whole)
     export(run, grown, episodes=":2")
@@ -168,7 +168,7 @@ def test_append_goes_on_where_the_dataset_ends(run: Path, tmp_path: Path) -> Non
     assert [row["meta/episodes/file_index"] for row in rows] == [0, 0, 1, 1]
 
 
-def test_append_refuses_what_does_not_fit_and_says_all(run: Path, tmp_path: Path) -> None:
+def test_append_refuses_unsuitable_recordings_with_all_reasons(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     export(run, out, episodes="0", action="ee", privileged=True)
     before = files_of(out)
@@ -181,7 +181,7 @@ def test_append_refuses_what_does_not_fit_and_says_all(run: Path, tmp_path: Path
     assert files_of(out) == before
 
 
-def test_append_leaves_out_what_the_dataset_does_not_have(run: Path, tmp_path: Path) -> None:
+def test_append_leaves_out_features_that_the_dataset_lacks(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     export(run, out, episodes="0")
     report = export(run, out, episodes="1", append=True, privileged=True)
@@ -221,7 +221,7 @@ def test_only_the_chosen_features(tmp_path: Path, chosen: tuple[str, ...]) -> No
     assert "observation.ee_pose" not in card
 
 
-def test_the_sidecar_tells_what_lerobot_cannot_hold(run: Path, tmp_path: Path) -> None:
+def test_the_sidecar_has_the_data_that_lerobot_cannot_hold(run: Path, tmp_path: Path) -> None:
     out = tmp_path / "d"
     export(run, out)
     row = pq.read_table(out / "demorec/episodes/chunk-000/file-000.parquet").to_pylist()[1]
@@ -252,7 +252,7 @@ def test_episodes_without_cameras(tmp_path: Path) -> None:
     assert not (tmp_path / "d" / "videos").exists()
 
 
-def test_append_refuses_episodes_that_are_there_already(run: Path, tmp_path: Path) -> None:
+def test_append_refuses_existing_episodes(run: Path, tmp_path: Path) -> None:
     """Episodes are compared by content: neither the recording's name nor its place matters."""
     out, copies = tmp_path / "d", tmp_path / "copies"
     export(run, out, episodes=":3")

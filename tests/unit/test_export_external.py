@@ -175,7 +175,7 @@ def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
     assert np.abs(np.array(shown) - 9 * np.arange(12)).max() < 6
 
 
-def test_an_hdf5_file_has_nothing_that_nobody_knows(tmp_path: Path) -> None:
+def test_an_hdf5_file_has_no_invented_data(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", *of_outcomes(True, False, None))
     export(run, tmp_path / "d.hdf5", "hdf5", include_failures=True)
     with h5py.File(tmp_path / "d.hdf5") as file:

@@ -116,7 +116,7 @@ def test_env_args_name_an_environment(run: Path, tmp_path: Path) -> None:
     env.close()
 
 
-def test_the_file_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) -> None:
+def test_a_third_party_file_is_not_replaced(run: Path, tmp_path: Path) -> None:
     """A file of another layout, and a robomimic file that demorec did not write."""
     with h5py.File(tmp_path / "a.hdf5", "w") as file:
         file["thesis"] = np.arange(5)
@@ -134,7 +134,7 @@ def test_the_file_of_somebody_else_is_not_replaced(run: Path, tmp_path: Path) ->
 @pytest.mark.parametrize(
     "addition", ["mine", "mask/10_percent", "data/demo_0/obs/language", "data/demo_0/notes", "data/mine"]
 )
-def test_a_file_that_somebody_has_added_to_is_not_replaced(run: Path, tmp_path: Path, addition: str) -> None:
+def test_a_file_with_additions_is_not_replaced(run: Path, tmp_path: Path, addition: str) -> None:
     target = tmp_path / "d.hdf5"
     options = {"privileged": True, "depth": True, "valid_share": 0.5, "overwrite": True}
     for _ in range(2):  # a demorec file with everything that an export can write is replaced
@@ -148,7 +148,7 @@ def test_a_file_that_somebody_has_added_to_is_not_replaced(run: Path, tmp_path: 
 
 
 @pytest.mark.parametrize("place", ["/", "data", "data/demo_0"])
-def test_a_file_with_a_note_or_a_link_of_somebody_is_not_replaced(run: Path, tmp_path: Path, place: str) -> None:
+def test_a_file_with_foreign_notes_or_links_is_not_replaced(run: Path, tmp_path: Path, place: str) -> None:
     for number, word in enumerate(("note", "link")):
         target = tmp_path / f"{number}.hdf5"
         export(run, target, "hdf5", episodes="0")

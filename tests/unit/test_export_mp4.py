@@ -76,7 +76,7 @@ def test_every_image_and_time_comes_back(tmp_path: Path, codec: str, fps: int) -
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected)
 
 
-def test_images_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path) -> None:
+def test_buffered_images_are_written_unchanged_and_removed(tmp_path: Path) -> None:
     videos = [coded("h264", count, seed=count)[0] for count in (5, 9, 3, 7)]
     aside = tmp_path / "aside"
     aside.mkdir()
@@ -89,7 +89,7 @@ def test_images_put_aside_are_written_the_same_and_cleared_away(tmp_path: Path) 
         assert list(aside.iterdir()) == []
 
 
-def test_images_that_are_none_are_refused(tmp_path: Path) -> None:
+def test_invalid_images_are_refused(tmp_path: Path) -> None:
     _, units = encoded("av1", 3)
     for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone
         with pytest.raises(ExportError, match="no image"):

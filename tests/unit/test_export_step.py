@@ -89,7 +89,7 @@ def test_after_a_kill_in_the_export_only_the_runs_own_dataset_is_replaced(run: P
 
 
 @pytest.mark.parametrize("foreign", ["mine.txt", "data/notes.csv", ".git/HEAD"])
-def test_a_dataset_with_files_of_somebody_is_set_aside_when_the_run_has_changed(run: Path, foreign: str) -> None:
+def test_a_dataset_with_foreign_files_is_set_aside_when_the_run_has_changed(run: Path, foreign: str) -> None:
     note = run / "dataset" / foreign
     note.parent.mkdir(exist_ok=True)
     note.write_text("years of work")
@@ -125,14 +125,14 @@ def test_an_edited_card_is_kept_when_the_run_has_changed(run: Path, is_known: bo
     assert not (run / "unfinished" / "dataset").exists()
 
 
-def test_a_card_that_nobody_has_touched_is_replaced_in_silence(run: Path) -> None:
+def test_an_unedited_card_is_replaced_silently(run: Path) -> None:
     said: list[str] = []
     assert export_run(run, repo_id="me/other", says=said.append)[1] is not None
     assert not said
     assert not list((run / "unfinished").glob("*"))
 
 
-def test_a_link_to_nothing_is_told(run: Path) -> None:
+def test_a_dangling_link_is_reported(run: Path) -> None:
     shutil.rmtree(run / "dataset")
     (run / "dataset").symlink_to(run / "nowhere")
     with pytest.raises(ConfigError, match="a link whose target is missing"):
@@ -140,7 +140,7 @@ def test_a_link_to_nothing_is_told(run: Path) -> None:
     assert (run / "dataset").is_symlink()
 
 
-def test_a_dataset_of_somebody_else_is_left_alone(run: Path) -> None:
+def test_a_third_party_dataset_is_left_alone(run: Path) -> None:
     plain = json.loads((run / "run.json").read_text())
     plain["export"] = None
     (run / "run.json").write_text(json.dumps(plain))
@@ -150,7 +150,7 @@ def test_a_dataset_of_somebody_else_is_left_alone(run: Path) -> None:
     assert files_of(run / "dataset") == before
 
 
-def test_the_dataset_of_a_run_whose_run_file_was_lost_is_known_again(run: Path) -> None:
+def test_a_dataset_is_recognised_after_its_run_file_was_lost(run: Path) -> None:
     lost = load_run_file(run).with_generation(export=None)
     (run / "dataset" / "demorec" / "configs.json").write_text(json.dumps({lost.config_digest: {}}))
     before = files_of(run / "dataset")
@@ -171,7 +171,7 @@ def test_a_dataset_of_other_episodes_is_left_alone_when_the_run_file_was_lost(ru
     assert files_of(run / "dataset") == before
 
 
-def test_a_dataset_that_was_moved_away_is_made_again_and_that_is_said(run: Path, tmp_path: Path) -> None:
+def test_a_moved_dataset_is_made_again_and_reported(run: Path, tmp_path: Path) -> None:
     (run / "dataset").rename(tmp_path / "mine")
     before = files_of(tmp_path / "mine")
     said: list[str] = []

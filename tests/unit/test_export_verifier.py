@@ -25,7 +25,7 @@ def test_an_export_that_fails_does_not_wait_for_it(monkeypatch: pytest.MonkeyPat
     assert process.exitcode == -signal.SIGTERM
 
 
-def test_not_even_for_one_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_failed_export_does_not_wait_for_a_hanging_verifier(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verify, "_GRACE_S", 0.1)
     monkeypatch.setattr(verify, "_serve", never_listen)
     with suppress(KeyError), Verifier() as verifier:
@@ -42,7 +42,7 @@ def test_not_even_for_one_that_does_not_listen(monkeypatch: pytest.MonkeyPatch) 
         (lack_memory, ResourceError, "too little memory"),
     ],
 )
-def test_its_end_and_its_lack_of_memory_are_told(
+def test_its_death_and_its_lack_of_memory_are_reported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, serve: Callable[..., None], error: type[Exception], words: str
 ) -> None:
     monkeypatch.setattr(verify, "_serve", serve)

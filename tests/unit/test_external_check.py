@@ -161,7 +161,7 @@ def external_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_run_is_told_and_checked(external_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_run_is_recognised_and_checked(external_run: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, told = run(capsys, "check", external_run)
     assert (code, told.splitlines()[1].startswith("good: 2 episodes")) == (0, True)
     code, told = run(capsys, "info", external_run)

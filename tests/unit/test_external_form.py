@@ -94,7 +94,7 @@ BAD: dict[str, tuple[Callable[[SampledWriter, SampledFrame], object], str]] = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_what_cannot_be_recorded_is_refused_in_one_sentence(tmp_path: Path, what: str) -> None:
+def test_invalid_frames_are_refused_in_one_sentence(tmp_path: Path, what: str) -> None:
     act, words = BAD[what]
     episode = make_external(num_frames=2, cameras=(TOP,))
     with SampledWriter(tmp_path / "a.mcap", episode.info) as writer:

@@ -31,7 +31,7 @@ def test_an_episode_is_shown_from_its_first_frame_on(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("cameras", [(), (TOP, WRIST)])
 @pytest.mark.parametrize("urdf", [True, False])
-def test_it_can_be_saved_with_whatever_is_known(tmp_path: Path, cameras: tuple[object, ...], urdf: bool) -> None:
+def test_it_can_be_saved_with_its_known_parts(tmp_path: Path, cameras: tuple[object, ...], urdf: bool) -> None:
     given = make_external(num_frames=5)
     if not cameras:
         given = make_external(num_frames=5, cameras=())
@@ -42,7 +42,7 @@ def test_it_can_be_saved_with_whatever_is_known(tmp_path: Path, cameras: tuple[o
     assert (tmp_path / "a.rrd").read_bytes().startswith(b"RR")
 
 
-def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_missing_meshes_leave_the_rest_visible(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     given = make_external(num_frames=5)
     mesh = given.info.urdf.replace('<box size="0.1 0.1 0.1"/>', '<mesh filename="package://arm/base.stl"/>')
     path = write_external(tmp_path / "a.mcap", replace(given, info=replace(given.info, urdf=mesh)))
@@ -56,7 +56,7 @@ def test_meshes_that_are_not_here_leave_the_rest_visible(tmp_path: Path, caplog:
     assert drawn == {"base", "upper", "lower"}  # rods to the joints of two links, and the third link's own shape
 
 
-def test_two_of_them_are_not_laid_over_each_other(tmp_path: Path) -> None:
+def test_two_external_episodes_are_not_overlaid(tmp_path: Path) -> None:
     path = write_external(tmp_path / "a.mcap", make_external(num_frames=5))
     (source,) = find_episodes([path])
     with pytest.raises(ConfigError, match="without --compare"):

@@ -192,7 +192,7 @@ def test_pose_deltas_compose_to_the_absolute_poses(rows: slice | np.ndarray[Any,
 
 
 @pytest.mark.parametrize("fps", [30, 10])
-def test_increments_lead_back_from_noise_as_the_noise_lets_go(fps: int) -> None:
+def test_increments_follow_the_decay_of_the_noise(fps: int) -> None:
     """Where the executed command returns to the clean one, increments are those of the executed one."""
     rng = np.random.default_rng(11)
     count, step = 12, 30 // fps

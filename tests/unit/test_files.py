@@ -42,7 +42,7 @@ def test_json_nested_deeply_is_an_ordinary_error(tmp_path: Path, text: str) -> N
 
 
 @pytest.mark.parametrize("data", [b"", b"\xff", b"{", b"1" * 5000])
-def test_what_is_no_json_is_an_ordinary_error(tmp_path: Path, data: bytes) -> None:
+def test_invalid_json_is_an_ordinary_error(tmp_path: Path, data: bytes) -> None:
     (tmp_path / "file").write_bytes(data)
     with pytest.raises(ValueError):
         read_json_limited(tmp_path / "file", 10_000_000)

@@ -28,7 +28,7 @@ def test_each_kind_of_gripper_is_read_as_it_was_written(name: str, has: dict[str
         ({"max_widht": 0.1}, "extra fields found"),
     ],
 )
-def test_a_gripper_that_makes_no_sense_is_refused(change: dict[str, object], words: str) -> None:
+def test_an_inconsistent_gripper_is_refused(change: dict[str, object], words: str) -> None:
     plain = to_plain(PANDA)
     with pytest.raises(ValueError, match=words):
         from_plain(plain | {"gripper": plain["gripper"] | change}, RobotSpec)

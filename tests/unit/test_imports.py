@@ -78,7 +78,7 @@ def test_no_modules_import_each_other() -> None:
 
 
 @pytest.mark.parametrize("library", HOMES)
-def test_a_library_is_imported_at_home_alone(library: str) -> None:
+def test_a_library_is_imported_in_one_place_only(library: str) -> None:
     """A module that is added to any folder, even the first one in a new folder, may not import it."""
     (rule,) = (rule for rule in _one_home_rules() if library in rule["forbidden_modules"])
     assert not _is_broken(rule)
@@ -87,7 +87,7 @@ def test_a_library_is_imported_at_home_alone(library: str) -> None:
         assert _is_broken(rule, (importer, library)) == (folder != HOMES[library]), importer
 
 
-def test_every_folder_stands_in_a_rule_of_its_own() -> None:
+def test_every_folder_has_its_own_rule() -> None:
     """The author of a new folder must specify the direction of its imports."""
     placed: set[str] = set()
     for rule in _rules():

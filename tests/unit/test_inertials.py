@@ -39,7 +39,7 @@ def arm(*, arm: str = BOX + inertial(), tool: str = "", base: str = "", ground: 
     "model",
     ["franka_panda/panda.urdf", "kuka_iiwa/model.urdf", "xarm/xarm6_with_gripper.urdf", "demorec:iiwa.urdf"],
 )
-def test_models_of_pybullet_and_ours_say_what_they_weigh(model: str) -> None:
+def test_models_of_pybullet_and_demorec_specify_their_masses(model: str) -> None:
     check_masses(model)
 
 
@@ -55,7 +55,7 @@ def test_models_of_pybullet_and_ours_say_what_they_weigh(model: str) -> None:
         arm(tool=BOX + inertial(mass="1e-9", moments=("0", "0", "0"))),  # as in SO-101's own URDF
     ],
 )
-def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
+def test_frames_and_fixed_bodies_need_no_mass(text: str) -> None:
     require_masses(text)
 
 
@@ -87,12 +87,12 @@ def test_frames_and_what_stands_on_the_ground_need_no_mass(text: str) -> None:
         (arm(tool=BOX + inertial(moments=("0.01", "-0.01", "0.01"))), "'tool' .*smallest principal value of -0.01"),
     ],
 )
-def test_a_link_that_no_body_can_be_is_named(tmp_path: Path, text: str, sentence: str) -> None:
+def test_a_physically_impossible_link_is_named(tmp_path: Path, text: str, sentence: str) -> None:
     with pytest.raises(ValueError, match=r"lacks the masses of these links: .*" + sentence):
         require_masses(text)
 
 
-def test_a_frame_weighs_nothing_and_the_engine_is_not_heard(
+def test_a_frame_weighs_nothing_and_the_engine_prints_nothing(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """A static test: the motor holds the arm of 2 kg, half a metre out, and not the frame a metre out."""

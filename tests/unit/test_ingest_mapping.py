@@ -90,7 +90,7 @@ def test_paths_of_fields() -> None:
         parse_path("a[")
 
 
-def test_a_publisher_of_velocities_alone_is_another_one() -> None:
+def test_publishers_of_velocities_alone_are_separate() -> None:
     """Wheels have no positions, which is no reason to refuse the arm whose messages follow."""
     source = Source(topic="/j", field="position", joints=("a",))
     with pytest.raises(OtherPublisherError):
@@ -112,7 +112,7 @@ def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Pa
 
 
 @pytest.mark.timeout(60)
-def test_long_numbers_in_a_name_do_not_hold_it_up() -> None:
+def test_long_numbers_in_a_name_do_not_slow_it_down() -> None:
     name = "1" * 200 + "a"
     assert task_in_name(name) == name
 

@@ -64,7 +64,7 @@ TIME = np.arange(HZ + 1) / HZ
         (20.0, 1.0, lambda t: np.maximum(1.05 * np.exp(-20 * t / INERTIA) - 0.05, 0)),  # 12 times a step's inertia
     ],
 )
-def test_a_joint_without_power_slows_down_as_its_equation_says(
+def test_an_unpowered_joint_slows_down_by_its_equation(
     damping: float, friction: float, solution: Callable[[Array], Array], tmp_path: Path
 ) -> None:
     found = speeds(tmp_path, limit=0.0, damping=damping, friction=friction, start=1.0, target=0.0)
@@ -76,7 +76,7 @@ def test_a_joint_without_power_slows_down_as_its_equation_says(
 @pytest.mark.parametrize(
     ("limit", "damping", "friction"), [(0.05, 0.02, 0.0), (0.12, 0.1, 0.02), (1.0, 5.0, 0.1), (3.0, 50.0, 1.0)]
 )
-def test_a_motor_at_its_limit_comes_to_the_speed_that_it_keeps_up(
+def test_a_motor_at_its_limit_reaches_its_steady_speed(
     limit: float, damping: float, friction: float, tmp_path: Path
 ) -> None:
     steady = (limit - friction) / damping
@@ -108,7 +108,7 @@ def expert_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arm: str, fin
 
 
 @pytest.mark.slow
-def test_motors_give_what_the_joints_lose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_motors_supply_the_losses_of_the_joints(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same motion needs additional torque for damping and friction, and no other force."""
     plain = expert_frames(tmp_path, monkeypatch, "", "")
     lossy = expert_frames(tmp_path, monkeypatch, 'damping="2" friction="0.5"', 'damping="10" friction="4"')

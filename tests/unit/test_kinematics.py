@@ -95,7 +95,7 @@ def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot: SimulatedRo
     assert solved >= 38
 
 
-def test_out_of_reach_is_none_and_not_a_wrong_answer(robot: SimulatedRobot) -> None:
+def test_out_of_reach_is_none(robot: SimulatedRobot) -> None:
     spec, *_ = robot
     arm = arm_kinematics(spec)
     home = np.array(spec.home_q)

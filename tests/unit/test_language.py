@@ -45,7 +45,7 @@ def scene(*cubes: tuple[str, float, float, float], yaw: float = 0.0) -> Scene:
         ("the cube nearest to the robot", 0), ("the red cube farthest from the robot", 1), ("the middle cube", 1),
     ],
 )  # fmt: skip
-def test_phrases_mean_what_they_say_from_where_the_robot_stands(phrase: str, number: int, yaw: float) -> None:
+def test_phrases_are_resolved_from_the_robots_side(phrase: str, number: int, yaw: float) -> None:
     things = scene(("red", 0.3, 0.2, 0.05), ("red", 0.45, 0.0, 0.03), ("blue", 0.5, -0.2, 0.04), yaw=yaw)
     assert resolve(phrase, situation(things)) == {things.bodies[number].name}
 
@@ -57,12 +57,12 @@ def test_phrases_mean_what_they_say_from_where_the_robot_stands(phrase: str, num
         "the larger blue cube", "the red one", "a red cube", "the red cube on the mat", "",
     ],
 )  # fmt: skip
-def test_what_is_not_clear_means_nothing(phrase: str) -> None:
+def test_an_ambiguous_phrase_refers_to_nothing(phrase: str) -> None:
     things = scene(("red", 0.4, 0.2, 0.05), ("red", 0.5, 0.02, 0.03), ("blue", 0.4, -0.2, 0.04))
     assert resolve(phrase, situation(things)) == frozenset()
 
 
-def test_a_millimetre_makes_no_left_and_no_larger() -> None:
+def test_a_millimetre_decides_neither_left_nor_larger() -> None:
     things = situation(scene(("red", 0.4, 0.1, 0.05), ("red", 0.6, 0.099, 0.0499)))
     for phrase in ("the left red cube", "the larger red cube"):
         assert resolve(phrase, things) == frozenset()
@@ -100,7 +100,7 @@ def steps(*phases: str, **events: tuple[str, str]) -> list[tuple[str, str, str]]
 GRASP = ("grasp", "grasp cube at yaw 0.1000 rad")
 
 
-def test_a_miss_and_a_drop_are_told_and_tried_again(tmp_path: Path) -> None:
+def test_a_miss_and_a_drop_are_named_and_retried(tmp_path: Path) -> None:
     script = [
         *steps("approach", "descend", "close", "recover", approach=GRASP, recover=("miss", "missed cube")),
         *steps(*PHASES[:5], "recover", approach=GRASP, recover=("drop", "dropped cube")),
@@ -124,7 +124,7 @@ def test_a_miss_and_a_drop_are_told_and_tried_again(tmp_path: Path) -> None:
     ]  # fmt: skip
 
 
-def test_phases_of_a_foreign_script_are_told_as_they_are(tmp_path: Path) -> None:
+def test_phases_of_a_foreign_script_are_used_verbatim(tmp_path: Path) -> None:
     found = told(tmp_path, [("wiggle_about", "", ""), ("", "", ""), ("close", "", "")])
     assert [(row, text) for row, kind, text in found if kind == "subtask"] == [
         (0, "wiggle about"), (2, "pick up the red cube and place it on the green target"), (4, "grasp the red cube"),

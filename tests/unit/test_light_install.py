@@ -50,7 +50,7 @@ def test_the_lists_of_packages_agree() -> None:
 
 
 @pytest.mark.usefixtures("light")
-def test_an_export_says_that_nothing_was_verified(
+def test_an_export_reports_that_nothing_was_verified(
     run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert exit_code("export", "lerobot", run, "--out", tmp_path / "d") == 0
@@ -60,7 +60,7 @@ def test_an_export_says_that_nothing_was_verified(
 
 
 @pytest.mark.usefixtures("light")
-def test_what_needs_lerobot_names_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_that_need_lerobot_name_it(run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     dataset = tmp_path / "d"
     export_lerobot([run], dataset, ExportOptions(verify=False))
     evidence = evidence_of_dataset(dataset, ReadOptions(images=False, lerobot=True))
@@ -99,7 +99,7 @@ for module in pkgutil.walk_packages(demorec.__path__, "demorec."):
         ("h5py", "h5py", "export hdf5 RUN --out NEW.hdf5"),
     ],
 )
-def test_a_package_that_is_missing_is_named_with_what_installs_it(
+def test_a_missing_package_is_named_with_its_install_command(
     module: str, package: str, command: str, run: Path, tmp_path: Path
 ) -> None:
     blocked = f"import sys; sys.modules[{module!r}] = None; from demorec.cli import main; main(sys.argv[1:])"

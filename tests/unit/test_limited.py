@@ -123,7 +123,7 @@ def test_memory_of_a_worker_counts(file: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", [["generate"], ["render"], ["check", "--deep"], []])
-def test_what_draws_may_take_more(words: list[str], file: Path) -> None:
+def test_commands_that_render_may_take_more(words: list[str], file: Path) -> None:
     assert run(FILL, *words, file).output == "filled\n"
 
 
@@ -174,7 +174,7 @@ def test_the_child_dies_with_its_parent(file: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_stopped_child_goes_on(file: Path) -> None:
+def test_a_stopped_child_continues(file: Path) -> None:
     process, child = started(COUNT, "info", file)
     child.suspend()
     time.sleep(0.2)
@@ -183,7 +183,7 @@ def test_a_stopped_child_goes_on(file: Path) -> None:
     assert process.wait(20) == 0
 
 
-def test_limits_grow_with_what_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_limits_grow_with_the_named_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "run"
     (folder / "episodes").mkdir(parents=True)
     for number in range(3):

@@ -35,7 +35,7 @@ def test_polygons_become_fans_however_their_corners_are_named(tmp_path: Path, fa
     assert found.face_materials == ("", "")
 
 
-def test_materials_are_those_that_are_there(tmp_path: Path) -> None:
+def test_materials_are_the_existing_ones(tmp_path: Path) -> None:
     (tmp_path / "m.mtl").write_text("newmtl red\nKd 1 0 0\nmap_Kd gone.png\nnewmtl plain\n")
     (tmp_path / "x.obj").write_text(f"mtllib m.mtl\nmtllib missing.mtl\n{SQUARE}usemtl red\nf 1 2 3\n")
     found = read_obj(tmp_path / "x.obj")
@@ -47,7 +47,7 @@ def test_materials_are_those_that_are_there(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("face", ["f 1 2 5", "f 1 2 -9", "f 1 2 0"])
-def test_a_face_of_points_that_are_not_there_is_refused(tmp_path: Path, face: str) -> None:
+def test_a_face_with_missing_points_is_refused(tmp_path: Path, face: str) -> None:
     (tmp_path / "x.obj").write_text(f"{SQUARE}{face}\n")
     with pytest.raises(ValueError, match=r"a face names vertex \d+ of 4"):
         read_obj(tmp_path / "x.obj")

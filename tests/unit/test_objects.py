@@ -69,7 +69,7 @@ def test_mass_properties_are_those_of_the_mesh(noun: str) -> None:
     np.testing.assert_allclose(mesh.centred().mass_properties()[1], 0.0, atol=1e-5)
 
 
-def test_shapes_differ_and_held_out_ones_are_no_others() -> None:
+def test_shapes_differ_and_held_out_ones_are_distinct() -> None:
     for kind in KINDS.values():
         texts = [encode_mesh(kind.shape(number)) for number in range(kind.count)]
         assert len(set(texts)) == kind.count, kind.noun
@@ -99,7 +99,7 @@ def test_a_mesh_comes_back_from_its_text_and_a_broken_one_is_refused() -> None:
         encode_mesh(block(0.7, 0.1, 0.1))
 
 
-def test_things_come_to_rest_as_they_stand_and_what_is_balanced_falls() -> None:
+def test_objects_rest_in_stable_poses_and_balanced_ones_fall() -> None:
     text, height = at_rest(encode_mesh(block(0.03, 0.05, 0.04)))
     np.testing.assert_allclose(decode_mesh(text).extents, (0.03, 0.05, 0.04), atol=2e-5)
     assert height == pytest.approx(0.02, abs=1.5e-3)
@@ -121,7 +121,7 @@ def test_a_box_is_grasped_across_the_side_that_fits_and_not_by_its_edges() -> No
     assert not antipodal_grasps(encode_mesh(block(0.09, 0.075, 0.03)), PANDA_HAND, up=UP)
 
 
-def test_what_sticks_out_where_a_finger_would_come_down_forbids_the_grasp() -> None:
+def test_an_overhang_in_the_path_of_a_finger_prevents_the_grasp() -> None:
     """A post can be grasped, but not below a plate on it that is nearly as wide as the open hand."""
     post, plate = trimesh.creation.box(extents=(0.03, 0.03, 0.04)), trimesh.creation.box(extents=(0.076, 0.076, 0.01))
     plate.apply_translation((0.0, 0.0, 0.025))
@@ -141,7 +141,7 @@ def test_each_kind_has_grasps_for_the_usual_hand(kind: Kind) -> None:
         assert antipodal_grasps(text, PANDA_HAND, up=UP), f"{kind.noun} {number}"
 
 
-def test_scenes_name_one_thing_without_doubt_and_take_from_the_shelves_asked_for() -> None:
+def test_scenes_name_one_object_unambiguously_from_the_requested_shelves() -> None:
     counts: Counter[int] = Counter()
     targets = set()
     meshes = {
@@ -177,7 +177,7 @@ def test_distractors_are_of_the_same_shelves_and_grey_or_black() -> None:
 
 
 @pytest.mark.parametrize("target", ["white_bowl", "white_plate"])
-def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> None:
+def test_an_object_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> None:
     """Verified with PyBullet's contacts and with the object's points, all inside the rim."""
     made = next(
         made
@@ -199,7 +199,7 @@ def test_a_thing_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> 
     assert np.hypot(inside[:, 0], inside[:, 1]).max() < vessel.shape.size[0] / 2
 
 
-def test_things_wear_the_texture_of_their_material_in_tints_of_their_colour() -> None:
+def test_objects_have_the_texture_of_their_material_in_tints_of_their_colour() -> None:
     worn: dict[str, set[str]] = {}
     for number in range(40):
         for body in episode(number, task="pick_anything").info.simulated.scene.movable:
@@ -212,7 +212,7 @@ def test_things_wear_the_texture_of_their_material_in_tints_of_their_colour() ->
     assert len(worn["mug"] | worn["can"]) >= 3
 
 
-def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
+def test_walls_surround_the_table_in_pick_anything_alone() -> None:
     made = episode(0, task="pick_anything", variation="full", width=160, height=120, cameras=("front",))
     scene, (camera,) = made.info.simulated.scene, made.info.simulated.scene.cameras
     walls = [body for body in scene.bodies if body.name.startswith("wall")]
@@ -234,7 +234,7 @@ def test_a_room_stands_around_the_table_and_other_tasks_have_none() -> None:
     ]
 
 
-def test_tasks_with_things_of_their_own_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tasks_with_their_own_objects_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(ConfigError, match="--objects was given"):
         episode(task="stack", objects=("blocks",))
     with pytest.raises(ConfigError, match="--object-split was given"):
@@ -282,9 +282,7 @@ def test_a_folder_of_meshes_is_a_shelf_and_a_ring_keeps_its_hole(tmp_path: Path)
         (trimesh.Trimesh([[0, 0, 0], [0.05, 0, 0], [0, 0.05, 0], [0, 0, 0.05]], [[0, 2, 1], [0, 1, 3]]), "is open"),
     ],
 )
-def test_a_mesh_that_cannot_be_handled_is_refused_in_one_sentence(
-    tmp_path: Path, mesh: trimesh.Trimesh, wrong: str
-) -> None:
+def test_an_unsuitable_mesh_is_refused_in_one_sentence(tmp_path: Path, mesh: trimesh.Trimesh, wrong: str) -> None:
     export(mesh, tmp_path / "thing.stl")
     with pytest.raises(ConfigError, match=wrong) as error:
         load_shelf(f"{tmp_path}/")

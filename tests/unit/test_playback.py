@@ -79,7 +79,7 @@ def test_coded_images_are_passed_on_unchanged(saved: dict[str, list[Any]], recor
     assert [(time, bytes(value[0])) for time, value in rows] == [(packet.time_ns, packet.data) for packet in packets]
 
 
-def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Path) -> None:
+def test_depth_and_segments_are_shown(saved: dict[str, list[Any]], recording: Path) -> None:
     with Recording(recording) as source:
         metres = next(iter(source.depth("front")))
     _, value = _column(saved["/world/cameras/front/depth"], "DepthImage:buffer")[0]
@@ -90,7 +90,7 @@ def test_depth_and_segments_are_there(saved: dict[str, list[Any]], recording: Pa
     assert len(np.unique(np.frombuffer(bytes(labels[0]), dtype=np.uint16))) == 4  # nothing, table, cube, robot
 
 
-def test_robot_objects_path_and_goal_are_there(saved: dict[str, list[Any]]) -> None:
+def test_robot_objects_path_and_goal_are_shown(saved: dict[str, list[Any]]) -> None:
     links = [entity for entity in saved if "/world/robot/" in entity and _has(saved[entity], "Mesh3D:vertex_positions")]
     assert len(links) == 11  # links 0 to 7, hand, two fingers
     assert len(_column(saved["/world/bodies/cube"], "Transform3D:translation")) == 20
@@ -102,7 +102,7 @@ def _has(chunks: list[Any], component: str) -> bool:
     return any(component in chunk.to_record_batch().schema.names for chunk in chunks)
 
 
-def test_the_recorded_description_stands_in_for_a_model_with_other_joints(recording: Path) -> None:
+def test_the_recorded_description_replaces_a_model_with_other_joints(recording: Path) -> None:
     with Recording(recording) as source:
         description = source.description()
     moved = description.replace('xyz="0 0 0.333"', 'xyz="0 0 0.444"')
@@ -200,7 +200,7 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
     assert _mesh_of(drawn["/world/bodies/brick"])[1] == {0x3366FFFF}
 
 
-def test_a_model_of_another_size_is_not_taken_for_the_recorded_one(
+def test_a_model_of_another_size_does_not_replace_the_recorded_one(
     with_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(bodies, "_model_mesh", lambda shape: bodies._unit_mesh("box"))
@@ -227,7 +227,7 @@ def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> 
     assert {"/a/plots/position", "/b/plots/position", "/differences/distance"} <= entities
 
 
-def test_a_damaged_file_in_the_cache_is_made_anew(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_damaged_file_in_the_cache_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path))
     source = assets.data_folder() / "cube.obj"
     first = mesh_file.__wrapped__(source)

@@ -37,7 +37,7 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_what_the_hand_holds_moves_with_it(dataset: Path, recorded: Array) -> None:
+def test_held_objects_move_with_the_hand(dataset: Path, recorded: Array) -> None:
     with open_dataset_episode(LeRobotFolder(dataset), 0) as episode:
         assert episode.info.simulation is not None
         drawn = episode.motion.object_poses["red_cube"]
@@ -67,7 +67,7 @@ def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path
         ([80, 60, 50, 50, 49, 48, 40, 30, 20, 10], [80] + [0] * 9, [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]),
     ],
 )
-def test_closing_fingers_that_stop_hold_something(opening: list[int], target: list[int], expected: list[int]) -> None:
+def test_closing_fingers_that_stop_hold_an_object(opening: list[int], target: list[int], expected: list[int]) -> None:
     assert held(np.array(opening) / 1000, np.array(target) / 1000, 30).astype(int).tolist() == expected
 
 
@@ -95,7 +95,7 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
     np.testing.assert_allclose(drawn, measured[-1], atol=2e-3)
 
 
-def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> None:
+def test_codes_of_depth_follow_the_datasets_metadata(tmp_path: Path) -> None:
     """Datasets of LeRobot may have another range, and a linear scale."""
     write_episode(tmp_path / "e.mcap", num_frames=3, depth=True, cameras=("front",))
     export(tmp_path / "e.mcap", tmp_path / "d", depth=True)
@@ -122,7 +122,7 @@ def test_codes_of_depth_mean_what_the_datasets_metadata_say(tmp_path: Path) -> N
             assert "depth is" in why_not_recorded(name, LeRobotFolder(tmp_path / "d").info.features[name])
 
 
-def test_what_info_says_of_a_video_must_be_true_of_it(tmp_path: Path) -> None:
+def test_info_json_must_match_the_video(tmp_path: Path) -> None:
     write_episode(tmp_path / "e.mcap", num_frames=3, depth=True, cameras=("front",))
     export(tmp_path / "e.mcap", tmp_path / "d", depth=True)
     info = tmp_path / "d" / "meta" / "info.json"

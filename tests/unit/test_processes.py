@@ -85,7 +85,7 @@ print(process.exitcode)
 """
 
 
-def test_ctrl_c_in_a_callback_is_heard_and_not_printed(tmp_path: Path) -> None:
+def test_ctrl_c_in_a_callback_is_handled_and_not_printed(tmp_path: Path) -> None:
     (tmp_path / "work.py").write_text(IN_A_CALLBACK)
     (tmp_path / "script.py").write_text(STARTS_IT)
     done = subprocess.run(
@@ -113,7 +113,7 @@ except KeyboardInterrupt:
 
 
 @pytest.mark.slow
-def test_a_second_ctrl_c_ends_what_the_first_waits_for(tmp_path: Path) -> None:
+def test_a_second_ctrl_c_ends_the_wait_of_the_first(tmp_path: Path) -> None:
     """Only the parent receives it, so that nothing but the second one can end the workers."""
     (tmp_path / "work.py").write_text(SLEEPS)
     parent = subprocess.Popen(
@@ -150,7 +150,7 @@ def test_a_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None
     assert not alive
 
 
-def test_a_program_ends_when_it_is_asked_to_and_tells_how_it_ended() -> None:
+def test_a_program_ends_on_request_and_reports_its_exit_code() -> None:
     command = [sys.executable, "-c", "import time; print('ready', flush=True); time.sleep(600)"]
     process = start_program(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -165,7 +165,7 @@ def test_a_program_ends_when_it_is_asked_to_and_tells_how_it_ended() -> None:
         assert failing.wait(20) == 7
 
 
-def test_a_process_that_is_asked_to_end_while_it_ends_prints_no_traceback() -> None:
+def test_a_signal_during_exit_prints_no_traceback() -> None:
     """SIGTERM arrives while Python runs atexit callbacks, as the verifier of an export may receive it."""
     code = (
         "import atexit, os, signal, sys; from demorec.core.processes import exit_silently;"

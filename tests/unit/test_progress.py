@@ -36,7 +36,7 @@ def lines_of(
     return told.err.splitlines()
 
 
-def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_line_has_progress_and_remaining_time(capsys: pytest.CaptureFixture[str]) -> None:
     lines = lines_of(capsys, total=40, seconds_each=5.0, note="2 failed attempts")
     assert lines[0] == "generating: 2 of 40 episodes (5 %), 10 s passed, about 3.2 min left, 2 failed attempts"
     assert lines[1].startswith("generating: 4 of 40 episodes (10 %), 20 s passed, about 3.0 min left")
@@ -45,7 +45,7 @@ def test_a_line_says_how_far_it_is_and_how_long_it_will_take(capsys: pytest.Capt
 
 @pytest.mark.parametrize("is_terminal", [True, False])
 @pytest.mark.parametrize("workers", [1, 8])
-def test_the_start_does_not_count_for_the_time_that_is_left(
+def test_the_start_does_not_affect_the_remaining_time(
     capsys: pytest.CaptureFixture[str], workers: int, is_terminal: bool
 ) -> None:
     """All workers start for two minutes, and then each finishes an episode a minute, one second apart."""
@@ -75,13 +75,13 @@ def test_the_start_does_not_count_for_the_time_that_is_left(
         (8640, 10.0, 300, 360),  # a day: every five minutes after the first hours
     ],
 )
-def test_there_is_neither_a_flood_nor_a_silence(
+def test_lines_are_neither_too_many_nor_too_few(
     capsys: pytest.CaptureFixture[str], total: int, seconds_each: float, fewest: int, most: int
 ) -> None:
     assert fewest <= len(lines_of(capsys, total=total, seconds_each=seconds_each)) <= most
 
 
-def test_lines_come_by_themselves_until_the_end(capsys: pytest.CaptureFixture[str]) -> None:
+def test_lines_are_printed_until_the_end(capsys: pytest.CaptureFixture[str]) -> None:
     told = ""
     with ProgressBar("generating", total=3, is_terminal=False, quiet=0.01):
         while not told:  # the tests' time limit ends it

@@ -38,7 +38,7 @@ def same(one: Any, two: Any) -> bool:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("antialias", [True, False])
-def test_keeping_what_stands_still_changes_no_bit(client: Any, antialias: bool) -> None:
+def test_reusing_static_pixels_changes_no_bit(client: Any, antialias: bool) -> None:
     bodies = scenes.panda_scene(client)
     front, _ = scenes.panda_cameras(160, 120)
     kept, redrawn = RasterRenderer(), RasterRenderer(keep_still=False)
@@ -74,7 +74,7 @@ def test_changed_colours_are_noticed(client: Any, mass: float) -> None:
     assert blue.color[seen].mean(0).argmax() == 2
 
 
-def test_each_face_of_a_solid_wears_the_texture_as_seen_along_its_axis(client: Any, tmp_path: Path) -> None:
+def test_each_face_of_a_solid_has_the_texture_projected_along_its_axis(client: Any, tmp_path: Path) -> None:
     size = np.array([0.4, 0.3, 0.2])
     box = trimesh.creation.box(extents=size)
     solid = SolidMesh(points=np.array(box.vertices), faces=np.array(box.faces), parts=())
@@ -113,7 +113,7 @@ def test_distant_textures_turn_to_their_mean(client: Any) -> None:
         assert 0.4 < seen.color[inner].mean() / flat.color[inner].mean() < 0.65
 
 
-def test_a_shadow_lies_where_the_light_puts_it(client: Any) -> None:
+def test_a_shadow_is_where_the_light_casts_it(client: Any) -> None:
     floor = scenes.add(
         client, "box", (1.0, 1.0, 0.1), Pose(position=np.array([0.0, 0.0, -0.05])), rgbaColor=[0.7, 0.7, 0.7, 1]
     )
@@ -155,7 +155,7 @@ def test_exact_draws_all_triangles_and_levels_stay_close(client: Any) -> None:
         assert np.quantile(np.abs(present(images.depth) - present(other.depth))[both], 0.99) < 5e-3
 
 
-def test_a_camera_inside_a_mesh_clips_more_than_there_is_room_for(client: Any) -> None:
+def test_a_camera_inside_a_mesh_clips_more_than_the_buffers_hold(client: Any) -> None:
     # Thousands of triangles cross the guard planes at once: the buffers must grow, not overflow.
     body = scenes.add(
         client, "mesh", (30.0, 30.0, 30.0), fileName=f"{scenes.DATA}/textured_sphere_smooth.obj", mass=1.0

@@ -40,7 +40,7 @@ def recording_of(folder: Path, index: int = 0) -> Recording:
     return Recording(folder / "episodes" / f"episode_{index:06d}.mcap")
 
 
-def test_what_was_given_is_recorded_to_the_bit(tmp_path: Path) -> None:
+def test_inputs_are_recorded_bit_exactly(tmp_path: Path) -> None:
     random = np.random.default_rng(0)
     states = random.normal(size=(40, 6)).astype(np.float32)
     actions, forces = random.normal(size=(40, 2)), random.normal(size=(40, 3))
@@ -98,7 +98,7 @@ def feature_of(folder: Path, name: str) -> Feature:
         (PANDA, [0.0] * 9, PANDA.joint_names, PANDA.joint_names),
     ],
 )  # fmt: skip
-def test_elements_are_named_by_what_is_known(
+def test_elements_get_the_best_known_names(
     tmp_path: Path, robot: Any, observation: Any, names: tuple[str, ...], joints: tuple[str, ...]
 ) -> None:
     with recorder(tmp_path / "run", robot=robot) as run, run.episode() as episode:
@@ -111,7 +111,7 @@ def test_elements_are_named_by_what_is_known(
         assert found.table().features["observation.state"][0].tolist() == values
 
 
-def test_the_run_goes_on_where_it_ended(tmp_path: Path) -> None:
+def test_the_run_continues_where_it_ended(tmp_path: Path) -> None:
     for _ in range(2):
         with recorder(tmp_path / "run") as run:
             for task in ("", "another"):
@@ -145,7 +145,7 @@ def test_a_lost_run_json_is_made_again(tmp_path: Path) -> None:
     assert (tmp_path / "run" / "run.json.damaged").read_text() == "{"
 
 
-def test_what_ends_an_episode_is_told(tmp_path: Path) -> None:
+def test_the_end_of_an_episode_is_reported(tmp_path: Path) -> None:
     with recorder(tmp_path / "run") as run:
         with pytest.raises(ZeroDivisionError), run.episode() as episode:  # noqa: PT012
             episode.write([0.0])
@@ -185,7 +185,7 @@ BAD: dict[str, tuple[Act, str]] = {
 
 
 @pytest.mark.parametrize("what", BAD)
-def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, what: str) -> None:
+def test_bad_input_is_one_sentence_and_costs_one_frame(tmp_path: Path, what: str) -> None:
     act, words = BAD[what]
     with recorder(tmp_path / "run", robot=["a", "b"], cameras=TOP) as run:
         episode = run.episode()
@@ -218,7 +218,7 @@ def test_bad_input_is_told_in_one_sentence_and_costs_one_frame(tmp_path: Path, w
         ({"task": None}, "The task is None; describe"),
     ],
 )
-def test_what_cannot_be_recorded_is_refused_before_a_folder_is_made(
+def test_invalid_settings_are_refused_before_a_folder_is_made(
     tmp_path: Path, changes: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):
@@ -226,7 +226,7 @@ def test_what_cannot_be_recorded_is_refused_before_a_folder_is_made(
     assert not (tmp_path / "run").exists()
 
 
-def test_odd_sizes_are_recorded_by_the_codec_that_is_advised(tmp_path: Path) -> None:
+def test_odd_sizes_are_recorded_by_the_recommended_codec(tmp_path: Path) -> None:
     cameras, pixels = {"top": (47, 65)}, np.full((47, 65, 3), 90, dtype=np.uint8)
     with recorder(tmp_path / "run", cameras=cameras, video=VideoConfig(codec="jpeg")) as run, run.episode() as episode:
         episode.write([0.0], [0.0], images={"top": pixels})
@@ -260,7 +260,7 @@ def test_an_episode_that_was_opened_and_killed_leaves_no_gap(tmp_path: Path) -> 
     assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap"]
 
 
-def test_folders_of_others_are_left_alone(tmp_path: Path) -> None:
+def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.jpg").write_text("")
     (tmp_path / "file").write_text("")
@@ -352,7 +352,7 @@ with Recorder(sys.argv[1], robot="arm", cameras={"top": (48, 64)}, fps=50, task=
 
 @pytest.mark.slow
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_what_ends_the_program_loses_at_most_a_second(tmp_path: Path, number: signal.Signals) -> None:
+def test_the_end_of_the_program_loses_at_most_a_second(tmp_path: Path, number: signal.Signals) -> None:
     command = [sys.executable, "-c", KILLED, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as program:
         assert program.stdout is not None

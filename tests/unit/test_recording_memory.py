@@ -95,7 +95,7 @@ def test_numbers_of_a_long_external_episode_take_little_more_memory_than_they_ar
     assert peaks[2] - peaks[1] < 4 * (num_bytes[2] - num_bytes[1])
 
 
-def test_numbers_of_a_external_episode_are_read_without_its_images(tmp_path: Path) -> None:
+def test_numbers_of_an_external_episode_are_read_without_its_images(tmp_path: Path) -> None:
     given = make_external(cameras=(replace(TOP, kept="jpeg"),), num_frames=120)
     noise = np.random.default_rng(0)
     num_bytes = 0

@@ -126,7 +126,7 @@ def test_the_page_of_a_notebook(path: Path) -> None:
     assert [frame_number(image) for image in images] == 2 * [0, 12, 23, 34, 46]
 
 
-def test_foreign_text_does_nothing_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
+def test_foreign_text_has_no_effect_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
     evil = tmp_path / "<script>alert(1)<\\script>\x1b[2J.mcap"
     evil.write_bytes(path.read_bytes())
     with Recording(evil) as recording:
@@ -142,7 +142,7 @@ def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> Non
     assert capsys.readouterr().out
 
 
-def test_an_external_recording_is_at_home_in_notebooks(tmp_path: Path) -> None:
+def test_an_external_recording_works_in_notebooks(tmp_path: Path) -> None:
     given = make_external(num_frames=20)
     with open_recording(write_external(tmp_path / "episode.mcap", given)) as recording:
         table = recording.to_pandas()
@@ -158,7 +158,7 @@ def test_an_external_recording_is_at_home_in_notebooks(tmp_path: Path) -> None:
         open_simulated(tmp_path / "episode.mcap")
 
 
-def test_a_simulated_recording_says_which_image_each_frame_holds(path: Path) -> None:
+def test_a_simulated_recording_lists_the_image_of_each_frame(path: Path) -> None:
     with open_simulated(path) as recording:
         table, info = recording.table(), recording.info
         for camera in info.cameras:

@@ -120,7 +120,7 @@ def test_depth_and_segmentation(tmp_path: Path) -> None:
     assert names[2 + (1 << 24)] == "panda/panda_link1"
 
 
-def test_without_depth_it_says_so(tmp_path: Path) -> None:
+def test_missing_depth_is_an_error(tmp_path: Path) -> None:
     with Recording(write_episode(tmp_path / "a.mcap", num_frames=3)) as recording:
         assert not recording.has_depth("front")
         with pytest.raises(RecordingError, match="no depth images"):

@@ -30,7 +30,7 @@ for codec in ("h264", "av1", "jpeg"):
 
 
 @pytest.mark.slow
-def test_packets_do_not_depend_on_what_was_in_the_memory() -> None:
+def test_packets_do_not_depend_on_uninitialised_memory() -> None:
     """glibc fills new memory with a chosen pattern.
 
     An encoder that reads memory before setting it is thus detected (x264 with its macroblock tree is).
@@ -58,7 +58,7 @@ def test_the_delay_is_short(codec: Codec) -> None:
     assert out + len(encoder.finish()) == 40
 
 
-def test_broken_video_is_told_in_one_sentence() -> None:
+def test_broken_video_is_one_sentence() -> None:
     _, frames, _ = make_episode(num_frames=4, cameras=("front",))
     broken: dict[Codec, bytes] = {"h264": b"\0\0\0\1\x65junk", "av1": b"\x12\0junk", "jpeg": b"\xff\xd8\xffjunk"}
     for codec, junk in broken.items():
@@ -75,7 +75,7 @@ def test_broken_video_is_told_in_one_sentence() -> None:
         assert "\n" not in str(caught.value)
 
 
-def test_another_size_than_the_settings_say() -> None:
+def test_a_size_that_differs_from_the_settings() -> None:
     encoder = make_encoder(video=VideoConfig(codec="jpeg"), width=64, height=48, fps=30)
     other = make_encoder(video=VideoConfig(codec="jpeg"), width=32, height=32, fps=30)
     (data,) = other.encode(np.zeros((32, 32, 3), dtype=np.uint8))
@@ -125,7 +125,7 @@ def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
 
 
 @pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
-def test_a_stream_says_how_its_colours_are_meant(codec: Codec, decoder: str) -> None:
+def test_a_stream_specifies_its_colour_space(codec: Codec, decoder: str) -> None:
     """Its luma and chroma give the image back by the matrix and range in its metadata."""
     import av
 

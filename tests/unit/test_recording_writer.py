@@ -88,7 +88,7 @@ def test_images_are_complete(tmp_path: Path) -> None:
             writer.write(replace(frames[1], images={**frames[1].images, "wrist": small}))
 
 
-def test_an_impossible_preset_is_told_in_one_sentence(tmp_path: Path) -> None:
+def test_an_impossible_preset_is_one_sentence(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=1)
     with (
         EpisodeWriter(tmp_path / "a.mcap", info, video=VideoConfig(preset="quickest")) as writer,
@@ -121,7 +121,7 @@ def leftover(folder: Path, origin: str) -> bytes:
     return (folder / "a.mcap.part").read_bytes()
 
 
-def test_what_a_killed_rendering_left_is_replaced_by_the_same_rendering(tmp_path: Path) -> None:
+def test_the_same_rendering_replaces_the_rest_of_a_killed_one(tmp_path: Path) -> None:
     leftover(tmp_path, "render of 0123")
     info, frames, outcome = make_episode(num_frames=5, cameras=())
     with EpisodeWriter(tmp_path / "a.mcap", replace(info, origin="render of 0123")) as writer:
@@ -131,7 +131,7 @@ def test_what_a_killed_rendering_left_is_replaced_by_the_same_rendering(tmp_path
 
 
 @pytest.mark.parametrize(("left", "new"), [("", ""), ("", "render of 0123"), ("render of 4567", "render of 0123")])
-def test_what_cannot_be_made_again_by_the_same_command_stays(tmp_path: Path, left: str, new: str) -> None:
+def test_irreproducible_leftovers_stay(tmp_path: Path, left: str, new: str) -> None:
     before = leftover(tmp_path, left)
     info, _, _ = make_episode(num_frames=5, cameras=())
     with pytest.raises(ConfigError, match="unfinished recording"):
@@ -139,7 +139,7 @@ def test_what_cannot_be_made_again_by_the_same_command_stays(tmp_path: Path, lef
     assert (tmp_path / "a.mcap.part").read_bytes() == before
 
 
-def test_what_another_process_is_writing_is_left_alone(tmp_path: Path) -> None:
+def test_files_being_written_by_another_process_are_left_alone(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=40, cameras=())
     info = replace(info, origin="render of 0123")
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:

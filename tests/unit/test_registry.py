@@ -38,13 +38,13 @@ def test_of_many_names_the_refusal_names_the_command_that_lists_them() -> None:
 
 
 @pytest.mark.parametrize("allowed", [(), ("fraction",), ("fractions.sub",), ("decimal",)])
-def test_somebody_elses_object_is_refused_when_nobody_allowed_its_module(allowed: tuple[str, ...]) -> None:
+def test_a_third_party_object_needs_an_allowed_module(allowed: tuple[str, ...]) -> None:
     with pytest.raises(NotAllowedError, match=r"if you trust that module, add --allow fractions\."):
         SHAPES.load("fractions:Fraction", allowed)
 
 
 @pytest.mark.parametrize("name", ["no_such_package.task:Mine", "decimal:NoSuchThing"])
-def test_somebody_elses_mistake_is_one_sentence(name: str) -> None:
+def test_a_third_party_mistake_is_one_sentence(name: str) -> None:
     with pytest.raises(ConfigError, match="cannot be imported"):
         SHAPES.load(name, ["no_such_package", "decimal"])
 
@@ -53,7 +53,7 @@ def test_somebody_elses_mistake_is_one_sentence(name: str) -> None:
     ("source", "reason"),
     [("def (", "SyntaxError"), ("1 / 0", "ZeroDivisionError"), ("raise SystemExit(3)", "SystemExit: 3")],
 )
-def test_whatever_a_module_raises_is_one_sentence(
+def test_any_error_of_a_module_is_one_sentence(
     source: str, reason: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "breaks_on_import.py").write_text(source)
@@ -63,12 +63,12 @@ def test_whatever_a_module_raises_is_one_sentence(
 
 
 @pytest.mark.parametrize("name", ["os:abort", "builtins:exit", "demorec.core.errors:DemorecError", "fractions:math"])
-def test_things_of_another_kind_are_refused_and_not_called(name: str) -> None:
+def test_objects_of_another_kind_are_refused_and_not_called(name: str) -> None:
     with pytest.raises(ConfigError, match=r"is not a shape: it must be a subclass of numbers\.Number"):
         SHAPES.load(name, [name.partition(":")[0]])
 
 
-def test_a_class_is_no_instance_of_itself() -> None:
+def test_a_class_is_not_an_instance_of_itself() -> None:
     assert NUMBERS.load("math:pi", ["math"]) == pytest.approx(3.14159, abs=1e-5)
     with pytest.raises(ConfigError, match=r"is not a number: it must be an instance of numbers\.Number"):
         NUMBERS.load("fractions:Fraction", ["fractions"])
@@ -84,6 +84,6 @@ def test_an_unfinished_class_is_refused() -> None:
 @pytest.mark.parametrize(
     "name", ["", ":", "a:", ":b", "a:b:c", "a b:c", "a..b:c", "a:b.c", "../a:b", "no colon", "1:2"]
 )
-def test_names_of_another_form_are_unknown_whatever_is_allowed(name: str) -> None:
+def test_malformed_names_are_unknown_even_if_allowed(name: str) -> None:
     with pytest.raises(ConfigError, match="Unknown shape"):
         SHAPES.load(name, ["a", "no", ""])

@@ -111,7 +111,7 @@ def dataset(run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_what_failed_comes_first(run: Path) -> None:
+def test_failures_come_first(run: Path) -> None:
     found = report_on(run)
     assert [words.split(" failed")[0].strip() for words in found.articles[:1]] == ["episode 1, attempt 0"]
     assert "distance_to_target in phase place" in found.articles[0]
@@ -153,7 +153,7 @@ def test_the_camera_is_chosen(run: Path, dataset: Path, capsys: pytest.CaptureFi
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_dataset_tells_the_same_as_its_run(run: Path, dataset: Path) -> None:
+def test_a_dataset_and_its_run_have_the_same_report(run: Path, dataset: Path) -> None:
     ours, theirs = gathered(run), gathered(dataset)
     of_run = {key: np.concatenate(parts).tolist() for key, parts in gathered(run / "episodes").distributions.items()}
     assert {key: np.concatenate(parts).tolist() for key, parts in theirs.distributions.items()} == of_run
@@ -163,7 +163,7 @@ def test_a_dataset_tells_the_same_as_its_run(run: Path, dataset: Path) -> None:
     assert not theirs.missing[:-1]
 
 
-def test_a_dataset_of_others_says_what_is_missing(dataset: Path, tmp_path: Path) -> None:
+def test_a_third_party_dataset_lists_missing_parts(dataset: Path, tmp_path: Path) -> None:
     other = shutil.copytree(dataset, tmp_path / "other")
     shutil.rmtree(other / "demorec")
     found = report_on(other)
@@ -207,7 +207,7 @@ def test_images_in_rows_are_shown(tmp_path: Path) -> None:
         assert parts == pytest.approx(10 + 20 * np.arange(8) + 40 * episode, abs=3)
 
 
-def test_foreign_text_does_nothing(run: Path, tmp_path: Path) -> None:
+def test_foreign_text_has_no_effect(run: Path, tmp_path: Path) -> None:
     """Text in a recording is escaped: the page has the same elements as without it."""
     good = run / "episodes" / "episode_000000.mcap"
     with Recording(good) as recording:
@@ -266,7 +266,7 @@ def test_distributions_are_drawn_from_frames_and_extremes() -> None:
     assert distribution("constant", [("action", constant)]).middle == "7"
 
 
-def test_what_cannot_be_read_is_told(run: Path, tmp_path: Path) -> None:
+def test_unreadable_inputs_are_reported(run: Path, tmp_path: Path) -> None:
     folder = shutil.copytree(run, tmp_path / "run")
     file = folder / "episodes" / "episode_000002.mcap"
     file.write_bytes(file.read_bytes()[:2000])

@@ -54,7 +54,7 @@ def test_motion_is_checked_whatever_the_features_are_called(name: str, tmp_path:
 
 
 @pytest.mark.parametrize("name", CONVENTIONS)
-def test_an_import_keeps_what_is_found(name: str, tmp_path: Path, capsys: Capture) -> None:
+def test_an_import_keeps_the_found_roles(name: str, tmp_path: Path, capsys: Capture) -> None:
     root, run = write_convention(tmp_path / "d", CONVENTIONS[name]), tmp_path / "run"
     assert exit_code("info", root, "--json") == 0
     there = json.loads(capsys.readouterr().out)["roles"]
@@ -67,7 +67,7 @@ def test_an_import_keeps_what_is_found(name: str, tmp_path: Path, capsys: Captur
     assert roles["grippers"] == there["grippers"]
 
 
-def test_without_state_and_action_the_verdict_says_what_was_not_looked_at(tmp_path: Path, capsys: Capture) -> None:
+def test_without_state_and_action_the_verdict_lists_unchecked_features(tmp_path: Path, capsys: Capture) -> None:
     source, root = write_convention(tmp_path / "all", UNKNOWN, frozen=True), tmp_path / "d"
     assert exit_code("dataset", "drop", source, "--episodes", "0", "--out", root) == 0  # it writes statistics
     capsys.readouterr()
@@ -83,7 +83,7 @@ def test_without_state_and_action_the_verdict_says_what_was_not_looked_at(tmp_pa
     assert found_by(named, "frozen_state")
 
 
-def test_info_shows_what_has_no_role_first_and_what_the_user_names(tmp_path: Path, capsys: Capture) -> None:
+def test_info_shows_features_without_a_role_first_and_named_ones(tmp_path: Path, capsys: Capture) -> None:
     root = write_convention(tmp_path / "d", CONVENTIONS["agibot"])
     edit_json(root / "meta/info.json", lambda info: info["features"].update(odd={"dtype": "int64", "shape": [1]}))
     assert exit_code("info", root) == 0
@@ -150,7 +150,7 @@ def test_an_import_records_what_the_user_names(tmp_path: Path, capsys: Capture) 
     assert "Another recording exists already" in capsys.readouterr().err
 
 
-def test_what_the_user_names_counts_more_than_what_an_import_recorded(tmp_path: Path, capsys: Capture) -> None:
+def test_the_users_names_override_recorded_roles(tmp_path: Path, capsys: Capture) -> None:
     root, run = write_convention(tmp_path / "d", UNKNOWN), tmp_path / "run"
     assert exit_code("import", "lerobot", root, "--out", run, *NAMED) == 0
     capsys.readouterr()
@@ -193,7 +193,7 @@ def test_a_report_draws_state_and_action(tmp_path: Path, capsys: Capture) -> Non
     assert "component 3" in text
 
 
-def test_idle_frames_are_found_in_anybodys_state(tmp_path: Path, capsys: Capture) -> None:
+def test_idle_frames_are_found_in_any_state(tmp_path: Path, capsys: Capture) -> None:
     root = write_convention(tmp_path / "d", CONVENTIONS["openpi droid"])
     assert exit_code("dataset", "trim", root, "--idle", "--dry-run") == 0
     assert exit_code("dataset", "trim", write_convention(tmp_path / "u", UNKNOWN), "--idle", "--dry-run") == 2
@@ -201,7 +201,7 @@ def test_idle_frames_are_found_in_anybodys_state(tmp_path: Path, capsys: Capture
 
 
 @pytest.mark.parametrize("write", [write_robomimic, write_aloha])
-def test_hdf5_of_other_people_has_a_state_and_an_action(write: Any, tmp_path: Path, capsys: Capture) -> None:
+def test_third_party_hdf5_has_a_state_and_an_action(write: Any, tmp_path: Path, capsys: Capture) -> None:
     path = write(tmp_path / "demo.hdf5")
     exit_code("import", "hdf5", path, "--suggest")
     mapping = tmp_path / "mapping.toml"
@@ -291,7 +291,7 @@ def test_every_known_form_gives_the_same_names(names: list[str]) -> None:
         (("a", "b"), ("c", "b.vel"), [None, 1]),
     ],
 )
-def test_elements_match_by_name_else_by_place(
+def test_elements_match_by_name_or_position(
     state: tuple[str, ...], action: tuple[str, ...], expected: list[int | None]
 ) -> None:
     assert matching_elements(state, action) == expected
@@ -319,7 +319,7 @@ def test_a_whole_state_wins_over_its_parts() -> None:
     }  # fmt: skip
 
 
-def test_the_simulators_truth_is_no_state() -> None:
+def test_the_simulators_object_poses_are_not_a_state() -> None:
     roles = find_roles({"observation.environment_state": vector(9), "action": vector(4)}, NamedRoles())
     assert roles.state == ()
     assert [*roles.notes()] == ["No state found, so nothing was judged by it; name it: --state FEATURE."]

@@ -55,7 +55,7 @@ def a_run() -> RunFile:
     ).with_attempts(attempts)
 
 
-def test_there_is_one_line_an_attempt_and_one_for_each_episode_to_come(tmp_path: Path) -> None:
+def test_there_is_one_line_for_each_attempt_and_planned_episode(tmp_path: Path) -> None:
     run = a_run()
     save_run_file(run, tmp_path)
     text = (tmp_path / "run.json").read_text()
@@ -78,7 +78,7 @@ def test_there_is_one_line_an_attempt_and_one_for_each_episode_to_come(tmp_path:
         lambda text: "\x00" * 100,
     ],
 )
-def test_every_damage_is_told_as_such(tmp_path: Path, damage: Callable[[str], str]) -> None:
+def test_every_damage_is_reported_as_damage(tmp_path: Path, damage: Callable[[str], str]) -> None:
     save_run_file(a_run(), tmp_path)
     path = tmp_path / "run.json"
     before = path.read_text()
@@ -113,7 +113,7 @@ def edit(path: Path, change: Callable[[Any], object]) -> None:
         (lambda run: run["episodes"].append(run["episodes"][0]), "two lines have episode 0, attempt 0"),
     ],
 )
-def test_numbers_that_no_run_has_are_damage(tmp_path: Path, change: Callable[[Any], object], words: str) -> None:
+def test_impossible_numbers_are_damage(tmp_path: Path, change: Callable[[Any], object], words: str) -> None:
     run = a_run()
     assert run.attempts[0].success, "the first line must be that of a recording in episodes/"
     save_run_file(run, tmp_path)
@@ -123,7 +123,7 @@ def test_numbers_that_no_run_has_are_damage(tmp_path: Path, change: Callable[[An
     assert words in str(error.value)
 
 
-def test_it_is_never_written_through_what_lies_in_the_way(tmp_path: Path) -> None:
+def test_it_is_never_written_through_links_or_fifos(tmp_path: Path) -> None:
     (tmp_path / "mine").write_text("mine")
     (tmp_path / "run.json.part").symlink_to("mine")
     save_run_file(a_run(), tmp_path)
@@ -133,7 +133,7 @@ def test_it_is_never_written_through_what_lies_in_the_way(tmp_path: Path) -> Non
     assert load_run_file(tmp_path) == a_run()
 
 
-def test_a_newer_format_is_no_damage(tmp_path: Path) -> None:
+def test_a_newer_format_is_not_damage(tmp_path: Path) -> None:
     save_run_file(a_run(), tmp_path)
     path = tmp_path / "run.json"
     path.write_text(path.read_text().replace('"format": 1', '"format": 2'))

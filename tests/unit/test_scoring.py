@@ -140,7 +140,9 @@ def scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[Call
         (lacks_numbers, "NaN or infinite numbers"),
     ],
 )
-def test_the_spoilt_episode_is_the_worst_and_says_why(scored: Any, spoil: Callable[[Rows], Rows], words: str) -> None:
+def test_the_damaged_episode_is_the_worst_with_the_reason(
+    scored: Any, spoil: Callable[[Rows], Rows], words: str
+) -> None:
     found = scored(spoil)
     assert min(found, key=lambda episode: episode["score"])["episode"] == BAD
     assert found[BAD]["score"] < 0.5
@@ -162,7 +164,7 @@ def late(tmp_path: Path) -> Path:
     return write(tmp_path / "d", episodes)
 
 
-def test_what_is_good_is_selected(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_good_episodes_are_selected(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     good, same = str(tmp_path / "good"), str(tmp_path / "same")
     assert exit_code("dataset", "select", str(late), "--where", 'verdict != "broken"', "--out", good) == 0
     assert f"{EPISODES_IN_ALL - 1} episodes" in capsys.readouterr().out

@@ -58,7 +58,7 @@ def failed(prepared: PreparedEpisode, world: World) -> set[str]:
 
 
 @pytest.mark.parametrize("name", BREAKAGES)
-def test_a_cube_that_lies_wrong_fails_its_check(finished: tuple[PreparedEpisode, World], name: str) -> None:
+def test_a_misplaced_cube_fails_its_check(finished: tuple[PreparedEpisode, World], name: str) -> None:
     prepared, world = finished
     good = world.pose("red_cube")
     world.set_state(object_poses={"red_cube": good})
@@ -92,7 +92,7 @@ def test_a_cube_that_floats_moves_or_is_held_fails(finished: tuple[PreparedEpiso
     world.set_state(object_poses={"red_cube": good})
 
 
-def test_into_a_tray_is_anywhere_in_it() -> None:
+def test_any_position_in_a_tray_succeeds() -> None:
     """The floor of tray.urdf is 0.26 x 0.20 m; a cube on the table next to it, or on its wall, is not in it."""
     prepared = episode(0, task="place_in_tray")
     with make_world(prepared.info) as world:
@@ -118,7 +118,7 @@ def behave(prepared: PreparedEpisode, **values: float) -> PreparedEpisode:
     return dataclasses.replace(prepared, behaviour=Behaviour(**values))
 
 
-def test_a_deliberate_miss_is_flagged_and_mended() -> None:
+def test_a_deliberate_miss_is_flagged_and_corrected() -> None:
     frames, outcome = run(behave(episode(5), miss_x=0.03, miss_y=0.03))
     assert outcome.success
     assert outcome.num_retries == 1

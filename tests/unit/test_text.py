@@ -14,7 +14,7 @@ from demorec.core.text import display_width, printable
 
 
 @given(st.text())
-def test_nothing_that_a_terminal_obeys_is_left(text: str) -> None:
+def test_no_control_characters_remain(text: str) -> None:
     shown = printable(text)
     assert not any(ord(character) < 0x20 or 0x7F <= ord(character) < 0xA0 for character in shown)
     assert not set(shown) & set("\u061c\u200e\u200f\u2028\u2029\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
@@ -32,7 +32,7 @@ def test_nothing_that_a_terminal_obeys_is_left(text: str) -> None:
         ("把红色方块放好 ✓", "把红色方块放好 ✓"),
     ],
 )
-def test_what_acts_is_spelt_out(text: str, shown: str) -> None:
+def test_control_characters_are_escaped(text: str, shown: str) -> None:
     assert printable(text) == shown
 
 
@@ -51,7 +51,7 @@ def test_a_terminal_of_another_alphabet_gets_what_it_can_show(monkeypatch: pytes
     assert raw.getvalue() == b"W\\xfcrfel\n"
 
 
-def test_a_full_disk_behind_the_output_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_behind_the_output_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     with open("/dev/full", "w") as full:  # noqa: PTH123 - a device, not a path of ours
         monkeypatch.setattr(sys, "stdout", full)
         with pytest.raises(OutputError, match="No space left"):
@@ -59,7 +59,7 @@ def test_a_full_disk_behind_the_output_is_told(monkeypatch: pytest.MonkeyPatch) 
 
 
 @given(st.lists(st.tuples(st.text(), st.text(min_size=1)), min_size=1))
-def test_columns_stand_below_each_other_whatever_is_in_them(cells: list[tuple[str, str]]) -> None:
+def test_columns_are_aligned_for_any_content(cells: list[tuple[str, str]]) -> None:
     rows = aligned([("name", "|"), *((name, "|") for name, _ in cells)])
     assert len({display_width(row.rpartition("|")[0]) for row in rows}) == 1
     assert all(printable(row) == row for row in rows)

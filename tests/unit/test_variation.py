@@ -28,7 +28,7 @@ def cube_starts(count: int, **config: Any) -> NDArray[np.float64]:
     return np.array(starts)[:, :2]
 
 
-def test_a_range_of_the_user_wins_over_the_preset() -> None:
+def test_the_users_range_overrides_the_preset() -> None:
     merged = resolve("full", Ranges(speed=(0.9, 0.95)))
     assert merged.speed == (0.9, 0.95)
     assert merged.action_noise == PRESETS["full"].action_noise
@@ -89,7 +89,7 @@ def test_full_varies_everything_within_its_ranges_and_records_it() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("task", ["place_in_tray", "sort_by_color"])
-def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
+def test_distractors_are_never_in_a_tray(task: str) -> None:
     """Points around a distractor are outside the rectangle of every tray."""
     count = 0
     for index in range(60):
@@ -110,7 +110,7 @@ def test_distractors_do_not_stand_in_a_tray(task: str) -> None:
 
 
 @pytest.mark.slow
-def test_looks_do_not_touch_the_physics() -> None:
+def test_the_appearance_does_not_affect_the_physics() -> None:
     """A preset that changes only the appearance gives the same bits of state."""
     plain = run(episode(3))[1].final_state_digest
     looks = Ranges(

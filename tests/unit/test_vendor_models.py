@@ -154,7 +154,7 @@ def drawn(recording: Path, out: Path) -> dict[str, tuple[int, set[int]]]:
     return found
 
 
-def test_a_recorded_arm_is_drawn_with_its_meshes_as_long_as_they_are_there(package: Path, tmp_path: Path) -> None:
+def test_a_recorded_arm_is_drawn_with_its_meshes_while_they_exist(package: Path, tmp_path: Path) -> None:
     recording = record(tmp_path / "run", package / "urdf" / "vendor.urdf")
     found = drawn(recording, tmp_path / "a.rrd")
     for link, color in (("base", WHITE), ("tip", ORANGE)):
@@ -168,7 +168,7 @@ def test_a_recorded_arm_is_drawn_with_its_meshes_as_long_as_they_are_there(packa
     }
 
 
-def test_a_model_that_has_other_joints_by_now_is_not_drawn(package: Path, tmp_path: Path) -> None:
+def test_a_model_with_changed_joints_is_not_drawn(package: Path, tmp_path: Path) -> None:
     urdf = package / "urdf" / "vendor.urdf"
     recording = record(tmp_path / "run", urdf)
     urdf.write_text(urdf.read_text().replace("0 0 0.3", "0 0 0.4"))
@@ -188,7 +188,7 @@ def test_a_described_arm_is_drawn_with_its_meshes_where_ros_finds_them(
     assert {link: n for link, (n, _) in found.items()} == {"base": len(CORNERS), "tip": len(CORNERS)}
 
 
-def test_what_joints_lose_is_read_and_what_is_no_urdf_is_named(package: Path) -> None:
+def test_joint_losses_are_read_and_invalid_urdfs_are_named(package: Path) -> None:
     text = (package / "urdf" / "vendor.urdf").read_text()
     assert read_dynamics(text) == {"turn": (10.0, 1.0)}
     with pytest.raises(ValueError, match="'turn' is -1; set it to 0 or more"):

@@ -50,7 +50,7 @@ thread 'main' panicked at 'index out of bounds'
         ("error: the port is taken\n", "ended by itself: error: the port is taken", False),
     ],
 )
-def test_a_driver_is_missed_only_when_the_viewer_says_so(said: str, words: str, is_driver: bool) -> None:
+def test_a_missing_driver_is_reported_only_by_the_viewers_message(said: str, words: str, is_driver: bool) -> None:
     error = why_it_ended(said)
     assert isinstance(error, DemorecError)
     assert words in str(error)

@@ -59,7 +59,7 @@ def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> No
     assert np.abs(at_rest[:7]).max() > 10
 
 
-def test_the_force_torque_sensor_does_not_touch_the_physics(world: World, scene: Scene) -> None:
+def test_the_force_torque_sensor_does_not_affect_the_physics(world: World, scene: Scene) -> None:
     def digest_after(sensor: bool) -> tuple[str, bool]:
         world.reset(scene)
         hand = world.arm.links[PANDA.hand_link]
@@ -76,7 +76,7 @@ def test_the_force_torque_sensor_does_not_touch_the_physics(world: World, scene:
     assert (with_sensor[1], without[1]) == (True, False)
 
 
-def test_the_wrench_grows_by_the_weight_of_what_is_lifted() -> None:
+def test_the_wrench_grows_by_the_weight_of_the_lifted_object() -> None:
     prepared = episode(0, variation="none")
     frames, outcome = run(prepared)
     assert outcome.success
@@ -86,7 +86,7 @@ def test_the_wrench_grows_by_the_weight_of_what_is_lifted() -> None:
     assert abs((free - held) - 9.81 * prepared.info.simulated.scene.body("red_cube").mass) < 0.15
 
 
-def test_a_body_whose_centre_of_mass_is_off_its_origin_is_where_the_scene_says(world: World, scene: Scene) -> None:
+def test_a_body_with_an_offset_centre_of_mass_has_the_scenes_pose(world: World, scene: Scene) -> None:
     pose = Pose.from_yaw([0.5, 0.3, 0.4], 0.8)
     duck = Body(
         name="duck",
