@@ -36,7 +36,7 @@ MAX_EPISODES_WITH_CAMERAS = 10
 
 @dataclass(frozen=True, kw_only=True)
 class Planted:
-    """A fault in a base, and whether it was found; `said` are the checks that said something."""
+    """A fault in a base, and whether it was found; `said` are the checks that reported something."""
 
     base: str
     fault: str

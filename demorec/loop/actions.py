@@ -43,7 +43,7 @@ class ActionDecoder:
     An unreachable pose keeps the last joint targets.
 
     Args:
-        world: At the episode's start.
+        world: World at the episode's start.
         kind: Meaning of the actions (`demorec.episode.features.action_vectors`).
         is_limited: True for a policy's actions: each command is clamped to the joint limits in position and velocity
             (from the last command) and to the gripper's opening, the elbow is pulled towards the expert's posture, and

@@ -126,7 +126,7 @@ def test_the_home_folder_is_never_a_target(place: Path, capsys: pytest.CaptureFi
 
 @pytest.mark.parametrize("target", ["mixed", "repository", "thesis", "thesis.tex", "noted"])
 def test_append_keeps_existing_files_or_refuses(place: Path, target: str) -> None:
-    """Third-party files are replaced when appending; where that is impossible, and in a repository, nothing changes."""
+    """Foreign files are kept when appending; where that is impossible, and in a repository, nothing is appended."""
     before = files_of(place)
     other = make_run(place.parent / "other", (6,), cameras=("front",), seed=1)
     code = exit_code("export", "lerobot", other, "--out", place / target, "--append", "--no-verify")

@@ -1,4 +1,4 @@
-"""Subtasks spoken in a bag become the language columns of a dataset, row by row, with nothing added."""
+"""Subtasks recorded in a bag become the language columns of a dataset, row by row, with nothing added."""
 
 from __future__ import annotations
 

@@ -57,7 +57,7 @@ def test_own_cameras_and_looks_give_the_recorded_images_again(filmed: Path, tmp_
 
 
 def test_calibration_errors_survive_a_second_rendering(tmp_path: Path) -> None:
-    """The second calibration error is independent of the seed; as recorded, it leads to the camera's true pose."""
+    """The error of a rendering does not follow from the seed; the recorded error leads to the camera's true pose."""
     source = simulate(tmp_path / "e.mcap", seed=2, cameras=("front",), width=64, height=64, variation="full")
     report = rerender(source, tmp_path / "again.mcap", RerenderOptions())
     assert (report.compared, report.differing) == (("front",), {})

@@ -20,7 +20,7 @@ from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 
 NUM_EPISODES = 4
-"""Total attempts; with two at a time the executor is asked for its capacity about thirty times."""
+"""Eight attempts in total; with two at a time the executor is asked for its capacity about thirty times."""
 MOMENTS = [[*range(0, 12, 2), 44], pytest.param(range(45), marks=[pytest.mark.slow, pytest.mark.long])]
 InFlight = Literal["lost", "stuck", "finished"]
 

@@ -38,12 +38,12 @@ class Note:
     """A message before it is written.
 
     Attributes:
-        topic, type: Of it.
-        log_ns: When it is recorded.
-        header_ns: In its header.
-        body: Fields of it; the header is made when it is written.
-        frame_id: In its header.
-        data: In place of a body: the message's bytes.
+        topic, type: Topic and type of the message.
+        log_ns: Recording time.
+        header_ns: Time in its header.
+        body: Its fields; the header is made when it is written.
+        frame_id: Frame in its header.
+        data: Bytes of the message, in place of a body.
     """
 
     topic: str

@@ -1,4 +1,4 @@
-"""The encoder: its settings, its independence of the process's past, and that it releases its memory."""
+"""The encoder: its settings, its independence of the process's past, and its short delay."""
 
 from __future__ import annotations
 

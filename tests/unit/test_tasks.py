@@ -142,7 +142,7 @@ def test_a_deliberate_miss_is_flagged_and_corrected() -> None:
     ],
 )
 def test_a_deliberate_miss_touches_nothing(robot: str, task: str, index: int, offset: float) -> None:
-    """Many layouts with bodies of all sizes: no finger lands on one, and no opening finger pushes one."""
+    """At 1.5 times the speed and with bodies of all sizes, no finger lands on one or pushes one on opening."""
     prepared = episode(index, robot=robot, task=task)
     side = 1.0 if index % 2 == 0 else -1.0
     frames, outcome = run(behave(prepared, speed=1.5, miss_x=0.03 * side, miss_y=0.012, grasp_offset=offset))

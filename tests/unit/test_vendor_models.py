@@ -21,7 +21,7 @@ from demorec.view.sources import find_episodes
 
 WHITE, ORANGE = (242, 242, 242, 255), (255, 128, 0, 255)
 BOX_CORNERS = 24
-"""Colours of a box, with flat shading."""
+"""Vertices of a box with flat shading: three at each corner."""
 CORNERS = [(0, 0, 0), (0.1, 0, 0), (0, 0.2, 0), (0, 0, 0.3)]
 FACES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
 COLLADA = """<?xml version="1.0"?>

@@ -73,7 +73,7 @@ class VideoFile:
     """The encoded images of an mp4 file.
 
     Attributes:
-        path: Of the file.
+        path: Path of the file.
         offsets, sizes, is_keyframe: (N,) of its images, in storage order.
         frames: (N,) int64, number of the frame in which each is shown.
         order: (N,) indices that sort `frames`.

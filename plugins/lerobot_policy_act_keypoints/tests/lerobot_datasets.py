@@ -41,7 +41,7 @@ def write_by_lerobot(
         lengths: Frames of each episode.
         stored_as: "video" or "image": how images are kept.
         depth: Whether there is a depth camera, too.
-        arguments: Of `LeRobotDataset.create`.
+        arguments: Further arguments of `LeRobotDataset.create`.
     """
     with _ordinary_scheduling():
         return _write(root, lengths, stored_as=stored_as, depth=depth, **arguments)
