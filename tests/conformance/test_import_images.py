@@ -1,6 +1,6 @@
 """Images in bags of other recorders, by `rosbags` and `mcap`: none is lost, and only faulty bags give findings.
 
-Timestamps are derived from exact ticks and rounded like those of drivers. The image of each row is read from the recording.
+Timestamps are derived from exact ticks and rounded like those of drivers; rows' images are read from the recording.
 """
 
 from __future__ import annotations
