@@ -266,7 +266,7 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
             *(("problem", problem) for problem in problems[:_MOST_PROBLEMS]),
         ]
         if len(problems) > _MOST_PROBLEMS:
-            facts.append(("problems", f"{len(problems)} in all; demorec check says more"))
+            facts.append(("problems", f"{len(problems)} in all; demorec check reports more"))
         rows = role_lines.feature_rows(path, info, roles)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error

@@ -1,1 +1,1 @@
-"""What goes beyond making, recording, playing back and exporting: one folder each, which can be deleted."""
+"""Abilities beyond making, recording, playing back and exporting: one folder each, which can be deleted."""

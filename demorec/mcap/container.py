@@ -148,7 +148,7 @@ class Container:
         found, content_length = RECORD_HEAD.unpack_from(data)
         if found != opcode or content_length != length - RECORD_HEAD.size:
             raise RecordingError(
-                f"The recording is damaged: no {opcode.name.capitalize()} where its index says: {self.path}"
+                f"The recording is damaged: no {opcode.name.capitalize()} at the place in its index: {self.path}"
             )
         return memoryview(data)[RECORD_HEAD.size :]
 

@@ -15,7 +15,7 @@ LIMIT_TOLERANCE = 1e-4
 """Maximum excess of a spec's position limit over the URDF's, rad or m: both are rounded."""
 _PER_ARM_JOINT = ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit")
 _MAX_NAMES = 30
-_LINKAGES = 'docs/robots.md, "Grippers with linkages", says what to do'
+_LINKAGES = 'docs/robots.md, "Grippers with linkages", describes the remedy'
 
 
 def checked_urdf(spec: RobotSpec, *, scale: float = 1.0) -> Urdf:

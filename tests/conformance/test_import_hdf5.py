@@ -318,7 +318,7 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((3, 7)))),
         "demo_1/obs/agentview_image has 5 rows, other datasets of the episode have 3",
     ),
-    "num_samples": (_attribute("data/demo_1", "num_samples", 9), "num_samples says 9"),
+    "num_samples": (_attribute("data/demo_1", "num_samples", 9), "num_samples is 9"),
     "nan": (_set("data/demo_1/obs/object", 3, float("nan")), "data/demo_1/obs/object is nan in row 3 (object_0)"),
     "infinite": (_set("data/demo_10/actions", 0, float("inf")), "data/demo_10/actions is inf in row 0"),
     "texts": (_replaced("actions", lambda group, name: group.__setitem__(name, ["a"] * 5)), "it holds objects"),
@@ -353,7 +353,7 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "huge rate": (
         _attribute("data", "env_args", '{"env_kwargs": {"control_freq": 1' + "0" * 400 + "}}"), "inf rows a second"
     ),
-    "text of a number": (_attribute("data/demo_1", "num_samples", "5"), "num_samples says '5'"),
+    "text of a number": (_attribute("data/demo_1", "num_samples", "5"), "num_samples is '5'"),
     "mask": (_without_masked, "demo_7"),
 }  # fmt: skip
 

@@ -59,7 +59,7 @@ def test_discarded_takes_are_not_imported(
     told = capsys.readouterr().out
     assert _begins(tmp_path / "run") == kept
     lines = [line.strip() for line in told.splitlines() if "no episode" in line]
-    assert lines == [f"no episode from {place} s: its marker says 'discard'" for place in left_out]
+    assert lines == [f"no episode from {place} s: its marker is 'discard'" for place in left_out]
     dropped = f", {len(left_out)} dropped" if left_out else ""
     assert f"{len(kept)} episode{'s' * (len(kept) > 1)}, " in told
     assert f" frames{dropped}: " in told
@@ -72,7 +72,7 @@ def test_an_unknown_marker_is_refused(tmp_path: Path, capsys: pytest.CaptureFixt
     out, err = capsys.readouterr()
     assert out == ""
     assert err.count("\n") == 1
-    assert "Markers of /episode say 'abort', 'redo\\x1b[2J', which the mapping does not know" in err
+    assert "The mapping does not list these markers of /episode: 'abort', 'redo\\x1b[2J'; put each" in err
     assert "episodes.discard" in err
     assert "episodes.ignore" in err
     assert not list((tmp_path / "run").glob("episodes/*"))

@@ -89,8 +89,8 @@ def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequenc
             features[name] = found
         elif (feature.dtype, math.prod(feature.shape)) != (found.dtype, math.prod(found.shape)):
             changes.append(
-                f"{name} is {found.dtype} of shape {found.shape} in the rows; info.json says {feature.dtype} of shape "
-                f"{feature.shape}."
+                f"{name} is {found.dtype} of shape {found.shape} in the rows; info.json states {feature.dtype} of "
+                f"shape {feature.shape}."
             )
             features[name] = DatasetFeature.from_json(
                 {**feature.to_json(), "dtype": found.dtype, "shape": list(found.shape)}
@@ -161,10 +161,10 @@ def repaired_rate(info: DatasetInfo, table: Path, videos: Sequence[Path]) -> Rep
         return info, []  # then the timestamps are wrong
     if shown is not None and abs(shown * step - 1) > _MAX_RATE_ERROR:
         raise ExportError(
-            f"The rate is ambiguous: info.json says {info.fps} frames per second, the timestamps {1 / step:.4g}, the "
+            f"The rate is ambiguous: info.json states {info.fps} frames per second, the timestamps {1 / step:.4g}, the "
             f"videos {shown:.4g}. Correct fps in meta/info.json: {table}"
         )
-    return replace(info, fps=rate), [f"fps is {rate}, by the timestamps; info.json says {info.fps}."]
+    return replace(info, fps=rate), [f"fps is {rate}, by the timestamps; info.json states {info.fps}."]
 
 
 def _video_rate(videos: Sequence[Path]) -> float | None:
@@ -187,13 +187,15 @@ def repaired_cameras(folder: LeRobotFolder, images: Mapping[str, Sequence[tuple[
         shape = feature.shape
         if size not in (shape[:2], shape[1:]):
             shape = (*size, 1 if feature.is_depth else 3)
-            changes.append(f"{key} has images of {size[1]}x{size[0]} pixels; info.json says the shape {feature.shape}.")
+            changes.append(
+                f"{key} has images of {size[1]}x{size[0]} pixels; info.json states the shape {feature.shape}."
+            )
         info = dict(feature.info or {})
         with suppress(ExportError):  # for a codec that recordings do not support, nothing more is known
             told = file.stream_info()
             wrong = [name for name in _CODING if info.get(name) not in (None, told[name])]
             for name in wrong:
-                changes.append(f"{name} of {key} is {told[name]}; info.json says {info[name]}.")
+                changes.append(f"{name} of {key} is {told[name]}; info.json states {info[name]}.")
                 info[name] = told[name]
         features[key] = replace(feature, shape=shape, info=info or None)
     return replace(folder.info, features=features), changes

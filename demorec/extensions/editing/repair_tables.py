@@ -110,7 +110,7 @@ def _tasks(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
             yield "The table of tasks has the text as its index, where LeRobot looks for it."
     total = stated.get("total_tasks")
     if total != len(numbers):
-        yield f"info.json says total_tasks {total}; the table of tasks has {len(numbers)}."
+        yield f"info.json states total_tasks {total}; the table of tasks has {len(numbers)}."
 
 
 def _totals(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
@@ -120,11 +120,11 @@ def _totals(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
     }
     for name, count in found.items():
         if stated.get(name) != count:
-            yield f"info.json says {name} {stated.get(name)}; the rows have {count}."
+            yield f"info.json states {name} {stated.get(name)}; the rows have {count}."
     for name in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
         usual = getattr(folder.info, name)
         if not folder.info.is_old and stated.get(name) != usual:
-            yield f"info.json says {name} {stated.get(name)}; it is {usual} now."
+            yield f"info.json states {name} {stated.get(name)}; it is {usual} now."
     if not has_possible_splits(stated.get("splits"), len(folder.listed)):
         yield f"splits of info.json are one, train, of all {len(folder.listed)} episodes."
 

@@ -89,7 +89,7 @@ def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
         years = float(np.median([np.median(line.skews_ns) for line in known])) / NS / _YEAR_S
         text = (
             f"all headers are {abs(years):.1f} years {'behind' if years > 0 else 'ahead of'} the times of recording, "
-            "and rows go by them: simulated time, or a clock that was never set"
+            "and rows follow them: simulated time, or a clock that was never set"
         )
         yield Finding(kind=NOTE, stream="", text=text)
 
@@ -211,7 +211,7 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
         steps = np.diff(rows.table.time_ns)
         rate = NS / float(steps[steps <= LOST * np.median(steps)].mean())
         if abs(rate - fps) > RATE * fps:
-            text = f"rows follow its messages, {rate:.1f} a second, fps says {fps}"
+            text = f"rows follow its messages, {rate:.1f} a second, but fps is {fps}"
             yield Finding(kind="fps", stream=rows.follows, text=text)
             break
     for name in lines.mapping.cameras if episodes else ():

@@ -157,7 +157,7 @@ class _Stored:
         stated = file.attribute(place, "num_samples")
         if stated is not None and stated != num_rows:
             raise FieldError(
-                f"{place or 'the episode'} has {num_rows} rows, but its num_samples says {reprlib.repr(stated)}"
+                f"{place or 'the episode'} has {num_rows} rows, but its num_samples is {reprlib.repr(stated)}"
             )
         files = [images for images in cameras.values() if len(images.shape) == 2]
         lengths = None

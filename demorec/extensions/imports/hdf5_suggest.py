@@ -238,10 +238,10 @@ def _task(contents: _Contents, path: Path) -> list[str]:
 def _clock(contents: _Contents, layout: _Layout) -> list[str]:
     rate = stated_rate(contents.file, contents.place)
     if rate is not None:
-        return [f"# fps = {rate:g}  # as the file says"]
+        return [f"# fps = {rate:g}  # from the file"]
     if layout.is_aloha:
-        return [f"fps = {_ALOHA_FPS}  # of ALOHA's recorders (DT = 0.02); the file does not say it"]
-    return ["# fps = 20  # rows a second, which the file does not say: look it up"]
+        return [f"fps = {_ALOHA_FPS}  # of ALOHA's recorders (DT = 0.02); the file does not record it"]
+    return ["# fps = 20  # rows a second, which the file does not record: look it up"]
 
 
 def _episodes(contents: _Contents, places: Sequence[str], layout: _Layout) -> Iterator[str]:

@@ -93,7 +93,7 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
         for window in windows(lines):
             episode, reason = None, ""
             if window.discarded:
-                reason = f"its marker says {window.discarded!r}"
+                reason = f"its marker is {window.discarded!r}"
             else:
                 try:
                     rows = lines.rows(window)
@@ -181,14 +181,13 @@ def windows(lines: Timelines) -> list[Window]:
     markers = lines.streams.texts[episodes.topic]
     if unknown := _unknown_words(markers, lines.mapping):
         raise BagError(
-            f"Markers of {episodes.topic} say {unknown}, which the mapping "
-            f"does not know: put it into episodes.discard (the episode is left out) or episodes.ignore, or set start, "
-            f"stop, success or failure"
+            f"The mapping does not list these markers of {episodes.topic}: {unknown}; put each into episodes.discard "
+            "(the episode is left out) or episodes.ignore, or set start, stop, success or failure"
         )
     if found := _between_markers(markers, episodes):
         return found
     raise BagError(
-        f"No marker of {episodes.topic} says {episodes.start!r} and then {episodes.stop!r}, so there is no episode"
+        f"No marker {episodes.start!r} of {episodes.topic} is followed by {episodes.stop!r}, so there is no episode"
     )
 
 

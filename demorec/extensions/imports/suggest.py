@@ -245,7 +245,7 @@ def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
     text = f"# text = {quoted('what the robot was asked to do')}  # the same for all bags"
     if name := task_in_name(bag.name):
         return [f"file_name = true  # the name of each bag is its task, here {quoted(name)}; or write:", text]
-    return ["# No topic and no name of a file says what the robot was asked to do. Write it here:", text]
+    return ["# Neither a topic nor a file name describes the task. Write it here:", text]
 
 
 def _task_topics(topics: Mapping[str, _Topic]) -> list[str]:
@@ -256,7 +256,7 @@ def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
     """Texts that may describe the robot's current subtask."""
     others = {*_task_topics(topics)[:1], *(name for name in topics if name.endswith("robot_description"))}
     for name in (name for name in sorted(topics) if name not in others and topics[name].is_text):
-        yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts say what the robot does")
+        yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts describe the robot's actions")
 
 
 def _set_stamps(topics: Mapping[str, _Topic], mapped: Collection[str]) -> bool:

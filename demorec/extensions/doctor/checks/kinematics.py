@@ -70,7 +70,7 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="broken",
             value="w first",
-            message="the quaternion of the EE pose has its scalar first, not last as its names say",
+            message="the quaternion of the EE pose has its scalar first, not last as its names imply",
         )
         return
     bad = {number: error for number, error in errors.items() if error > KNOWN_ERROR_M}

@@ -147,7 +147,7 @@ def _changes(plan: Plan) -> list[str]:
         for name, dtype in mistyped_features(source).items():
             claimed = source.info.features[name].dtype
             lines.append(
-                f"info.json says {claimed} of {name}, which the data files hold as {dtype}: corrected in the result."
+                f"info.json states {claimed} of {name}, which the data files hold as {dtype}: corrected in the result."
             )
     if new := sum(bool(cut.task) for cut in plan.cuts):
         lines.append(f"New instruction: {new} of {counted(len(plan.cuts), 'episode')}")
