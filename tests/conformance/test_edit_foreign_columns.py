@@ -22,7 +22,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from support.commands import exit_code
-from support.drawn_datasets import STATE, DrawnDataset, write_drawn
+from support.drawn_datasets import STATE, DrawnDataset, encoded, write_drawn
 from support.export import recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
@@ -337,3 +337,29 @@ def test_nothing_is_appended_to_a_table_of_episodes_with_other_columns(
     assert {path: path.read_bytes() for path in first.rglob("*") if path.is_file()} == before
     assert exit_code("dataset", "select", first, "--where", "num_frames > 0", "--out", tmp_path / "new") == 0
     assert exit_code(*words, tmp_path / "new") == 0
+
+
+def test_a_file_with_too_few_images_is_named_for_all_of_its_episodes(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As in AgiBot-World#149: images of one episode are missing, and those of all later ones are early."""
+    source = write_drawn(tmp_path / "set", replace(PLAIN, version="v3.0", lengths=(5, 6, 4)))
+    (path,) = source.rglob("*.mp4")
+    assert exit_code("info", source) == 0
+    assert "images for" not in capsys.readouterr().out
+    path.write_bytes(encoded("h264", 13, 3, False))
+    told = (
+        f"{path.relative_to(source).as_posix()} has 13 images for 15 rows of episodes 0 to 2: after the first missing"
+    )
+    for words, code in (
+        (["info", source], 0),
+        (["check", source], 1),
+        (["view", source, "--episodes", "1", "--save", tmp_path / "x.rrd"], 0),
+        (["import", "lerobot", source, "--episodes", "1", "--out", tmp_path / "run"], 0),
+        (["dataset", "drop", source, "--episodes", "2", "--out", tmp_path / "new"], 0),
+    ):
+        assert exit_code(*words) == code, words
+        printed = capsys.readouterr()
+        assert told in printed.out + printed.err, words
+    assert exit_code("dataset", "repair", source, "--out", tmp_path / "repaired") == 1
+    assert "13 images for 15 rows" in capsys.readouterr().err

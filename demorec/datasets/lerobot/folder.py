@@ -122,7 +122,29 @@ class LeRobotFolder:
             problem = self._listed_and_problem[1]
         absent = ", ".join(self.info.unlisted)
         missing = f"The rows have no {absent}, and are taken in their order ({REPAIR} adds it)." if absent else ""
-        return tuple(note for note in (problem, missing) if note)
+        return (*(note for note in (problem, missing) if note), *self._short_videos)
+
+    @cached_property
+    def _short_videos(self) -> tuple[str, ...]:
+        """Sentences about video files of several episodes with fewer images than rows."""
+        from demorec.datasets.lerobot.mp4_index import mp4_index
+
+        notes: list[str] = []
+        for key in self.info.video_keys:
+            files: dict[Path, list[EpisodePlace]] = {}
+            for place in self.listed:
+                files.setdefault(place.videos[key][0], []).append(place)
+            for path, places in files.items():
+                num_rows = max(place.videos[key][1] + place.length for place in places)
+                with suppress(ExportError):  # an unreadable file is reported for its own episodes
+                    if len(places) > 1 and (num_images := len(mp4_index(path)[0])) < num_rows:
+                        numbers = [place.episode_index for place in places]
+                        notes.append(
+                            f"{path.relative_to(self.root).as_posix()} has {num_images} images for {num_rows} rows of "
+                            f"episodes {min(numbers)} to {max(numbers)}: after the first missing image, rows show "
+                            "images of other moments."
+                        )
+        return tuple(notes)
 
     @cached_property
     def _listed_and_problem(self) -> tuple[tuple[EpisodePlace, ...], str]:
