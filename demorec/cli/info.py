@@ -293,7 +293,9 @@ def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
         if problems:
             return facts, problems
         if (counts := attempt_counts(folder)) is not None:
-            facts.insert(0, ("successes", f"{counts[0]}, of {counts[1]} attempts"))
+            successes, unknown, attempts = counts
+            shown = f", {unknown} unknown" if unknown else ""
+            facts.insert(0, ("successes", f"{successes}, of {attempts} attempts{shown}"))
         if not without_digest(folder.info):
             facts.append(("digest", dataset_digest(path)))
     except ExportError as error:

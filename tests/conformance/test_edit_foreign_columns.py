@@ -28,6 +28,7 @@ from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
 from demorec.datasets.lerobot.episode_table import are_on_grid
 from demorec.mcap import Recording
+from demorec.view.sources import find_episodes
 
 TEXTS = ("open the drawer", "close the drawer", "valid", "invalid", "push it")
 LENGTH, COUNT = 8, 4
@@ -136,6 +137,18 @@ def test_measured_timestamps_are_imported_as_stamps(
         with Recording(path) as recording:
             assert recording.time_ns.tolist() == np.rint(stamps.astype(np.float64) * 1e9).astype(np.int64).tolist()
     assert exit_code("view", source, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
+
+
+@pytest.mark.slow
+def test_measured_timestamps_are_shown_as_they_are(tmp_path: Path) -> None:
+    times = measured(0.03, 1.7)
+    source = foreign(tmp_path / "d", {"timestamp": pa.array(times)})
+    assert exit_code("view", source, "--save", tmp_path / "x.rrd") == 0
+    for number, playback in enumerate(find_episodes([source])):
+        with playback.open() as episode:
+            shown = episode.data.time_ns / 1e9
+        own = times[number * LENGTH : (number + 1) * LENGTH].astype(float)
+        np.testing.assert_allclose(shown - shown[0], own - own[0], atol=1e-8)
 
 
 @pytest.mark.parametrize("begin_s", [0.0, 10.0, 1500.0, 3000.0])

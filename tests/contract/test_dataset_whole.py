@@ -6,6 +6,7 @@ One damaged file affects only its own episode.
 from __future__ import annotations
 
 import shutil
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 
@@ -147,6 +148,20 @@ def test_an_old_dataset_without_its_table_is_found_by_the_rows(
     assert "found by the episode_index" in capsys.readouterr().err
     tables = [pq.read_table(tmp_path / f"{root.name}-new" / "data") for root in roots]
     assert tables[0].equals(tables[1])
+
+
+def test_a_check_of_a_dataset_without_its_table_warns_of_nothing_else(
+    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A recording that was never finalized (leLab#84): no warning of NumPy."""
+    root = Path(shutil.copytree(apart, tmp_path / "d"))
+    without_table(root)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert exit_code("check", root) == 1
+    printed = capsys.readouterr()
+    assert "found by the episode_index of the rows" in printed.out
+    assert "Warning" not in printed.out + printed.err
 
 
 def test_ambiguous_rows_are_refused(exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from pathlib import Path
 
@@ -12,8 +13,18 @@ from demorec.core.tables import ROBOTS
 from demorec.extensions.remake.demonstration import ReplayOptions, open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.mcap import Recording
+from demorec.tasks.success import at_least, at_most, gripper_open_check, placement_checks
+from demorec.testing import TaskContract
 
 EXAMPLE = Path(__file__).parents[2] / "docs" / "tasks.md"
+
+
+def test_the_page_names_every_argument_of_the_contract_and_of_checks() -> None:
+    page = EXAMPLE.read_text()
+    assert all(f"`{name}`" in page for name in TaskContract.__annotations__ if name != "task")
+    for function in (at_most, at_least, placement_checks, gripper_open_check):
+        assert f"`{function.__name__}({', '.join(inspect.signature(function).parameters)})`" in page
+    assert all(f"`{name}(" in page for name in ("touches_robot", "touches", "grip_force", "finger_forces"))
 
 
 @pytest.mark.slow

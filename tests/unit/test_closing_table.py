@@ -13,12 +13,12 @@ from support.check import simulate_run
 from support.docs import ROOT
 
 from demorec.cli import generate_report
-from demorec.cli.generate_report import has_environment_state, next_commands
+from demorec.cli.generate_report import check_run, has_environment_state, next_commands
 from demorec.core.config import GenerateConfig
 from demorec.generate.contents import set_aside
 from demorec.generate.options import RunResult
 from demorec.mcap import Recording
-from demorec.runs.run_file import Generation, RunFile, load_run_file
+from demorec.runs.run_file import Generation, RunFile, load_run_file, save_run_file
 
 
 def result_of(folder: Path) -> RunResult:
@@ -117,3 +117,15 @@ def test_files_set_aside_are_described(tmp_path: Path, names: Sequence[str], wor
         file.parent.mkdir(parents=True, exist_ok=True)
         file.write_bytes(b"" if "000005" in name else b"something")
     assert set_aside(tmp_path) == words
+
+
+@pytest.mark.slow
+def test_the_checks_that_warned_are_named(tmp_path: Path) -> None:
+    folder = simulate_run(tmp_path / "run", 1, seed=6)
+    run = load_run_file(folder)
+    complete = RunResult(folder=folder, run=run, made=(), interrupted=False)
+    assert check_run(complete, progress=lambda done, total: None) == ("none failed, 0 warnings", [])
+    save_run_file(run.with_generation(num_episodes=2), folder)
+    summary, failures = check_run(complete, progress=lambda done, total: None)
+    assert summary == "none failed, 1 warning (run_complete)"
+    assert failures == []

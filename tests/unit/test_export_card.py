@@ -8,6 +8,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 import pytest
 from support import bag_mappings, bags
+from support.commands import exit_code
 from support.export import export, make_run
 from support.external import TOP, make_external, write_external
 from support.mcap import rewritten
@@ -57,7 +58,9 @@ def test_foreign_text_has_no_effect_in_a_card(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["bag", "recorder"])
-def test_a_card_claims_nothing_of_imported_data(kind: str, tmp_path: Path) -> None:
+def test_a_card_and_info_claim_nothing_of_imported_data(
+    kind: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     if kind == "bag":
         bag = bags.write_mcap(bags.in_order(bags.so101(1.6)), tmp_path / "stack.mcap")
         derived = bag_mappings.SO101.replace(
@@ -77,5 +80,7 @@ def test_a_card_claims_nothing_of_imported_data(kind: str, tmp_path: Path) -> No
     ):
         assert claim not in card
     assert kind == "recorder" or "| `action` | float32 | [6] | observation.state of the next frame |" in card
+    assert exit_code("info", tmp_path / "d") == 0
+    assert ("successes" in capsys.readouterr().out) == (kind == "recorder")  # a bag has no outcome
     export(source, tmp_path / "licensed", license="cc-by-4.0")
     assert "license: cc-by-4.0" in (tmp_path / "licensed" / "README.md").read_text()

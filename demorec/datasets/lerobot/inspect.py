@@ -14,8 +14,8 @@ from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_di
 from demorec.datasets.lerobot.mp4_index import check_video
 
 
-def attempt_counts(folder: LeRobotFolder) -> tuple[int, int] | None:
-    """Count (successful episodes, attempts made); None for a dataset that demorec did not write.
+def attempt_counts(folder: LeRobotFolder) -> tuple[int, int, int] | None:
+    """Count (successful episodes, episodes without a known outcome, attempts made); None if no outcome is known.
 
     Raises:
         ExportError: Its tables are damaged.
@@ -23,8 +23,11 @@ def attempt_counts(folder: LeRobotFolder) -> tuple[int, int] | None:
     attempts = folder.sidecar_tables("attempts")
     if not attempts:
         return None
-    successes = sum(row["success"] is True for row in folder.sidecar(["success"]))
-    return successes, sum(open_table(file).metadata.num_rows for file in attempts)
+    outcomes = [row["success"] for row in folder.sidecar(["success"])]
+    if all(outcome is None for outcome in outcomes):
+        return None
+    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts)
+    return outcomes.count(True), outcomes.count(None), num_attempts
 
 
 def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
