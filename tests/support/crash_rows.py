@@ -211,9 +211,9 @@ ROWS = {
     ),
     "generate again": Row(
         call="generate --config SOURCES/e.mcap --workers 1 --no-check --no-export --out new",
-        targets=("new/episodes/*.mcap",),
+        targets=("new/failed/*.mcap",),  # the source is a failure
         needs=(SIMULATED,),
-        surprise="new/episodes/episode_000000.mcap",
+        surprise="new/failed/episode_000000.attempt_0.mcap",
         resumes=True,
     ),
     "evaluate": Row(

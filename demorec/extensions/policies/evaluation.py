@@ -122,8 +122,9 @@ def open_evaluation(settings: Settings, out: Path, *, overwrite: bool) -> Iterat
 
 
 def _check_place(out: Path, *, overwrite: bool) -> None:
-    """Raise ConfigError for a folder with content other than an evaluation."""
-    is_free = not out.exists() or (out.is_dir() and {path.name for path in out.iterdir()} <= {LOCK_NAME})
+    """Raise ConfigError for a folder with content other than an evaluation, or one that was killed as it began."""
+    begun = {LOCK_NAME, f"{EVALUATION_NAME}.part"}
+    is_free = not out.exists() or (out.is_dir() and {path.name for path in out.iterdir()} <= begun)
     if not is_free and not (out / EVALUATION_NAME).is_file():
         raise ConfigError(f"The folder holds files that are not part of an evaluation, choose another --out: {out}")
     if overwrite and not is_free:
@@ -143,9 +144,9 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
             raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
         evaluation = with_rollouts(replace(evaluation, settings=settings), kept)
+    save_evaluation(evaluation, out)  # first, since it makes the folder an evaluation
     for place in (EPISODES, FAILED):
         make_folder(out / place)
-    save_evaluation(evaluation, out)
     return evaluation
 
 
