@@ -262,6 +262,20 @@ def test_a_clock_that_was_never_set(years: int, imports: Imports) -> None:
     assert "No findings." not in told
 
 
+@pytest.mark.parametrize("stamp", ["log", "header"])
+def test_messages_without_a_log_time_are_left_out_and_named(stamp: str, imports: Imports, tmp_path: Path) -> None:
+    notes = [note for note in real() if note.topic != GRIPPER]
+    number = next(place for place, note in enumerate(notes) if note.topic == STATE)
+    notes[number] = replace(notes[number], log_ns=0)
+    code, told, error = imports(notes, MAPPING.replace("fps = 30", f'fps = 30\nstamp = "{stamp}"'))
+    assert code == 0, error
+    assert ("1 of 200 messages have no log time and are left out" in told) == (stamp == "log")
+    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
+        table = recording.table()
+    assert table.num_frames >= 55
+    assert table.stamps["observation.state"].min() > bags.EPOCH_NS - bags.NS
+
+
 @pytest.mark.parametrize("size", [0.0, 5e-4])
 def test_a_bag_in_which_nothing_moves(size: float, imports: Imports) -> None:
     """A robot that was never switched on, with and without encoder noise."""

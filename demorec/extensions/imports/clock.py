@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.extensions.imports.bag import EPOCH_S
 from demorec.extensions.imports.mapping import CameraSource, Clock, Sampling
 from demorec.extensions.imports.streams import Stream
 
@@ -42,7 +43,7 @@ class Timeline:
         stream: The stream.
         times_ns: (M,) int64, strictly increasing.
         order: (M,) indices of the stream's messages. Excludes all but the first of equal times, messages without a
-        header time if others have one, and video before its first keyframe.
+        time if others have one, and video before its first keyframe.
         is_header: Whether times are header times.
         period_ns: Usual interval, 0 for fewer than two messages.
         is_regular: Whether intervals are similar; false for a stream that publishes only changes.
@@ -111,11 +112,12 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
     stamped = stream.header_ns > 0
     is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
-    if (not is_header or stamped.all()) and bool(np.all(times[1:] > times[:-1])):
+    is_known = stamped if is_header else ~without_log_time(stream.log_ns)
+    if is_known.all() and bool(np.all(times[1:] > times[:-1])):
         order: Int = np.arange(len(times))
         ordered = times
     else:
-        usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+        usable = np.flatnonzero(is_known)
         order = usable[np.argsort(times[usable], kind="stable")]
         ordered = times[order]
         is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
@@ -139,6 +141,12 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
         sample=sample,
         max_age_ns=MISSING - 1 if age_s >= 1e9 else round(age_s * NS),
     )
+
+
+def without_log_time(log_ns: Int) -> NDArray[np.bool_]:
+    """(N,) whether each message was recorded without a time: 0, if others are not in simulated time from 0."""
+    is_dated = bool(len(log_ns)) and float(np.median(log_ns)) > EPOCH_S * NS
+    return np.asarray((log_ns == 0) & is_dated)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.extensions.imports.clock import NS, SKEW_S, Int, Numbers, Timeline
+from demorec.extensions.imports.clock import NS, SKEW_S, Int, Numbers, Timeline, without_log_time
 from demorec.extensions.imports.streams import NO_STAMP, Stream
 
 _JITTER = 0.25
@@ -65,6 +65,8 @@ def _message_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     stream = line.stream
     if stream.num_malformed:
         yield "malformed", f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
+    if not line.is_header and (untimed := int(without_log_time(stream.log_ns).sum())):
+        yield "unstamped", f"{untimed} of {len(stream)} messages have no log time and are left out"
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
     if unstamped and not line.is_log_asked:
         yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
