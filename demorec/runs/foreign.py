@@ -7,6 +7,7 @@ Each is a row `readers` of an extension (`demorec.core.extensions`). Every comma
 from __future__ import annotations
 
 import pkgutil
+import shlex
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -166,13 +167,13 @@ def _suggested(path: Path, form: SourceFormat, target: Path, tell: Tell) -> Path
     """Write the suggested mapping; ConfigError if it leaves a decision to the user."""
     doubts: list[str] = []
     target.write_text("\n".join(form.suggest(path, doubts.append)) + "\n", encoding="utf-8")
-    suggest = f"{form.command} {path} --suggest > mapping.toml"
+    suggest = f"{form.command} {shlex.quote(str(path))} --suggest > mapping.toml"
     try:
         if doubts:
             raise ConfigError(doubts[0])
         taken = pkgutil.resolve_name(form.reviewer)(target)
     except ConfigError as error:
-        reason = str(error).removesuffix(f": {target}")
+        reason = str(error).removesuffix(f": {target}").removesuffix(".")
         raise ConfigError(
             f"This is read by a mapping (--mapping FILE), and the suggested one leaves a decision to you: {reason}; "
             f"{suggest} writes it: {path}"

@@ -376,3 +376,59 @@ def test_a_file_with_too_few_images_is_named_for_all_of_its_episodes(
         assert told in printed.out + printed.err, words
     assert exit_code("dataset", "repair", source, "--out", tmp_path / "repaired") == 1
     assert "13 images for 15 rows" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("listed", "code"), [("valid", 0), ("push it", 1)])
+def test_the_table_of_episodes_may_list_the_tasks_of_annotations(listed: str, code: int, tmp_path: Path) -> None:
+    validity = pa.array(np.full(LENGTH * COUNT, TEXTS.index("valid")))
+    source = foreign(tmp_path / "set", {"annotation.human.validity": validity})
+    episodes = pq.read_table(source / EPISODES)
+    both = pa.array([sorted({task, listed}) for (task,) in episodes["tasks"].to_pylist()])
+    assert exit_code("check", source, "--only", "contradicting_counts") == 0
+    pq.write_table(episodes.drop_columns("tasks").append_column("tasks", both), source / EPISODES)
+    assert exit_code("check", source, "--only", "contradicting_counts") == code
+
+
+def test_features_missing_from_info_json_are_distinguished_from_missing_columns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_foreign(tmp_path / "set")
+    path = source / "meta/info.json"
+    info = json.loads(path.read_text())
+    for name in ("timestamp", "frame_index"):
+        del info["features"][name]
+    path.write_text(json.dumps(info))
+    pq.write_table(pq.read_table(source / DATA).drop_columns("frame_index"), source / DATA)
+    assert exit_code("info", source) == 0
+    printed = capsys.readouterr().out
+    assert "The rows have no frame_index, and are taken in their order" in printed
+    assert "meta/info.json does not list timestamp of the rows" in printed
+    assert exit_code("check", source, "--only", "table_schema") == 0  # LeRobot reads everything but frame_index
+
+
+def test_a_table_that_belongs_to_no_episode_is_one_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = write_foreign(tmp_path / "set")
+    data = source / DATA
+    pq.write_table(pq.read_table(data).append_column("weight", pa.array(np.zeros(16))), data)
+    raw = source / "data/chunk-001/file-000.parquet"
+    raw.parent.mkdir()
+    pq.write_table(pa.table({f"joint_{number}": [0.0, 1.0] for number in range(20)}), raw)
+    checks = ("unused_files", "table_schema", "contradicting_counts")
+    assert exit_code("check", source, "--only", *checks, "--json") == 1
+    report = json.loads(capsys.readouterr().out)
+    found = [(finding["check"], finding["severity"]) for finding in report["findings"]]
+    assert found == [("unused_files", "broken"), ("table_schema", "look")]
+    assert exit_code("dataset", "select", source, "--episodes", "0", "--out", tmp_path / "new") == 0
+    printed = capsys.readouterr().out
+    assert "Left out: weight (meta/info.json does not list this column of the data files)" in printed
+    assert not list((tmp_path / "new").rglob("chunk-001"))
+
+
+def test_tasks_as_categories_with_doubles_as_numbers_are_read(tmp_path: Path) -> None:
+    numbers = pa.array(np.repeat([4, 0, 1, 0], LENGTH).astype(float))
+    source = foreign(tmp_path / "set", {"task_index": numbers})
+    table = pa.table({"task": pa.array(TEXTS).dictionary_encode(), "task_index": np.arange(5.0)})
+    pq.write_table(table, source / TASKS)
+    assert exit_code("check", source, "--only", "table_schema", "contradicting_counts") == 0
+    assert exit_code("dataset", "select", source, "--episodes", "0,2", "--out", tmp_path / "new") == 0
+    assert said(tmp_path / "new", "task_index") == ["push it"] * LENGTH + ["close the drawer"] * LENGTH

@@ -159,7 +159,13 @@ def second_video(dataset: Path) -> None:
     shutil.copy(path, path.with_name("file-001.mp4"))
 
 
+def last_frames_as_ends(dataset: Path) -> None:
+    path = next(dataset.glob("meta/episodes/*/*.parquet"))
+    edit_parquet(path, f"videos/{CAMERA}/to_timestamp", lambda ends: [end - 1 / 30 for end in ends])
+
+
 WARNED: dict[str, tuple[Fault, str]] = {
+    "videos that end at their last frames": (last_frames_as_ends, "contradicting_counts"),
     "a video without an episode": (second_video, "unused_files"),
     "statistics of an unknown feature": (
         lambda dataset: edit_json(dataset / "meta/stats.json", lambda data: data.update(force=data["action"])),

@@ -181,6 +181,20 @@ def test_a_resting_encoder_flickers_by_a_tick(sound: Evidence) -> None:
     assert found(diagnose(replace(sound, episodes=episodes, cameras={})), "state_jumps") == set()
 
 
+@pytest.mark.parametrize("is_whole", [True, False])
+def test_a_fast_start_of_the_whole_arm_is_not_a_jump(is_whole: bool, sound: Evidence) -> None:
+    """The first joint moves within one frame, two others accelerate over five."""
+    ramp = np.cumsum([6.0, 20, 30, 20, 6])[:, None]
+
+    def start(state: Array, action: Array) -> tuple[Array, Array]:
+        state[-8:, 0] += 40
+        if is_whole:
+            state[-10:, 1:3] += np.vstack([ramp, np.repeat(ramp[-1:], 5, axis=0)])
+        return state, action
+
+    assert found(diagnose(spoilt(sound, start)), "state_jumps") == (set() if is_whole else {BAD})
+
+
 def test_a_copy_and_a_lone_instruction(sound: Evidence) -> None:
     twin = replace(sound.episodes[2], number=EPISODES)
     other = replace(sound.episodes[4], instruction="open the drawer")

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError
@@ -151,11 +150,7 @@ def read_tasks(root: Path) -> list[str]:
     table = read_table(path)
     # pandas names an index column without a name.
     column = next((name for name in ("task", "__index_level_0__") if name in table.column_names), None)
-    if (
-        column is None
-        or "task_index" not in table.column_names
-        or not pa.types.is_integer(table.schema.field("task_index").type)
-    ):
+    if column is None or "task_index" not in table.column_names:
         raise ExportError(f"The tasks' table has no task or no task_index: {path}")
     numbers, texts = table.column("task_index").to_pylist(), table.column(column).to_pylist()
     return _by_number(list(zip(numbers, texts, strict=True)), path)
@@ -165,6 +160,8 @@ def _by_number(rows: Sequence[tuple[object, object]], path: Path) -> list[str]:
     """List the tasks by number, with "" for missing numbers."""
     found: dict[int, str] = {}
     for number, task in rows:
+        if isinstance(number, float) and number.is_integer():
+            number = int(number)
         if not isinstance(number, int) or not 0 <= number < len(rows) + _MAX_TASK_GAPS:
             raise ExportError(f"The tasks' table has {reprlib.repr(number)} as task_index: {path}")
         found[number] = str(task)

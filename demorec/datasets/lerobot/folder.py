@@ -117,12 +117,17 @@ class LeRobotFolder:
     @property
     def notes(self) -> tuple[str, ...]:
         """Sentences about missing parts that the rows replace; empty if the rows cannot be read."""
-        problem = ""
-        with suppress(ExportError):
-            problem = self._listed_and_problem[1]
-        absent = ", ".join(self.info.unlisted)
+        try:
+            listed, problem = self._listed_and_problem
+            data = next((place.data for place in listed if place.data.exists()), None)
+            columns = AUTOMATIC_FEATURES if data is None else open_table(data).schema_arrow.names
+        except ExportError:
+            return ()
+        absent = ", ".join(name for name in AUTOMATIC_FEATURES if name not in columns)
         missing = f"The rows have no {absent}, and are taken in their order ({REPAIR} adds it)." if absent else ""
-        return (*(note for note in (problem, missing) if note), *self._short_videos)
+        names = ", ".join(name for name in self.info.unlisted if name in columns)
+        unlisted = f"{INFO_PATH} does not list {names} of the rows ({REPAIR} adds it)." if names else ""
+        return (*(note for note in (problem, missing, unlisted) if note), *self._short_videos)
 
     @cached_property
     def _short_videos(self) -> tuple[str, ...]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, Severity, check
 from demorec.datasets.lerobot.files import open_table, read_table, tables_in
@@ -123,11 +124,13 @@ def _wrong_indices(columns: Mapping[str, Any], number: int, start: int) -> list[
 
 
 def _wrong_task(folder: LeRobotFolder, tasks: tuple[str, ...], columns: Mapping[str, Any], number: int) -> Fault | None:
+    """Compare tasks; the table of episodes may also list those to which GR00T's annotations refer."""
     if "task_index" not in columns:
         return Fault(severity="broken", episode=number, message="its rows have no task_index")
-    used = {int(index) for index in columns["task_index"].reshape(-1)}
-    names = {folder.tasks[index] if 0 <= index < len(folder.tasks) else f"number {index}" for index in used}
-    if names == set(tasks):
+    names = _task_names(folder, columns["task_index"])
+    annotations = [values for name, values in columns.items() if name.startswith("annotation.")]
+    numbers = [values for values in annotations if values.dtype.kind in "iu"]
+    if names <= set(tasks) <= names.union(*(_task_names(folder, values) for values in numbers)):
         return None
     stated, found = (", ".join(map(repr, sorted(each))) for each in (tasks, names))
     return Fault(
@@ -137,9 +140,15 @@ def _wrong_task(folder: LeRobotFolder, tasks: tuple[str, ...], columns: Mapping[
     )
 
 
+def _task_names(folder: LeRobotFolder, numbers: NDArray[np.integer[Any]]) -> set[str]:
+    tasks = folder.tasks
+    return {tasks[index] if 0 <= index < len(tasks) else f"number {index}" for index in np.unique(numbers).tolist()}
+
+
 def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
     """Check the ranges in the episodes' table: rows of the dataset, and seconds of each video."""
     ends = [f"videos/{key}/to_timestamp" for key in folder.info.video_keys]
+    last_frames: dict[str, int] = {}
     for path in tables_in(folder.root, "meta/episodes"):
         columns = open_table(path).schema_arrow.names
         names = [name for name in ("dataset_to_index", *ends) if name in columns]
@@ -147,18 +156,28 @@ def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
         for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
             for begin, end in zip(begins, names, strict=True):
                 unit = 1 if end == "dataset_to_index" else folder.info.fps
-                if not abs((row[end] - row[begin]) * unit - row["length"]) < 0.5:
+                surplus = (row[end] - row[begin]) * unit - row["length"]
+                if end in ends and -1.5 < surplus < -0.5:
+                    last_frames[end] = last_frames.get(end, 0) + 1
+                elif not abs(surplus) < 0.5:
                     yield Fault(
                         severity="broken",
                         episode=row["episode_index"],
                         message=f"{end} of the table of episodes does not fit its {row['length']} frames",
                     )
+    for end, count in last_frames.items():  # training looks up images from the start of an episode alone
+        yield Fault(
+            severity="look",
+            value=f"{count} episodes",
+            message=f"{end} of {count} episodes is the time of the last frame; LeRobot's edits would lose this frame",
+            do="demorec dataset repair {path} --out NEW",
+        )
 
 
 def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
-    """Find rows of the data files that belong to no episode."""
-    for file in tables_in(folder.root, "data"):
-        found, listed = open_table(file).metadata.num_rows, folder.num_rows.get(file, 0)
+    """Find rows that belong to no episode in the episodes' files."""
+    for file, listed in folder.num_rows.items():
+        found = open_table(file).metadata.num_rows if file.exists() else listed
         if listed != found:
             yield Fault(
                 severity="broken",
@@ -174,7 +193,7 @@ def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
     measures="columns that differ from info.json",
     unit="columns",
     why="Readers convert or refuse other types: numbers lose digits, or training does not start.",
-    do="correct meta/info.json, or write the column in the stated type",
+    do="demorec dataset repair {path} --out NEW",
 )
 def table_schema(evidence: Evidence) -> Iterator[Fault]:
     """Compare columns, types and shapes of the data files with info.json, and the counters with LeRobot's own."""
@@ -187,23 +206,29 @@ def table_schema(evidence: Evidence) -> Iterator[Fault]:
         elif found.shape != fixed.shape or (found.dtype != fixed.dtype and (name, found.dtype) != _PRECISE):
             yield Fault(severity="broken", message=f"{name} is not stated as {fixed.dtype} of shape {fixed.shape}")
     seen: set[str] = set()
-    for path in tables_in(folder.root, "data"):
-        for severity, message in _column_faults(path, features):
+    unlisted = folder.info.unlisted
+    for path in filter(Path.exists, folder.num_rows):
+        for severity, message in _column_faults(path, features, unlisted):
             if message not in seen:
                 seen.add(message)
                 yield Fault(severity=severity, message=f"{message} ({path.name})")  # type: ignore[arg-type]
 
 
-def _column_faults(path: Path, features: Mapping[str, DatasetFeature]) -> Iterator[tuple[str, str]]:
+def _column_faults(
+    path: Path, features: Mapping[str, DatasetFeature], unlisted: Sequence[str]
+) -> Iterator[tuple[str, str]]:
     schema = open_table(path).schema_arrow
     columns = set(schema.names)
     for name in sorted(features.keys() - columns):
-        yield "broken", f"the column {name} is missing"
+        if name != "frame_index" or name not in unlisted:  # LeRobot never reads it
+            yield "broken", f"the column {name} is missing"
     for name in sorted(columns - features.keys()):
         yield "look", f"the column {name} is not in info.json"
     for name in sorted(columns & features.keys()):
         kind, feature = schema.field(name).type, features[name]
         fit = _fits(kind, feature)
+        if name in AUTOMATIC_FEATURES and pa.types.is_floating(kind):
+            fit = "equal" if fit == "equal" else "converts"  # only whole numbers can be read
         if fit != "equal":
             severity = "look" if fit == "converts" else "broken"
             yield severity, f"{name} is {kind}, and info.json states {feature.dtype} of shape {feature.shape}"
@@ -344,12 +369,19 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
 def unused_files(evidence: Evidence) -> Iterator[Fault]:
     """Find video and data files that no episode uses."""
     folder = folder_of(evidence)
-    used = {path for place in folder.listed for path, _ in place.videos.values()} | set(folder.num_rows)
-    found = {*(evidence.path / "videos").rglob("*.mp4"), *(evidence.path / "data").rglob("*.parquet")} - used
-    if found:
-        names = sorted(path.relative_to(evidence.path).as_posix() for path in found)
-        more = f" and {len(names) - 1} more" if len(names) > 1 else ""
-        yield Fault(severity="look", value=f"{len(names)} files", message=f"no episode uses {names[0]}{more}")
+    used = {path for place in folder.listed for path, _ in place.videos.values()}
+    videos = set((evidence.path / "videos").rglob("*.mp4")) - used
+    tables = set((evidence.path / "data").rglob("*.parquet")) - set(folder.num_rows)
+    if videos:
+        yield Fault(severity="look", value=f"{len(videos)} files", message=_unused(evidence.path, videos))
+    if tables:
+        message = f"{_unused(evidence.path, tables)}; LeRobot reads all tables in data, and then finds other rows"
+        yield Fault(severity="broken", value=f"{len(tables)} files", message=message)
+
+
+def _unused(root: Path, files: Collection[Path]) -> str:
+    more = f" and {len(files) - 1} more" if len(files) > 1 else ""
+    return f"no episode uses {min(files).relative_to(root).as_posix()}{more}"
 
 
 @check(

@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
@@ -30,6 +31,9 @@ MIN_JUMP_TICKS = 10.0
 """Minimum size of a jump in units of the element's smallest difference: a resting encoder flickers by a tick or two."""
 MIN_JUMP_STEPS = 6.0
 """Minimum factor of a jump over the largest usual step and over its neighbours: motors accelerate over frames."""
+MIN_COMPANY = 0.33
+"""Minimum step of another element in an adjacent frame, relative to the jump, that shows fast motion of the whole arm;
+both in units of each element's limit."""
 
 
 @check(
@@ -143,7 +147,8 @@ def _action_units(evidence: Evidence) -> Iterator[Fault]:
 def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     """Find steps several times as large as the largest usual one and as the steps before and after them.
 
-    Grippers are excluded, because they snap. A reading that jumps away and back also counts.
+    Grippers are excluded, because they snap. A reading that jumps away and back also counts. Steps next to which
+    other elements also move fast are excluded: a whole arm that starts or stops in a few frames.
     """
     episodes = evidence.need_state(8)
     arm = ~evidence.is_gripper
@@ -163,6 +168,7 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
         spike = (other > 0.5 * sizes) & (smaller * MIN_JUMP_STEPS < sizes)
         alone = other * MIN_JUMP_STEPS / 2 < sizes
         jumps = (sizes > np.maximum(limit, own)) & (spike | alone) & arm & (evidence.ranges > 0)
+        jumps &= ~_accompanied(sizes / np.maximum(limit, 1e-12), jumps)
         if not jumps.any():
             continue
         frames = np.flatnonzero(jumps.any(axis=1))
@@ -178,6 +184,18 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
             message=f"{element_name(evidence, element)} jumps from {number_in_words(state[frame, element])} to "
             f"{number_in_words(state[frame + 1, element])} within one frame (frame {frame + 1}{count})",
         )
+
+
+def _accompanied(speeds: Array, jumps: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Find (T - 1, D) steps next to which elements without a jump move comparably fast.
+
+    Args:
+        speeds: (T - 1, D) steps in units of each element's limit.
+        jumps: (T - 1, D) flags of the jumps.
+    """
+    fastest = np.where(jumps.any(axis=0), 0.0, speeds).max(axis=1)
+    beside = np.maximum(np.append(fastest[1:], 0.0), np.insert(fastest[:-1], 0, 0.0))
+    return np.asarray(beside[:, None] > MIN_COMPANY * speeds)
 
 
 def _ticks(episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Array:
