@@ -432,3 +432,18 @@ def test_tasks_as_categories_with_doubles_as_numbers_are_read(tmp_path: Path) ->
     assert exit_code("check", source, "--only", "table_schema", "contradicting_counts") == 0
     assert exit_code("dataset", "select", source, "--episodes", "0,2", "--out", tmp_path / "new") == 0
     assert said(tmp_path / "new", "task_index") == ["push it"] * LENGTH + ["close the drawer"] * LENGTH
+
+
+@pytest.mark.parametrize(
+    ("words", "is_stale"),
+    [(["rename", "action=act"], True), (["drop-features", "action"], True), (["trim", "--head", "1"], False)],
+)
+def test_a_modality_file_that_names_other_features_is_named(
+    words: list[str], is_stale: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    source = write_drawn(tmp_path / "set", replace(PLAIN, camera=""))
+    (source / "meta/modality.json").write_text('{"action": {"arm": {"start": 0, "end": 3}}}')
+    name, *rest = words
+    assert exit_code("dataset", name, source, *rest, "--out", tmp_path / "new") == 0
+    assert ("written for the features of the source: meta/modality.json" in capsys.readouterr().out) == is_stale
+    assert (tmp_path / "new/meta/modality.json").read_bytes() == (source / "meta/modality.json").read_bytes()

@@ -22,6 +22,8 @@ from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
+from demorec.datasets.lerobot.modality import MODALITY_PATH
 from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
@@ -31,7 +33,7 @@ _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "epi
 """Columns that describe a simulated episode as recorded, and do not apply to a cut one."""
 _COUNTERS = ("index", "episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
-_ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", "meta/modality.json")
+_ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", MODALITY_PATH)
 """Files that are copied if all sources have the same."""
 _OF_OTHER_TOOLS = (".cache/", ".git/")
 """Folders created by downloading a dataset."""
@@ -224,6 +226,14 @@ def copied_files(plan: Plan) -> tuple[str, ...]:
 def copied_unknown_files(plan: Plan) -> tuple[str, ...]:
     """List the copied files whose purpose is unknown."""
     return tuple(name for name in copied_files(plan) if name not in _ABOUT_THE_WHOLE)
+
+
+def copies_stale_modality(plan: Plan) -> bool:
+    """Whether modality.json is copied, although a feature that it may name was renamed, converted or left out."""
+    names = set(plan.sources[0].info.features) - set(AUTOMATIC_FEATURES)
+    mappings = plan.mappings[0]
+    is_changed = set(mappings) != names or not all(m.feature == name and m.is_copy for name, m in mappings.items())
+    return is_changed and MODALITY_PATH in copied_files(plan)
 
 
 def _is_equal(name: str, first: Path, other: Path) -> bool:

@@ -106,7 +106,7 @@ class Edit:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
     def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
-        from demorec.extensions.editing.beside import MAX_NAMES, copied_unknown_files, left_out
+        from demorec.extensions.editing.beside import MAX_NAMES, copied_unknown_files, copies_stale_modality, left_out
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)
@@ -120,6 +120,8 @@ class Edit:
         if self.dry_run and len(plan.sources) == 1 and not is_in_parts and numbers != list(range(len(lengths))):
             say(f"episodes {_listed(numbers)}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
+        if copies_stale_modality(plan):
+            say("Copied, but written for the features of the source: meta/modality.json. Correct it.")
         if unknown := copied_unknown_files(plan):
             more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
             say(f"Copied, but unknown: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still apply.")
