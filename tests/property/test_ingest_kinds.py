@@ -72,6 +72,9 @@ def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
         if pixels in MEASURED:
             assert (code, recordings(run)) == (2, [])
             assert f"The video of {TOP} holds {pixels}, which is depth or another measurement and not colour" in error
+            told = f"The video of {TOP} holds {pixels}: depth or another measurement, not colour."
+            assert told in command("check", source, "--only", "unreadable_episodes")[1]
+            assert told in command("info", source)[1]
             assert command("dataset", "drop-features", source, TOP, "--out", Path(folder) / "rest")[0] == 0
             assert command("import", "lerobot", Path(folder) / "rest", "--out", run)[0] == 0
             return

@@ -127,7 +127,7 @@ class LeRobotFolder:
         missing = f"The rows have no {absent}, and are taken in their order ({REPAIR} adds it)." if absent else ""
         names = ", ".join(name for name in self.info.unlisted if name in columns)
         unlisted = f"{INFO_PATH} does not list {names} of the rows ({REPAIR} adds it)." if names else ""
-        return (*(note for note in (problem, missing, unlisted) if note), *self._short_videos)
+        return (*(note for note in (problem, missing, unlisted) if note), *self._short_videos, *self._measurements)
 
     @cached_property
     def _short_videos(self) -> tuple[str, ...]:
@@ -149,6 +149,22 @@ class LeRobotFolder:
                             f"episodes {min(numbers)} to {max(numbers)}: after the first missing image, rows show "
                             "images of other moments."
                         )
+        return tuple(notes)
+
+    @cached_property
+    def _measurements(self) -> tuple[str, ...]:
+        """Sentences about cameras whose video holds a measurement of unknown scale instead of colour."""
+        from demorec.mcap.gray_video import deep_gray
+
+        notes: list[str] = []
+        for key in self.info.video_keys:
+            path = next((place.videos[key][0] for place in self.listed if place.videos[key][0].exists()), None)
+            if path is None or self.info.features[key].is_depth:
+                continue
+            with suppress(ExportError):  # an unreadable file is reported for its own episodes
+                file = self.open_video(path)
+                if measurement := deep_gray(file.codec, file.pixels, file.parameters):
+                    notes.append(f"The video of {key} holds {measurement}: depth or another measurement, not colour.")
         return tuple(notes)
 
     @cached_property

@@ -268,7 +268,7 @@ def _files_below(root: Path) -> list[str]:
 
 
 def _files(plan: Plan, number: int, root: Path, copied: Collection[str]) -> Iterator[tuple[str, str]]:
-    for path in plan.sources[number].num_rows:
+    for path in filter(Path.exists, plan.sources[number].num_rows):
         for name in open_table(path).schema_arrow.names:
             if name not in plan.sources[number].info.features:
                 yield name, f"{INFO_PATH} does not list this column of the data files"

@@ -19,8 +19,8 @@ from PIL import Image, UnidentifiedImageError
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import describe_error
 from demorec.extensions.imports.fields import FieldError, image_bytes, whole
-from demorec.extensions.imports.gray_video import deep_gray
 from demorec.mcap.cdr import Values
+from demorec.mcap.gray_video import deep_gray
 from demorec.mcap.lossless import decode_millimetres
 from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
 

@@ -17,7 +17,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
 from demorec.datasets.lerobot.videos import opened_video
-from demorec.extensions.doctor.evidence import DROP, Evidence
+from demorec.extensions.doctor.evidence import DROP, REPAIR, Evidence
 
 _TYPES = {
     "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
@@ -26,6 +26,7 @@ _PRECISE = ("timestamp", "float64")
 """A counter that may be more precise than LeRobot's own."""
 _RATE_TOLERANCE = 0.01
 """Relative tolerance of rates: concatenated files have slightly different ones."""
+_LEAVE_CAMERA_OUT = "restore its videos, or leave it out: demorec dataset drop-features {path} CAMERA --out NEW"
 
 
 def folder_of(evidence: Evidence) -> LeRobotFolder:
@@ -57,7 +58,8 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     for number, note in enumerate(folder.notes):
         # Without the table of episodes LeRobot opens nothing; with a wrong one it reads other rows.
         severity: Severity = "broken" if number == 0 and folder.is_found_by_rows else "look"
-        yield Fault(severity=severity, message=note, do="demorec dataset repair {path} --out NEW")
+        remedy = REPAIR if "dataset repair" in note else _LEAVE_CAMERA_OUT
+        yield Fault(severity=severity, message=note, do=remedy)
     if missing := folder.missing:
         yield Fault(severity="broken", message=missing.partition(": /")[0], do="complete the recording or the download")
     if not folder.listed:
