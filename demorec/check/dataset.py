@@ -11,15 +11,14 @@ from typing import Any, ClassVar
 from numpy.typing import NDArray
 
 from demorec.check.base import Form
-from demorec.core.errors import ConfigError, ExportError, describe_error
+from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.inspect import noted, recorded_info
 from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
-from demorec.episode.validity import read_episode_info
 from demorec.robots.motors import Motors
 
 Rows = Mapping[str, NDArray[Any]]
@@ -125,11 +124,6 @@ class CheckedDataset:
             number = row["episode_index"]
             if row["episode_info"] is None or number not in self.rows:
                 continue
-            try:
-                info = read_episode_info(row["episode_info"])
-            except (ValueError, KeyError, TypeError) as error:
-                raise ExportError(
-                    f"The sidecar's episode_info cannot be used ({describe_error(error)}): {self.path}"
-                ) from error
+            info = recorded_info(row, self.path)
             found.append(DescribedEpisode(number=number, rows=self.rows[number], kept=row, info=info))
         return sorted(found, key=lambda episode: episode.number)

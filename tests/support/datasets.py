@@ -26,8 +26,10 @@ def write_with_lerobot(root: Path, *, video: bool = True, episodes: int = 6, **a
     for episode in range(episodes):
         length = 12 + episode
         for t in range(length):
-            image = np.full((64, 96, 3), (episode * 20 + t * 3) % 255, np.uint8)
-            image[10:30, 5 + t : 25 + t] = rng.integers(0, 255, 3)
+            background = (episode * 20 + t * 3) % 255
+            contrast = rng.integers(60, 125, 3)  # at least this: an image in one grey is blank
+            image = np.full((64, 96, 3), background, np.uint8)
+            image[10:30, 5 + t : 25 + t] = background + (contrast if background < 128 else -contrast)
             frame = {
                 "observation.state": rng.normal(size=3).astype(np.float32) * (3 < t < length - 4),
                 "action": rng.normal(size=3).astype(np.float32),

@@ -95,7 +95,7 @@ def feature_rows(path: Path, info: Mapping[str, Any], roles: Roles | None) -> li
     rows = [("role", "feature", "dtype", "shape", "elements", "units")]
     for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):
         column, role = roles.columns[name], roles.of[name]
-        unit = ", ".join(dict.fromkeys(units.get(name, ()))) or (
+        unit = ", ".join(dict.fromkeys(filter(None, units.get(name, ())))) or (
             "unknown" if column.is_vector and role != "label" else ""
         )
         rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements), unit))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.episode_table import EpisodePlace
@@ -12,6 +13,9 @@ from demorec.datasets.lerobot.files import open_table, read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.mp4_index import check_video
+from demorec.episode.features import ACTION, STATE
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.validity import read_episode_info
 
 
 def attempt_counts(folder: LeRobotFolder) -> tuple[int, int, int] | None:
@@ -31,14 +35,31 @@ def attempt_counts(folder: LeRobotFolder) -> tuple[int, int, int] | None:
 
 
 def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
-    """Feature -> units of its elements, from the sidecar; empty without one.
+    """Feature -> units of its elements, from the sidecar's robot and first episode; empty without a sidecar.
+
+    An action with the elements of the state has the state's units.
 
     Raises:
         ExportError: The tables or the robot's description are damaged.
     """
     digests = (row["robot_digest"] for row in folder.sidecar(["robot_digest"]))
     digest = next((digest for digest in digests if digest), None)
-    return {} if digest is None else folder.robot(digest).record.units
+    found = {} if digest is None else dict(folder.robot(digest).record.units)
+    for row in folder.sidecar_rows("episodes", 0):
+        if row.get("episode_info") is not None:
+            found = {feature.name: feature.units for feature in recorded_info(row, folder.root).features} | found
+    state, action = (folder.info.features.get(name) for name in (STATE, ACTION))
+    if STATE in found and state is not None and action is not None and state.names == action.names:
+        found.setdefault(ACTION, found[STATE])
+    return found
+
+
+def recorded_info(row: Mapping[str, Any], root: Path) -> EpisodeInfo:
+    """Parse the description of a simulated episode in its row of the sidecar; ExportError if it is damaged."""
+    try:
+        return read_episode_info(row["episode_info"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise ExportError(f"The sidecar's episode_info cannot be used ({describe_error(error)}): {root}") from error
 
 
 def dataset_problems(folder: LeRobotFolder) -> list[str]:

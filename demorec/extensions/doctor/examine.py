@@ -97,6 +97,8 @@ def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen:
         evidence = evidence_of_dataset(path, replace(options, images=False))
     except ExportError as error:
         return replace(diagnosis, findings=(_unopened(error, path), *diagnosis.findings))
+    if options.images:
+        evidence.images_missing = "the images are those of the recordings"
     about_files = [check for check in chosen if check.family == "files"]
     files = diagnose(evidence, about_files)
     names = {check.name for check in about_files}
@@ -163,7 +165,11 @@ def _verdict(diagnosis: Diagnosis) -> str:
     if diagnosis.verdict == "good":
         return f"good: {amount}; {counted(diagnosis.num_checks, 'check')} found nothing"
     bad = {word: sum(each.verdict == word for each in diagnosis.episodes) for word in ("broken", "look", "good")}
-    return f"{diagnosis.verdict}: {amount}; " + ", ".join(f"{number} {word}" for word, number in bad.items() if number)
+    words = [f"{number} {word}" for word, number in bad.items() if number]
+    whole = {finding.severity for finding in diagnosis.findings if finding.episode is None}
+    if diagnosis.verdict in whole:
+        return f"{diagnosis.verdict} as a whole: {amount}; of the episodes alone {', '.join(words) or 'none'}"
+    return f"{diagnosis.verdict}: {amount}; {', '.join(words)}"
 
 
 def _by_reason(not_measured: Mapping[str, str]) -> dict[str, list[str]]:
