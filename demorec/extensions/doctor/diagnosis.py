@@ -139,7 +139,7 @@ def _for_recordings(finding: Finding, evidence: Evidence) -> Finding:
 def _verdicts(evidence: Evidence, findings: Sequence[Finding]) -> tuple[EpisodeVerdict, ...]:
     """Build the verdict on each episode, worst first."""
     found = []
-    for number, score in score_episodes(evidence).items():
+    for number, score in evidence.once(score_episodes).items():
         own = [finding for finding in findings if finding.episode == number]
         verdict: Verdict = max((finding.severity for finding in own), key=RANK.__getitem__, default="good")
         reasons = [finding.message for finding in own] + [reason.text for reason in score.reasons]

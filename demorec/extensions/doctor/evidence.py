@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array, signs_of_course
+from demorec.episode.element_names import joint_of
 from demorec.episode.roles import Role, Roles
 from demorec.extensions.doctor.robust import without_gaps
 
@@ -27,6 +28,8 @@ DROP = "demorec dataset drop {path} --episodes {episode} --out NEW"
 """Advice for one bad episode."""
 REPAIR = "demorec dataset repair {path} --out NEW"
 """Advice for tables, counts and statistics that contradict the rows."""
+_INCREMENT = re.compile("^delta_")
+"""Prefix of an action's element that is the change of the state's element, as LeRobot names them."""
 _HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
 """Joint names of a hand with fingers."""
 
@@ -131,10 +134,15 @@ class Evidence:
 
     @cached_property
     def action_of(self) -> list[int | None]:
-        """Index in the action of each element of the state; None if missing."""
+        """Index in the action of each element of the state, "delta_x" for "x" too; None if missing."""
         if not (self.roles.state and self.roles.action):
             return [None] * len(self.elements)
-        return self.roles.in_state(self.roles.action)
+        increments = {_INCREMENT.sub("", name): place for place, name in enumerate(self.action_elements)}
+        matched = self.roles.in_state(self.roles.action)
+        return [
+            increments.get(joint_of(name)) if place is None else place
+            for name, place in zip(self.elements, matched, strict=True)
+        ]
 
     @cached_property
     def by_number(self) -> Mapping[int, EpisodeEvidence]:

@@ -6,19 +6,13 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-import numpy as np
-
 from demorec.core.errors import ExportError, without_path
-from demorec.core.geometry import Array
+from demorec.datasets.lerobot.episode_records import OLD_STATS
 from demorec.datasets.lerobot.episode_table import EpisodePlace, read_tasks
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, FilePosition
-from demorec.datasets.lerobot.stats import NAMES, QUANTILES, Statistics, data_statistics
-
-_MAX_ERROR = 0.05
-"""Maximum error of a stored statistic in standard deviations, the same as in `demorec check`."""
-_MIN_DEVIATION = 1e-4
+from demorec.datasets.lerobot.layout import STATS_PATH, TASKS_PATH, FilePosition
+from demorec.datasets.lerobot.statistic_errors import statistic_errors
 
 
 def table_changes(
@@ -38,7 +32,7 @@ def table_changes(
     yield from _tasks(folder, stated)
     yield from _totals(folder, stated)
     yield from _strays(folder)
-    if not folder.info.is_old:
+    if not folder.info.is_old or (folder.root / OLD_STATS).exists():
         yield from _statistics(folder)
 
 
@@ -149,38 +143,23 @@ def _strays(folder: LeRobotFolder) -> Iterator[str]:
 
 def _statistics(folder: LeRobotFolder) -> Iterator[str]:
     """Compare the statistics with the rows."""
+    features = folder.info.features
+    reader = folder.rows([name for name, feature in features.items() if feature.is_numeric])
     try:
-        stored = folder.statistics
+        errors = list(statistic_errors(folder, {n: reader.numbers(place) for n, place in enumerate(folder.listed)}))
+        stored = () if folder.info.is_old else tuple(folder.statistics)
     except ExportError as error:
         yield f"{STATS_PATH} is written from the rows: {without_path(error, folder.root)}"
         return
-    features = {
-        name: feature for name, feature in folder.info.features.items()
-        if feature.is_numeric and name not in AUTOMATIC_FEATURES
-    }  # fmt: skip
-    found = data_statistics(folder.data_tables, features)
-    wrong = [name for name in features if not _is_close(stored.get(name), found[name])]
-    wrong += [name for name, feature in folder.info.features.items() if feature.is_camera and name not in stored]
+    wrong = list(dict.fromkeys(error.feature for error in errors if error.episode is None))
+    if not folder.info.is_old:
+        wrong += [name for name, feature in features.items() if feature.is_camera and name not in stored]
     if wrong:
         yield f"{STATS_PATH} gets the statistics of {', '.join(wrong)} from the rows and images."
-
-
-def _is_close(stored: Mapping[str, Any] | None, found: Statistics) -> bool:
-    """Whether stored statistics match the rows; LeRobot's estimated quantiles are between the extremes."""
-    try:
-        told = Statistics.from_json(stored or {})
-    except (ValueError, TypeError):
-        return False
-    if told is None or told.count != found.count:
-        return False
-    if any(told.values[name].shape != found.values[name].shape for name in NAMES if name != "count"):
-        return False
-    unknown = np.isnan(found.values["mean"])  # rows with a NaN have no true statistics
-    margin: Array = _MAX_ERROR * np.maximum(found.values["std"], _MIN_DEVIATION)
-    low, high = found.values["min"] - margin, found.values["max"] + margin
-    is_right = [(told.values[name] >= low) & (told.values[name] <= high) for name in QUANTILES]
-    is_right += [np.abs(told.values[name] - found.values[name]) <= margin for name in ("min", "max", "mean", "std")]
-    return all(bool((each | unknown).all()) for each in is_right)
+    if own := {error.episode for error in errors if error.episode is not None}:
+        yield f"The statistics of {len(own)} episodes are computed from their rows."
+    if unknown := [name for name in stored if name not in features]:
+        yield f"{STATS_PATH} loses {', '.join(unknown)}, which is not a feature."
 
 
 def stated_splits(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Mapping[str, str] | None:

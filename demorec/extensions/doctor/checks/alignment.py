@@ -11,6 +11,7 @@ from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.relation import ActionRelation, EpisodeLag, relation_of
 from demorec.extensions.doctor.robust import usual
+from demorec.extensions.doctor.units import BOUND_QUANTILES
 
 MIN_OTHERS = 3
 """Minimum number of episodes to compare one with."""
@@ -26,6 +27,13 @@ EQUAL_RATIO = 1e-4
 """Maximum difference of action and state, as a ratio of the range, that counts as equal."""
 MIN_EQUAL_SHARE = 0.95
 """Minimum ratio of moving frames with equal numbers at which the action is the state."""
+MIN_MIRRORED = 0.8
+"""Minimum negative correlation of a gripper that mirrors its action."""
+MAX_UNIT_DIFFERENCE = 0.3
+"""Maximum difference of the bounds of a gripper and its action in one unit, as a ratio of the range: an object stops
+the fingers early."""
+MAX_CONVENTION = 1.5
+"""Maximum of a gripper by convention, in which 1 may be open or closed."""
 MIN_PAIR_GAIN = 4.0
 """Minimum factor by which the other element explains an element's motion better if the two are exchanged."""
 
@@ -256,6 +264,13 @@ def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[F
     if len(followed) <= MIN_OTHERS:
         return
     usual_correlation = float(np.median(list(followed.values())))
+    if usual_correlation < -MIN_MIRRORED and _have_one_unit(evidence, element, column):
+        yield Fault(
+            severity="look",
+            value=f"{usual_correlation:+.2f}",
+            message=f"{name} opens when its action closes, in the same unit: one of the two is inverted",
+            do="compare the signs of gripper and command in the program that recorded them",
+        )
     for number, correlation in followed.items():
         if abs(usual_correlation) > 0.6 and correlation * np.sign(usual_correlation) < -0.5:
             yield Fault(
@@ -265,6 +280,15 @@ def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[F
                 message=f"{name} moves against its action (correlation {correlation:+.2f}, usual "
                 f"{usual_correlation:+.2f})",
             )
+
+
+def _have_one_unit(evidence: Evidence, element: int, column: int) -> bool:
+    """Check whether a gripper and its action have the same range; 0 to 1 is a convention, not a unit."""
+    states = [state[:, element] for _, state in evidence.with_state()]
+    actions = [each.action[:, column] for each in evidence.episodes if each.action is not None]
+    opening, command = (np.quantile(np.concatenate(part), BOUND_QUANTILES) for part in (states, actions))
+    is_near = np.abs(opening - command).max() < MAX_UNIT_DIFFERENCE * np.ptp(opening)
+    return bool(is_near and opening[1] > MAX_CONVENTION)
 
 
 def _best_correlation(values: Array, others: Array, reach: int) -> float:

@@ -54,17 +54,17 @@ def copies(
     by_length: dict[int, list[tuple[EpisodeEvidence, Array]]] = defaultdict(list)
     for episode, state in earlier:
         by_length[len(state)].append((episode, _moments(state, ranges, alive)))
+    moments = {length: np.stack([each for _, each in group]) for length, group in by_length.items()}
     same = later is earlier
     for episode, state in later:
-        if not np.ptp(state, axis=0).any():
+        if not np.ptp(state, axis=0).any() or len(state) not in moments:
             continue  # an episode at rest has no motion to copy
-        own = _moments(state, ranges, alive)
-        for other, vector in by_length.get(len(state), ()):
-            if same and other.number >= episode.number:
-                break
-            if np.sqrt(((own - vector) ** 2).mean()) <= MAX_DISTANCE:
-                yield episode, other
-                break
+        group = by_length[len(state)]
+        count = sum(other.number < episode.number for other, _ in group) if same else len(group)
+        distances = moments[len(state)][:count] - _moments(state, ranges, alive)
+        near = np.flatnonzero(np.sqrt((distances**2).mean(axis=(1, 2))) <= MAX_DISTANCE)
+        if len(near):
+            yield episode, group[near[0]][0]
 
 
 def _moments(state: Array, ranges: Array, alive: NDArray[np.bool_]) -> Array:

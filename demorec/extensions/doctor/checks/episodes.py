@@ -161,7 +161,7 @@ def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state(8)
     if len(evidence.episodes) <= MIN_OTHERS:
         raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
-    scores = score_episodes(evidence)
+    scores = evidence.once(score_episodes)
     far = Counter(r.kind for score in scores.values() for r in score.reasons if r.spreads > MAX_UNUSUAL_SPREADS)
     rare = {kind for kind, count in far.items() if count <= max(1, MAX_UNUSUAL_SHARE * len(scores))}
     for number, score in scores.items():

@@ -74,7 +74,7 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     measures="counters and indices that contradict",
     unit="contradictions",
     why="LeRobot looks up rows and images by these numbers: it finds wrong ones, or none.",
-    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW numbers them again; otherwise record it again",
+    do=REPAIR,
 )
 def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
     """Compare totals with the tables; indices must be consecutive, and tasks must match the episodes' table."""
@@ -185,7 +185,6 @@ def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
                 severity="broken",
                 value=f"{found - listed} rows",
                 message=f"{file.name} has {found} rows, {listed} of them belong to episodes",
-                do="finalize the recording, or write the dataset again",
             )
 
 
@@ -195,7 +194,7 @@ def _surplus_rows(folder: LeRobotFolder) -> Iterator[Fault]:
     measures="columns that differ from info.json",
     unit="columns",
     why="Readers convert or refuse other types: numbers lose digits, or training does not start.",
-    do="demorec dataset repair {path} --out NEW",
+    do=REPAIR,
 )
 def table_schema(evidence: Evidence) -> Iterator[Fault]:
     """Compare columns, types and shapes of the data files with info.json, and the counters with LeRobot's own."""
@@ -366,7 +365,7 @@ def video_places(evidence: Evidence) -> Iterator[Fault]:
     measures="files that nothing refers to",
     unit="files",
     why="They enlarge the disk usage and the download; merges, deleted episodes and renamed cameras leave them behind.",
-    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW copies only used files",
+    do=REPAIR,
 )
 def unused_files(evidence: Evidence) -> Iterator[Fault]:
     """Find video and data files that no episode uses."""
@@ -391,7 +390,7 @@ def _unused(root: Path, files: Collection[Path]) -> str:
     needs="a LeRobot dataset of v3.0",
     measures="statistics that are missing",
     why="Training cannot normalise without them.",
-    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW writes them",
+    do=REPAIR,
 )
 def missing_statistics(evidence: Evidence) -> Iterator[Fault]:
     """Check that meta/stats.json exists."""

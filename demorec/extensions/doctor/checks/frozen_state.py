@@ -24,6 +24,8 @@ MIN_FROZEN_RANGE = 0.3
 MIN_FROZEN_ERRORS = 2.0
 """Minimum factor of the distance between action and a frozen element over the usual one: a hobby servo holds its joint
 for seconds while the difference is within its dead band and load."""
+MIN_UNCOMMANDED_RANGE = 0.3
+"""Minimum range of an element without commands, relative to the arm's usual one: load and sag move a joint less."""
 MAX_END_STOP_RANGE = 0.02
 """Maximum distance from an end stop, as a ratio of the range in the whole set, at which an element counts as there."""
 
@@ -41,10 +43,12 @@ def frozen_state(evidence: Evidence) -> Iterator[Fault]:
 
     The action must be more than twice its usual distance away from the element: servos hold a joint within their dead
     band, under load, and at end stops. Without an action, a whole state counts as frozen if it continues with a jump.
-    An element that never changes in any episode while its action does is a fault of the whole set.
+    An element that never changes in any episode while its action does is a fault of the whole set, and so is an action
+    that never changes while its element moves.
     """
     episodes = evidence.need_state(8)
     yield from _never_moving(evidence, episodes)
+    yield from _never_acting(evidence, episodes)
     targets = _targets(evidence, episodes)
     needed = max(MIN_FROZEN_FRAMES, round(MIN_FROZEN_S * evidence.fps))
     faults: list[Fault] = []
@@ -80,6 +84,24 @@ def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, 
                 value="0",
                 message=f"{element_name(evidence, element)} never changes although its action does",
                 do="record the joint's own position",
+            )
+
+
+def _never_acting(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:
+    """Find elements of the arm that move as far as others while their action has one value in all episodes."""
+    acting = [each.action for each, _ in episodes if each.action is not None]
+    pairs = [(e, c) for e, c in enumerate(evidence.action_of) if c is not None and not evidence.is_gripper[e]]
+    if not acting or not pairs:
+        return
+    usual_range = float(np.median([evidence.ranges[element] for element, _ in pairs]))
+    constant = np.ptp(np.concatenate(acting), axis=0) == 0
+    for element, column in pairs:
+        if constant[column] and evidence.ranges[element] > MIN_UNCOMMANDED_RANGE * usual_range > 0:
+            yield Fault(
+                severity="broken",
+                value="0",
+                message=f"{element_name(evidence, element)} moves although its action never changes",
+                do="record the command that was sent to this joint",
             )
 
 

@@ -36,6 +36,10 @@ MIN_GAPS = 8
 """Minimum number of intervals between new images that determine the rate of a camera."""
 MIN_REGULAR = 0.95
 """Minimum ratio of these intervals within one frame of their mean for a camera with its own rate."""
+DRIFT_GAPS = 40
+"""Number of gaps of one and two frames that determine whether they are regular: 40 random ones drift by 4 frames."""
+MAX_DRIFT = 2.0
+"""Maximum drift of regular gaps, frames: one by rounding, one by a late image."""
 MIN_RATE_CHANGE = 1.5
 """Minimum usual change of images, of 255, for a close examination: codecs skip smaller ones in every second image."""
 MIN_REPEATED = 0.3
@@ -261,11 +265,16 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
 def _share_repeated(gaps: NDArray[np.intp]) -> float:
     """Compute the ratio of repeated images if new ones come regularly, after n or n + 1 frames; else 0.
 
-    Slow motion also changes an image only occasionally, but not regularly.
+    Slow motion also changes an image only occasionally, but not regularly. Gaps of one and two frames are regular if
+    their sum never drifts far from that of equal ones.
     """
     mean = float(np.mean(gaps))
-    regular = np.abs(gaps - mean) < 1.0
-    return 1 - 1 / mean if regular.mean() >= MIN_REGULAR else 0.0
+    regular = (np.abs(gaps - mean) < 1.0).mean() >= MIN_REGULAR
+    if mean < 2:
+        blocks = [gaps[first : first + DRIFT_GAPS] for first in range(0, len(gaps) - DRIFT_GAPS + 1, DRIFT_GAPS)]
+        drifts = [np.ptp(np.cumsum(block - block.mean())) for block in blocks]
+        regular = bool(drifts) and np.median(drifts) < MAX_DRIFT
+    return 1 - 1 / mean if regular else 0.0
 
 
 @check(

@@ -91,7 +91,28 @@ def unit_mismatch(evidence: Evidence) -> Iterator[Fault]:
             value=f"{ratio:.3g} times",
             message=f"its {' and '.join(ratios)} is {_in_words(ratio)} the size of the others' ({_confusion(ratio)})",
         )
+    yield from _gripper_units(evidence)
     yield from _action_units(evidence)
+
+
+def _gripper_units(evidence: Evidence) -> Iterator[Fault]:
+    """Find episodes in which a gripper's values and range are both larger by a known confusion of units."""
+    episodes = [each for each in evidence.need_state() if each[0].number not in evidence.once(other_units)]
+    for element in np.flatnonzero(evidence.is_gripper).tolist() if len(episodes) > MIN_OTHERS else ():
+        sizes = np.array([np.abs(state[:, element]).max() for _, state in episodes])
+        spans = np.array([np.ptp(state[:, element]) for _, state in episodes])
+        usual_size, usual_span = np.median(sizes), np.median(spans)
+        for (episode, _), size, span in zip(episodes, sizes, spans, strict=True):
+            ratio = float(span / usual_span) if usual_span > 0 else 0.0
+            if min(ratio, size / usual_size) > MIN_UNIT_RATIO and not _confusion(ratio).startswith("another"):
+                yield Fault(
+                    severity="broken",
+                    episode=episode.number,
+                    value=f"{ratio:.3g} times",
+                    message=f"its {element_name(evidence, element)} opens {_in_words(ratio)} as far as in the others "
+                    f"({_confusion(ratio)})",
+                    do=DROP,
+                )
 
 
 def _in_words(ratio: float) -> str:

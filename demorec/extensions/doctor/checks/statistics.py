@@ -3,40 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, Severity, check
-from demorec.core.geometry import Array
-from demorec.datasets.lerobot.episode_records import OLD_STATS, episode_statistics
-from demorec.datasets.lerobot.files import open_table, rows_in
+from demorec.datasets.lerobot.episode_records import OLD_STATS
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
-from demorec.datasets.lerobot.stats import NAMES, QUANTILES
+from demorec.datasets.lerobot.statistic_errors import StatisticError, numbers_of, statistic_errors
+from demorec.datasets.lerobot.stats import NAMES
 from demorec.extensions.doctor.checks.files import folder_of
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import REPAIR, Evidence
 
-_RENUMBERED = ("index", "episode_index")
-"""Columns that LeRobot's delete, split and merge renumber without updating the statistics."""
-_COUNTED = (*_RENUMBERED, "task_index")
-MAX_ERROR = 0.02
-"""Maximum error of statistics, in standard deviations: histograms and sampling cause errors of 0.01."""
 MIN_BROKEN_ERROR = 0.2
 """Minimum error of broken statistics: normalised values are wrong by a fifth of their spread."""
-MIN_DEVIATION = 1e-4
-"""Minimum standard deviation used as the unit, for elements that hardly move."""
-MAX_SUMMED = 4000
-"""Number of rows over which the rounding of a float32 sum accumulates: an episode of over a minute at 60 fps."""
-FLOAT32_SUM = 0.25
-"""Error of a float32 sum of N equal values, in N roundings of its result: rounding is uniform while the sum grows."""
-FLOAT32_VARIANCE = 3 * FLOAT32_SUM
-"""Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
-Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
-"""Episode -> feature -> quantity -> its numbers."""
-Ranges = Mapping[str, Array]
-"""Quantile -> (2, D) minimum and maximum allowed value."""
+_COUNTED = ("index", "episode_index", "task_index", "frame_index", "timestamp")
 
 
 @check(
@@ -45,7 +28,7 @@ Ranges = Mapping[str, Array]
     measures="statistics that do not match the rows",
     unit="standard deviations",
     why="Training normalises by them: state and action are shifted and squeezed.",
-    do="demorec dataset select {path} --where 'num_frames > 0' --out NEW computes them again",
+    do=REPAIR,
 )
 def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     """Recompute minimum, maximum, mean, deviation, count and quantiles of every column, and of each episode.
@@ -57,154 +40,27 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     stats_path = OLD_STATS if folder.info.is_old else STATS_PATH
     if not (evidence.path / stats_path).exists():
         raise NotMeasuredError(f"{stats_path} is missing")
-    known = {} if folder.info.is_old else folder.statistics
-    unused = (*_RENUMBERED, *(name for name in evidence.roles.having("label") if name not in known))
-    names = [name for name, f in folder.info.features.items() if f.is_numeric and name not in unused]
-    yield from _of_episodes(evidence, folder, names)
+    for error in statistic_errors(folder, {each.number: each.columns for each in evidence.episodes}):
+        yield Fault(
+            severity=_severity(error),
+            episode=error.episode,
+            value=f"{error.error:.2g} deviations" if math.isfinite(error.error) else "missing",
+            message=f"the {error.quantity} of {error.feature} in {error.place} does not match the rows",
+        )
     if folder.info.is_old:
         return  # training aggregates the episodes' statistics
     if evidence.unreadable:
         raise NotMeasuredError(f"the whole dataset's, since {len(evidence.unreadable)} of its episodes cannot be read")
-    stats = folder.statistics
-    for name in names:
-        episodes = [_vectors(folder, name, each.columns[name]) for each in evidence.episodes]
-        if not episodes or any(not np.isfinite(values).all() for values in episodes):
-            continue  # without these numbers a comparison is impossible, and `missing_numbers` reports them
-        ranges = [_quantile_ranges(values) for values in episodes]
-        count = sum(len(each.columns[name]) for each in evidence.episodes)
-        error, quantity = _largest_error(stats.get(name), np.concatenate(episodes), count, ranges)
-        if error > MAX_ERROR:
-            yield Fault(
-                severity="look" if quantity == "count" else _severity(error, name),
-                value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
-                message=f"the {quantity} of {name} in {STATS_PATH} does not match the rows",
-            )
-    if unknown := [name for name in stats if name not in folder.info.features]:
+    if unknown := [name for name in folder.statistics if name not in folder.info.features]:
         yield Fault(severity="look", message=f"{STATS_PATH} has {', '.join(unknown[:3])}, which is not a feature")
     yield from _image_forms(folder)
 
 
-def _severity(error: float, name: str) -> Severity:
-    return "broken" if error > MIN_BROKEN_ERROR and name not in (*_COUNTED, "timestamp", "frame_index") else "look"
-
-
-def _of_episodes(evidence: Evidence, folder: LeRobotFolder, names: Sequence[str]) -> Iterator[Fault]:
-    """Compare the statistics of each episode, and yield the first error in each."""
-    entries = _old_entries(folder, names) if folder.info.is_old else _table_entries(folder, names)
-    place = OLD_STATS if folder.info.is_old else "the table of episodes"
-    for episode in evidence.episodes:
-        for name, stored in entries.get(episode.number, {}).items():
-            values = _vectors(folder, name, episode.columns[name])
-            if not np.isfinite(values).all():
-                continue
-            error, quantity = _largest_error(stored, values, len(episode.columns[name]), ())
-            if error > MAX_ERROR:
-                yield Fault(
-                    severity="look" if name in _COUNTED or quantity == "count" else _severity(error / 2, name),
-                    episode=episode.number,
-                    value=f"{error:.2g} deviations" if math.isfinite(error) else "missing",
-                    message=f"the {quantity} of {name} in {place} does not match its rows",
-                )
-                break
-
-
-def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
-    """Read the statistics of the episodes before v3.0."""
-    found: dict[int, dict[str, Mapping[str, Any]]] = {}
-    for number, name, stored in episode_statistics(folder, names):
-        found.setdefault(number, {})[name] = stored
-    return found
-
-
-def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
-    """Read the available statistics in the table of episodes."""
-    tables = folder.episode_tables
-    there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
-    columns = {name: [q for q in NAMES if f"stats/{name}/{q}" in there] for name in names}
-    known = [f"stats/{name}/{quantity}" for name, quantities in columns.items() for quantity in quantities]
-    rows = rows_in(folder.root, "meta/episodes", known) if known else ()
-    return {
-        place.episode_index: {
-            name: {quantity: row[f"stats/{name}/{quantity}"] for quantity in quantities}
-            for name, quantities in columns.items()
-            if quantities
-        }
-        for place, row in zip(folder.listed, rows, strict=False)
-    }
-
-
-def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
-    """Convert rows to (N, D); arrays keep only their last dimension, as in LeRobot's statistics."""
-    return np.asarray(rows, dtype=np.float64).reshape(-1, folder.info.features[name].shape[-1])
-
-
-def _quantile_ranges(values: Array) -> Ranges:
-    """Compute the values of the neighbouring ranks: LeRobot reads quantiles off a histogram, others interpolate."""
-    ordered, last = np.sort(values, axis=0), len(values) - 1
-    ranks = {name: share * last for name, share in QUANTILES.items()}
-    return {
-        name: ordered[[max(math.ceil(rank) - 1, 0), min(math.floor(rank) + 1, last)]] for name, rank in ranks.items()
-    }
-
-
-def _largest_error(
-    stored: Mapping[str, Any] | None, values: Array, count: int, episodes: Sequence[Ranges]
-) -> tuple[float, str]:
-    """Find the largest error of a feature's quantities in standard deviations, and its quantity.
-
-    Args:
-        stored: Quantity -> its numbers.
-        values: (N, D) rows.
-        count: Number of rows.
-        episodes: Quantiles of the episodes; those of the set may be between them.
-    """
-    if not stored:
-        return math.inf, "mean"
-    true = {quantity: getattr(values, quantity)(axis=0) for quantity in ("min", "max", "mean", "std")}
-    scale = np.maximum(true["std"], MIN_DEVIATION)
-    roundings = min(len(values), MAX_SUMMED) * float(np.finfo(np.float32).eps)
-    variance_error = FLOAT32_VARIANCE * roundings * (values**2).mean(axis=0)
-    between = {quantity: _between(quantity, values, episodes) for quantity in QUANTILES}
-    worst = (0.0, "")
-    for quantity in (*true, "count", *QUANTILES):
-        found = numbers_of(stored.get(quantity))
-        if quantity not in stored and quantity in QUANTILES:
-            continue  # older writers have no quantiles
-        if quantity == "count":
-            error = float(np.abs(found - count).max(initial=0.0)) if len(found) else math.inf
-        elif found.shape != scale.shape:
-            error = math.inf
-        elif quantity == "std":
-            low = np.sqrt(np.maximum(true["std"] ** 2 - variance_error, 0.0))
-            high = np.sqrt(true["std"] ** 2 + variance_error)
-            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
-        elif quantity in between:
-            low, high = between[quantity]
-            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
-        else:
-            steps = FLOAT32_SUM * roundings if quantity == "mean" else 4 * float(np.finfo(np.float32).eps)
-            slack = steps * np.abs(true[quantity])
-            error = float((np.maximum(np.abs(found - true[quantity]) - slack, 0.0) / scale).max())
-        worst = max(worst, (error, quantity))
-    return worst
-
-
-def _between(quantity: str, values: Array, episodes: Sequence[Ranges]) -> tuple[Array, Array]:
-    """Compute the (D,) minimum and maximum value that a quantile may have."""
-    low, high = _quantile_ranges(values)[quantity]
-    width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
-    lows = [low, *(each[quantity][0] for each in episodes)]
-    highs = [high, *(each[quantity][1] for each in episodes)]
-    return np.min(lows, axis=0) - width, np.max(highs, axis=0) + width
-
-
-def numbers_of(value: Any) -> Array:
-    """Flatten a nested entry of the statistics to (N,) numbers; (0,) for anything else, including text of numbers."""
-    try:
-        found = np.asarray(value)
-    except (ValueError, OverflowError):
-        return np.zeros(0)
-    return found.reshape(-1).astype(np.float64) if found.dtype.kind in "biuf" else np.zeros(0)
+def _severity(error: StatisticError) -> Severity:
+    """Judge by the size of the error; one episode counts half in training on several."""
+    size = error.error if error.episode is None else error.error / 2
+    is_used = error.feature not in _COUNTED and error.quantity != "count"
+    return "broken" if size > MIN_BROKEN_ERROR and is_used else "look"
 
 
 def _image_forms(folder: LeRobotFolder) -> Iterator[Fault]:

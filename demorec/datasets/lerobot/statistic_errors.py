@@ -1,0 +1,203 @@
+"""Errors of a dataset's statistics, which normalise training data: of the whole dataset and of each episode.
+
+A quantile may also be the mean of the episodes' quantiles, as LeRobot computes it, or between them, as after its merge.
+The deviation of a joint parked far from zero may have the rounding of LeRobot's float32.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.geometry import Array
+from demorec.datasets.lerobot.episode_records import OLD_STATS, episode_statistics
+from demorec.datasets.lerobot.files import open_table, rows_in
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.layout import STATS_PATH
+from demorec.datasets.lerobot.stats import NAMES, QUANTILES
+
+_RENUMBERED = ("index", "episode_index")
+"""Columns that LeRobot's delete, split and merge renumber without updating the statistics."""
+MAX_ERROR = 0.02
+"""Maximum error of statistics, in standard deviations: histograms and sampling cause errors of 0.01."""
+MIN_DEVIATION = 1e-4
+"""Minimum standard deviation used as the unit, for elements that hardly move."""
+MAX_SUMMED = 4000
+"""Number of rows over which the rounding of a float32 sum accumulates: an episode of over a minute at 60 fps."""
+FLOAT32_SUM = 0.25
+"""Error of a float32 sum of N equal values, in N roundings of its result: rounding is uniform while the sum grows."""
+FLOAT32_VARIANCE = 3 * FLOAT32_SUM
+"""Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
+Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
+"""Episode -> feature -> quantity -> its numbers."""
+Ranges = Mapping[str, Array]
+"""Quantile -> (2, D) minimum and maximum allowed value."""
+
+
+class StatisticError(NamedTuple):
+    """The largest error of a feature's statistics.
+
+    Attributes:
+        episode: Episode whose own statistics are wrong; None for those of the whole dataset.
+        place: File with the statistics.
+        feature, quantity: Feature, and its quantity.
+        error: Error in standard deviations; infinite if the quantity is missing.
+    """
+
+    episode: int | None
+    place: str
+    feature: str
+    quantity: str
+    error: float
+
+
+def statistic_errors(
+    folder: LeRobotFolder, episodes: Mapping[int, Mapping[str, NDArray[Any]]]
+) -> Iterator[StatisticError]:
+    """Recompute the statistics of every numeric feature, and yield the first error in each episode and each feature.
+
+    Those of the whole dataset are left out before v3.0, and if not all episodes are given.
+
+    Args:
+        folder: The dataset.
+        episodes: Episode number -> feature -> (T, ...) rows.
+
+    Raises:
+        ExportError: The stored statistics cannot be read.
+    """
+    stats = {} if folder.info.is_old else folder.statistics
+    unused = (*_RENUMBERED, *(name for name in folder.roles.having("label") if name not in stats))
+    names = [name for name, f in folder.info.features.items() if f.is_numeric and name not in unused]
+    yield from _of_episodes(folder, episodes, names)
+    if folder.info.is_old or len(episodes) < len(folder.listed):
+        return
+    for name in names:
+        values = [_vectors(folder, name, rows[name]) for rows in episodes.values() if name in rows]
+        if not values or any(not np.isfinite(each).all() for each in values):
+            continue  # without these numbers a comparison is impossible, and another check reports them
+        ranges = [_quantile_ranges(each) for each in values]
+        count = sum(len(rows[name]) for rows in episodes.values())
+        error, quantity = _largest_error(stats.get(name), np.concatenate(values), count, ranges)
+        if error > MAX_ERROR:
+            yield StatisticError(None, STATS_PATH, name, quantity, error)
+
+
+def _of_episodes(
+    folder: LeRobotFolder, episodes: Mapping[int, Mapping[str, NDArray[Any]]], names: Sequence[str]
+) -> Iterator[StatisticError]:
+    entries = _old_entries(folder, names) if folder.info.is_old else _table_entries(folder, names)
+    place = OLD_STATS if folder.info.is_old else "the table of episodes"
+    for number, rows in episodes.items():
+        for name, stored in entries.get(number, {}).items():
+            if name not in rows:
+                continue
+            values = _vectors(folder, name, rows[name])
+            if not np.isfinite(values).all():
+                continue
+            error, quantity = _largest_error(stored, values, len(rows[name]), ())
+            if error > MAX_ERROR:
+                yield StatisticError(number, place, name, quantity, error)
+                break
+
+
+def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
+    """Read the statistics of the episodes before v3.0."""
+    found: dict[int, dict[str, Mapping[str, Any]]] = {}
+    for number, name, stored in episode_statistics(folder, names):
+        found.setdefault(number, {})[name] = stored
+    return found
+
+
+def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
+    """Read the available statistics in the table of episodes."""
+    tables = folder.episode_tables
+    there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
+    columns = {name: [q for q in NAMES if f"stats/{name}/{q}" in there] for name in names}
+    known = [f"stats/{name}/{quantity}" for name, quantities in columns.items() for quantity in quantities]
+    rows = rows_in(folder.root, "meta/episodes", known) if known else ()
+    return {
+        place.episode_index: {
+            name: {quantity: row[f"stats/{name}/{quantity}"] for quantity in quantities}
+            for name, quantities in columns.items()
+            if quantities
+        }
+        for place, row in zip(folder.listed, rows, strict=False)
+    }
+
+
+def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
+    """Convert rows to (N, D); arrays keep only their last dimension, as in LeRobot's statistics."""
+    return np.asarray(rows, dtype=np.float64).reshape(-1, folder.info.features[name].shape[-1])
+
+
+def _quantile_ranges(values: Array) -> Ranges:
+    """Compute the values of the neighbouring ranks: LeRobot reads quantiles off a histogram, others interpolate."""
+    ordered, last = np.sort(values, axis=0), len(values) - 1
+    ranks = {name: share * last for name, share in QUANTILES.items()}
+    return {
+        name: ordered[[max(math.ceil(rank) - 1, 0), min(math.floor(rank) + 1, last)]] for name, rank in ranks.items()
+    }
+
+
+def _largest_error(
+    stored: Mapping[str, Any] | None, values: Array, count: int, episodes: Sequence[Ranges]
+) -> tuple[float, str]:
+    """Find the largest error of a feature's quantities in standard deviations, and its quantity.
+
+    Args:
+        stored: Quantity -> its numbers.
+        values: (N, D) rows.
+        count: Number of rows.
+        episodes: Quantiles of the episodes; those of the set may be between them.
+    """
+    if not stored:
+        return math.inf, "mean"
+    true = {quantity: getattr(values, quantity)(axis=0) for quantity in ("min", "max", "mean", "std")}
+    scale = np.maximum(true["std"], MIN_DEVIATION)
+    roundings = min(len(values), MAX_SUMMED) * float(np.finfo(np.float32).eps)
+    variance_error = FLOAT32_VARIANCE * roundings * (values**2).mean(axis=0)
+    between = {quantity: _between(quantity, values, episodes) for quantity in QUANTILES}
+    worst = (0.0, "")
+    for quantity in (*true, "count", *QUANTILES):
+        found = numbers_of(stored.get(quantity))
+        if quantity not in stored and quantity in QUANTILES:
+            continue  # older writers have no quantiles
+        if quantity == "count":
+            error = float(np.abs(found - count).max(initial=0.0)) if len(found) else math.inf
+        elif found.shape != scale.shape:
+            error = math.inf
+        elif quantity == "std":
+            low = np.sqrt(np.maximum(true["std"] ** 2 - variance_error, 0.0))
+            high = np.sqrt(true["std"] ** 2 + variance_error)
+            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
+        elif quantity in between:
+            low, high = between[quantity]
+            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
+        else:
+            steps = FLOAT32_SUM * roundings if quantity == "mean" else 4 * float(np.finfo(np.float32).eps)
+            slack = steps * np.abs(true[quantity])
+            error = float((np.maximum(np.abs(found - true[quantity]) - slack, 0.0) / scale).max())
+        worst = max(worst, (error, quantity))
+    return worst
+
+
+def _between(quantity: str, values: Array, episodes: Sequence[Ranges]) -> tuple[Array, Array]:
+    """Compute the (D,) minimum and maximum value that a quantile may have."""
+    low, high = _quantile_ranges(values)[quantity]
+    width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
+    lows = [low, *(each[quantity][0] for each in episodes)]
+    highs = [high, *(each[quantity][1] for each in episodes)]
+    return np.min(lows, axis=0) - width, np.max(highs, axis=0) + width
+
+
+def numbers_of(value: Any) -> Array:
+    """Flatten a nested entry of the statistics to (N,) numbers; (0,) for anything else, including text of numbers."""
+    try:
+        found = np.asarray(value)
+    except (ValueError, OverflowError):
+        return np.zeros(0)
+    return found.reshape(-1).astype(np.float64) if found.dtype.kind in "biuf" else np.zeros(0)
