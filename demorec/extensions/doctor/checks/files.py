@@ -24,6 +24,7 @@ _TYPES = {
 }  # fmt: skip
 _PRECISE = ("timestamp", "float64")
 """A counter that may be more precise than LeRobot's own."""
+_BY_HAND = "correct it in meta/info.json"
 _RATE_TOLERANCE = 0.01
 """Relative tolerance of rates: concatenated files have slightly different ones."""
 _LEAVE_CAMERA_OUT = "restore its videos, or leave it out: demorec dataset drop-features {path} CAMERA --out NEW"
@@ -61,7 +62,9 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
         remedy = REPAIR if "dataset repair" in note else _LEAVE_CAMERA_OUT
         yield Fault(severity=severity, message=note, do=remedy)
     if missing := folder.missing:
-        yield Fault(severity="broken", message=missing.partition(": /")[0], do="complete the recording or the download")
+        yield Fault(
+            severity="broken", message=missing.partition(": /")[0], do=f"complete it, or keep the intact part: {REPAIR}"
+        )
     if not folder.listed:
         yield Fault(
             severity="broken", message="the table of episodes is empty", do="finalize the recording: dataset.finalize()"
@@ -172,7 +175,7 @@ def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
             severity="look",
             value=f"{count} episodes",
             message=f"{end} of {count} episodes is the time of the last frame; LeRobot's edits would lose this frame",
-            do="demorec dataset repair {path} --out NEW",
+            do=REPAIR,
         )
 
 
@@ -260,7 +263,7 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> str:
     measures="videos that differ from info.json",
     unit="files",
     why="Readers expect the stated size and rate: images are resized, shifted, or refused.",
-    do="correct meta/info.json, or encode the video as stated",
+    do=REPAIR,
 )
 def video_format(evidence: Evidence) -> Iterator[Fault]:
     """Compare size, rate, codec and sound of each video file with info.json, and info.json with itself."""
@@ -276,11 +279,13 @@ def video_format(evidence: Evidence) -> Iterator[Fault]:
                     yield Fault(
                         severity="broken",
                         message=f"{key}: {path.name} has {value:.4g} fps, info.json {folder.info.fps}",
+                        do="set fps of meta/info.json to the recorded rate, or encode the video again",
                     )
                 elif quantity in stated and stated[quantity] != value:
                     yield Fault(
                         severity="broken" if quantity in ("height", "width") else "look",
                         message=f"{key}: {quantity} of {path.name} is {value}, info.json states {stated[quantity]}",
+                        do=_BY_HAND if quantity == "sound" else "",
                     )
         yield from _info_against_itself(key, feature, folder)
 
@@ -308,12 +313,15 @@ def _found_format(path: Path, folder: LeRobotFolder) -> dict[str, Any]:
 def _info_against_itself(key: str, feature: DatasetFeature, folder: LeRobotFolder) -> Iterator[Fault]:
     info, (width, height) = feature.info or {}, feature.image_size
     if feature.is_depth and feature.shape[2] != 1:
-        yield Fault(severity="broken", message=f"{key} is a depth map of {feature.shape[2]} channels in info.json")
+        yield Fault(
+            severity="broken", message=f"{key} is a depth map of {feature.shape[2]} channels in info.json", do=_BY_HAND
+        )
     for quantity, value in (("height", height), ("width", width), ("channels", feature.shape[2])):
         if info.get(f"video.{quantity}", value) != value:
             yield Fault(
                 severity="look",
                 message=f"{key}: info.json has video.{quantity} {info[f'video.{quantity}']} and the shape {value}",
+                do=_BY_HAND if quantity == "channels" else "",
             )
     if info.get("video.fps", folder.info.fps) != folder.info.fps:
         yield Fault(

@@ -44,6 +44,8 @@ MIN_RATE_CHANGE = 1.5
 """Minimum usual change of images, of 255, for a close examination: codecs skip smaller ones in every second image."""
 MIN_REPEATED = 0.3
 """Minimum ratio of repeated images of a camera that is slower than the frames."""
+MIN_REPEATED_OF_FEW = 0.45
+"""The same ratio in a set of up to three episodes, in which a codec that skips every third image looks like one."""
 MIN_FIT = 0.8
 """Minimum correlation of an episode's mean image with that of another camera, or with its rotated own, that implies the
 same view."""
@@ -225,7 +227,10 @@ def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_
     do="record at the camera's own rate, or accept it: the images are late by up to a period",
 )
 def repeated_images(evidence: Evidence) -> Iterator[Fault]:
-    """Find cameras with regularly repeated images: short repeats in at least a third of the moving frames."""
+    """Find cameras with regularly repeated images: short repeats in at least a third of the moving frames.
+
+    In a set of up to three episodes, it must be half of them.
+    """
     evidence.need_state()
     for camera, images in evidence.need_images().items():
         shares: dict[int, float] = {}
@@ -241,7 +246,8 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
                 shares[number] = _share_repeated(gaps)
         if not shares:
             continue
-        slow = [number for number, share in shares.items() if share > MIN_REPEATED]
+        least = MIN_REPEATED if len(shares) > MIN_OTHERS else MIN_REPEATED_OF_FEW
+        slow = [number for number, share in shares.items() if share > least]
         if len(slow) > len(shares) / 2:
             share = float(np.median(list(shares.values())))
             rate = evidence.fps * (1 - share)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -19,6 +19,12 @@ MAX_VELOCITY_ERROR = 0.2
 tenth, 24 frames per second instead of 30 by a quarter."""
 MIN_AGREED = 0.3
 """Minimum squared correlation of the two: that of different joints is lower."""
+MIN_OTHERS = 3
+"""Minimum number of episodes to compare one with."""
+MIN_COMMON_AXIS = 0.95
+"""Minimum agreement of mean rotations, the cosine of half their angle: 36 degrees, as hands at one task differ."""
+MAX_OTHER_AXIS = 0.8
+"""Maximum agreement of a rotation that is another one: they differ by 74 degrees or more."""
 MAX_NORM_ERROR = 0.02
 """Maximum distance of a quaternion's length from one: float16 rounds to 0.001, interpolation loses 0.01."""
 
@@ -97,13 +103,17 @@ def _velocity_ratios(state: Array, steps: Array, window: int) -> tuple[Array, Ar
 @check(
     family="numbers",
     needs="quaternions",
-    measures="quaternions that are not of unit length",
+    measures="quaternions of wrong length, order or sign",
     unit="length",
-    why="It is not a rotation: the order of the elements is wrong, or one of them is missing.",
+    why="It is another rotation, or none; a change of sign is a jump of the state without any motion.",
     do="compare the order of the elements in the recorder with their names",
 )
-def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
-    """Measure the length of each group of four elements named x, y, z and w of one rotation."""
+def quaternion_form(evidence: Evidence) -> Iterator[Fault]:
+    """Measure the length of each group of four elements named x, y, z and w of one rotation.
+
+    An episode has another order of elements if its usual rotation agrees with that of the others only with w moved from
+    one end to the other. A sign that changes between two frames is worth a look if it does not in most episodes.
+    """
     places = [
         (name, place)
         for name, column in evidence.roles.columns.items()
@@ -113,12 +123,14 @@ def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
     if not places:
         raise NotApplicableError("no elements have the names of a quaternion")
     for name, place in places:
-        worst: dict[int, float] = {}
-        for episode in evidence.episodes:
-            if name in episode.columns and evidence.roles.of[name] not in ("command", "action"):
-                four = without_gaps(episode.columns[name])[:, place : place + 4]
-                error = np.abs(np.linalg.norm(four, axis=1) - 1)
-                worst[episode.number] = float(np.median(error))
+        fours = {
+            episode.number: without_gaps(episode.columns[name])[:, place : place + 4]
+            for episode in evidence.episodes
+            if name in episode.columns and evidence.roles.of[name] not in ("command", "action")
+        }
+        yield from _order_faults(name, fours)
+        yield from _sign_faults(name, fours)
+        worst = {n: float(np.median(np.abs(np.linalg.norm(four, axis=1) - 1))) for n, four in fours.items()}
         bad = {number: error for number, error in worst.items() if error > MAX_NORM_ERROR}
         if len(bad) > len(worst) / 2:
             number, error = max(bad.items(), key=lambda item: item[1])
@@ -136,6 +148,45 @@ def quaternion_length(evidence: Evidence) -> Iterator[Fault]:
                 message=f"its quaternion in {name} is not of unit length",
                 do=DROP,
             )
+
+
+def _order_faults(name: str, fours: Mapping[int, Array]) -> Iterator[Fault]:
+    """Find episodes with w at the other end than in most."""
+    axes = {number: _main_axis(four) for number, four in fours.items() if len(four)}
+    if len(axes) <= MIN_OTHERS:
+        return
+    common = _main_axis(np.stack(list(axes.values())))
+    if np.median([abs(axis @ common) for axis in axes.values()]) < MIN_COMMON_AXIS:
+        return
+    for number, axis in axes.items():
+        moved = max(abs(np.roll(axis, step) @ common) for step in (1, -1))
+        if moved > MIN_COMMON_AXIS and abs(axis @ common) < MAX_OTHER_AXIS:
+            yield Fault(
+                severity="broken",
+                episode=number,
+                message=f"its quaternion in {name} has its scalar at the other end than those of the others",
+                do=DROP,
+            )
+
+
+def _main_axis(four: Array) -> Array:
+    """Compute the (4,) mean of (N, 4) quaternions, for which both signs are the same rotation."""
+    return np.asarray(np.linalg.eigh(four.T @ four)[1][:, -1])
+
+
+def _sign_faults(name: str, fours: Mapping[int, Array]) -> Iterator[Fault]:
+    """Find episodes in which a quaternion changes its sign between two frames, unlike in most."""
+    changes = {n: np.flatnonzero((four[1:] * four[:-1]).sum(axis=1) < 0) for n, four in fours.items()}
+    changing = {number: frames for number, frames in changes.items() if len(frames)}
+    for number, frames in changing.items() if len(changing) <= len(changes) / 2 else ():
+        yield Fault(
+            severity="look",
+            episode=number,
+            frames=(int(frames[0]) + 1, int(frames[-1]) + 1),
+            value=f"{len(frames)} changes",
+            message=f"its quaternion in {name} changes its sign in frame {frames[0] + 1}, without any motion",
+            do="keep the sign of the preceding frame in the program that recorded it, or drop the episode: " + DROP,
+        )
 
 
 @check(
