@@ -22,7 +22,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import ConfigError, ExportError, resource_error, write_error
+from demorec.core.errors import ConfigError, DemorecError, ExportError, resource_error, write_error
 from demorec.core.files import open_locked, sync_path
 from demorec.core.replacing import ReplaceableKind, check_replaceable, json_object, shown
 
@@ -59,6 +59,7 @@ def atomic_write(
         ConfigError: The target exists and must stay, another command is writing it, or another file has appeared there.
         In the last case the result is kept next to it, under the name in the error message.
         ExportError: It cannot be written for another reason, such as a full disk.
+        DemorecError: A source has disappeared or cannot be read.
     """
     with atomic_write_all([target], kind, overwrite=overwrite, sources=sources) as (part,):
         yield part
@@ -98,8 +99,16 @@ def atomic_write_all(
     except BrokenPipeError:  # the reader of standard output has closed it
         raise
     except OSError as error:
+        if isinstance(error.filename, str) and _is_below(error.filename, sources, other_than=(workshop, *places)):
+            raise DemorecError(f"The source cannot be read ({error.strerror}): {error.filename}") from error
         what = f"{kind.name[0].upper()}{kind.name[1:]}"
         raise resource_error(error) or write_error(what, error, targets[0], ExportError) from error
+
+
+def _is_below(name: str, folders: Iterable[Path], *, other_than: Iterable[Path]) -> bool:
+    path = Path.cwd() / name
+    is_other = any(path.resolve().is_relative_to(place) for place in other_than)
+    return not is_other and any(path.is_relative_to(Path.cwd() / folder) for folder in folders)
 
 
 def snapshot(path: Path) -> Snapshot:
