@@ -79,16 +79,26 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
     """Find episodes with images that the state of another episode explains far better than their own, at any lag.
 
     Images that no state explains are not evidence: the robot may be where no other episode was. The gain must be an
-    outlier among those of usual episodes, since the states of similar episodes explain each other's images.
+    outlier among those of usual episodes, since the states of similar episodes explain each other's images. All cameras
+    are of one take: an episode is not reported if its state explains the images of another camera as usual.
     """
-    for camera, fits in _judged(evidence):
-        usual_best = float(np.median([fit.best for fit in fits.values()]))
+    judged = dict(_judged(evidence))
+    usual_bests = {camera: float(np.median([fit.best for fit in fits.values()])) for camera, fits in judged.items()}
+    confirmed = {
+        number
+        for camera, fits in judged.items()
+        for number, fit in fits.items()
+        if fit.best > MIN_OTHER_RATIO * usual_bests[camera]
+    }
+    for camera, fits in judged.items():
+        usual_best = usual_bests[camera]
         gains = {number: _other_gain(fit) for number, fit in fits.items() if fit.by_another is not None}
         usual_gain = max((gains[n] for n in gains if fits[n].best >= MAX_UNRELATED_RATIO * usual_best), default=1.0)
         for number, gain in gains.items():
             fit = fits[number]
             explained = fit.by_another or 0.0
-            if explained > MIN_OTHER_RATIO * usual_best and gain > MIN_OTHER_GAIN * max(usual_gain, 1.0):
+            is_other = explained > MIN_OTHER_RATIO * usual_best and gain > MIN_OTHER_GAIN * max(usual_gain, 1.0)
+            if is_other and number not in confirmed:
                 yield Fault(
                     severity="broken",
                     episode=number,
