@@ -176,7 +176,8 @@ def test_a_command_reads_it(
     if command == "info" and kind in ("mcap", "rosbag2", "folder of bags"):  # whose topics are listed
         assert printed.out.count("/follower/joint_states") == episodes
     elif command == "info":
-        assert f"{episodes} " in printed.out
+        is_one = kind in ("simulation", "recorder")  # a recording, which is one episode
+        assert is_one or re.search(rf"episodes +{episodes}\b|\b{episodes} (of|episodes?|recordings?)\b", printed.out)
         assert all(str(count) in printed.out for count in FRAMES_OF.get(kind, (frames,)))
     if command == "import":
         recordings = sorted((tmp_path / "new" / "episodes").glob("*.mcap"))
