@@ -387,6 +387,9 @@ def test_the_table_of_episodes_may_list_the_tasks_of_annotations(listed: str, co
     assert exit_code("check", source, "--only", "contradicting_counts") == 0
     pq.write_table(episodes.drop_columns("tasks").append_column("tasks", both), source / EPISODES)
     assert exit_code("check", source, "--only", "contradicting_counts") == code
+    assert exit_code("dataset", "select", source, "--episodes", "2", "--out", tmp_path / "new") == 0
+    (stored,) = pq.read_table(tmp_path / "new" / EPISODES)["tasks"].to_pylist()
+    assert stored == ["close the drawer", "valid"][: 2 - code]
 
 
 def test_features_missing_from_info_json_are_distinguished_from_missing_columns(

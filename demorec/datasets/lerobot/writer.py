@@ -78,6 +78,7 @@ class EpisodeData:
         language: Statements; written if the dataset has language columns that `columns` lacks.
         facts: Column of the table of episodes -> value; written if the dataset has the column.
         row_tasks: Instruction of each row, if there are several; `task` is the first.
+        annotated_tasks: Tasks of annotation columns, which the table of episodes also lists.
         timestamps: (T,) float32 or float64 seconds; None for multiples of 1/fps.
         record: Its data for the sidecar; None in a dataset without one.
         boxes: Camera feature -> visible objects, if known.
@@ -91,6 +92,7 @@ class EpisodeData:
     language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
     facts: Mapping[str, Any] = field(default_factory=dict)
     row_tasks: Sequence[str] = ()
+    annotated_tasks: Sequence[str] = ()
     timestamps: NDArray[Any] | None = None
     record: EpisodeRecord | None = None
     boxes: Mapping[str, SeenByCamera] = field(default_factory=dict)
@@ -199,7 +201,7 @@ class DatasetWriter(Closing):
         self._write_rows({**columns, **{name: texts[name] for name in spoken}})
         row: dict[str, Any] = {
             "episode_index": self.num_episodes,
-            "tasks": list(tasks),
+            "tasks": list(dict.fromkeys([*tasks, *episode.annotated_tasks])),
             "length": frames,
             "data/chunk_index": position.chunk,
             "data/file_index": position.file,

@@ -155,6 +155,7 @@ class _Reader:
         video_info: dict[str, dict[str, Any]] = {}
         pixels: dict[str, PixelHistogram | Statistics] = {}
         language = EpisodeLanguage()
+        annotated: set[str] = set()
         num_decoded = 0
         for name, mapping in self._mappings.items():
             feature = self._features[name]
@@ -164,6 +165,7 @@ class _Reader:
             if mapping.feature in self._references:
                 values = column_numbers(self._column(rows, mapping, feature))
                 columns[name] = renumbered(values, self._task_numbers)
+                annotated.update(task for number, task in enumerate(self.source.tasks) if number in values)
                 continue
             if feature.is_video:
                 stored = self.source.video(mapping.feature, place)
@@ -189,6 +191,7 @@ class _Reader:
             language=language,
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
+            annotated_tasks=[task for task in place.tasks if task in annotated],
             timestamps=self._timestamps(rows, cut),
             record=self._sidecar.record(cut) if self._has_sidecar else None,
             boxes=self._sidecar.boxes(cut),
