@@ -94,3 +94,11 @@ def test_the_only_file_of_a_bag_is_read_under_another_name(
     file.rename(path / f"monday{file.suffix}")
     assert exit_code("info", path, "--json") == 0
     assert json.loads(capsys.readouterr().out)["messages"] == len(notes)
+
+
+def test_no_mapping_is_offered_for_a_bag_without_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = bags.write_mcap([], tmp_path / "empty.mcap")
+    assert exit_code("info", path) == 0
+    printed = capsys.readouterr().out
+    assert "0 messages" in printed
+    assert "--suggest" not in printed

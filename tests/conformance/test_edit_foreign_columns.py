@@ -167,6 +167,7 @@ def test_doubles_under_float32_are_named_and_imported(tmp_path: Path, capsys: py
     assert "float32 of action, which the data files hold as float64" in capsys.readouterr().out
     assert json.loads((tmp_path / "new/meta/info.json").read_text())["features"]["action"]["dtype"] == "float64"
     assert exit_code("import", "lerobot", source, "--out", tmp_path / "run") == 0
+    assert "action is rounded to float32, its type in info.json" in capsys.readouterr().out
     with Recording(recordings(tmp_path / "run")[1]) as recording:
         np.testing.assert_array_equal(
             recording.table().features["action"], values[LENGTH : 2 * LENGTH].astype("float32")

@@ -7,57 +7,20 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
-from demorec.datasets.lerobot.files import open_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     CODEBASE_VERSION,
     DATA_PATH,
-    NUMBER_TYPES,
     VIDEO_PATH,
     DatasetFeature,
     DatasetInfo,
-    FeatureType,
 )
+from demorec.datasets.lerobot.stored_types import mistyped_features
 from demorec.episode.features import ACTION, STATE
-
-_NUMPY_NAMES = {"float": "float32", "double": "float64"}
-"""Arrow's type names -> NumPy's."""
-
-
-def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
-    """Find numeric features whose type in the data files differs from info.json -> the files' type.
-
-    If files differ, it is the type that holds all their numbers.
-    """
-    numeric = {name: feature for name, feature in source.info.features.items() if feature.is_numeric}
-    stored: dict[str, set[str]] = {}
-    for path in source.data_tables:
-        schema = open_table(path).schema_arrow
-        for name in numeric:
-            if name in schema.names:
-                stored.setdefault(name, set()).add(str(_number_type(schema.field(name).type)))
-    found: dict[str, FeatureType] = {}
-    for name, kinds in stored.items():
-        if name in AUTOMATIC_FEATURES and name != "timestamp":
-            continue
-        dtypes = {_NUMPY_NAMES.get(kind, kind) for kind in kinds}
-        if dtypes <= set(NUMBER_TYPES) and dtypes != {numeric[name].dtype}:
-            found[name] = str(np.result_type(*dtypes))  # type: ignore[assignment]
-    return found
-
-
-def _number_type(column: pa.DataType) -> pa.DataType:
-    """Number type in a column of numbers, lists or arrays."""
-    if isinstance(column, pa.BaseExtensionType):
-        column = column.storage_type
-    while pa.types.is_list(column) or pa.types.is_fixed_size_list(column) or pa.types.is_large_list(column):
-        column = column.value_type
-    return column
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from itertools import islice
 from pathlib import Path
@@ -24,6 +24,7 @@ from demorec.datasets.lerobot.layout import is_task_reference
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
 from demorec.datasets.lerobot.recorded_features import NOT_HELD, why_not_recorded
 from demorec.datasets.lerobot.recording import DatasetRecording
+from demorec.datasets.lerobot.stored_types import mistyped_features
 from demorec.datasets.options import select_episodes
 from demorec.episode.info import Camera, EpisodeInfo, Origin, SourceFile
 from demorec.episode.roles import NO_NAMES, NamedRoles
@@ -104,7 +105,7 @@ def import_lerobot(
         cameras=fates,
         left_out=left_out,
         skipped={f"episode {index}": reason for index, reason in skipped.items()},
-        notes=dataset.notes,
+        notes=(*dataset.notes, *_rounded(dataset)),
     )
 
 
@@ -187,6 +188,17 @@ def _left_out(dataset: LeRobotFolder) -> dict[str, str]:
     if any(row["root_seed"] is not None for row in dataset.known.values()):
         found[f"{SIDECAR_DIR}/episodes"] = "scenes, phases and conditions of success are not read back"
     return found
+
+
+def _rounded(dataset: LeRobotFolder) -> Iterator[str]:
+    """Name the features that are read as float32, as LeRobot does, from more precise numbers."""
+    imported = {feature.name for feature in dataset.features}
+    found: Mapping[str, str] = {}
+    with suppress(ExportError):  # an unreadable file is reported for its own episodes
+        found = mistyped_features(dataset)
+    for name, stored in found.items():
+        if name in imported and stored == "float64" and dataset.info.features[name].dtype == "float32":
+            yield f"{name} is rounded to float32, its type in info.json; the data files hold float64."
 
 
 def _cameras(dataset: LeRobotFolder, survey: _Survey) -> tuple[dict[str, Camera], dict[str, str]]:

@@ -34,8 +34,11 @@ def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
     for topic in plain["topics"]:
         rate = f"{topic['rate']:.1f} Hz" if topic["rate"] else ""
         rows.append((topic["topic"], str(topic["messages"]), rate, topic["type"]))
-    lines = [*aligned(facts), "", *aligned(rows)]
-    return plain, [*lines, "", f"demorec import {path} --suggest writes a mapping of these topics."]
+    lines = aligned(facts)
+    if plain["topics"]:
+        suggest = f"demorec import {path} --suggest writes a mapping of these topics."
+        lines = [*lines, "", *aligned(rows), "", suggest]
+    return plain, lines
 
 
 def describe_hdf5(path: Path) -> tuple[dict[str, Any], list[str]]:

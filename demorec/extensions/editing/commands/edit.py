@@ -142,7 +142,7 @@ class EditOne(Edit):
 
 def _changes(plan: Plan) -> list[str]:
     """Lines about the changes of episodes."""
-    from demorec.extensions.editing.plan import mistyped_features
+    from demorec.datasets.lerobot.stored_types import mistyped_features
 
     lines = []
     for source in plan.sources:
