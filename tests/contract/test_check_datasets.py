@@ -181,6 +181,12 @@ def test_a_warning(name: str, dataset: Path) -> None:
     assert verdict_of(dataset, check, "dataset") == "look"
 
 
+def test_statistics_without_a_count_are_called_missing(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    edit_json(dataset / "meta/stats.json", lambda data: data["action"].pop("count"))
+    assert exit_code("check", dataset, "--only", "wrong_statistics") == 0
+    assert "the count of action in meta/stats.json is missing" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize("is_ours", [True, False])
 def test_the_good_one_passes(is_ours: bool, dataset: Path) -> None:
     if not is_ours:

@@ -41,11 +41,13 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     if not (evidence.path / stats_path).exists():
         raise NotMeasuredError(f"{stats_path} is missing")
     for error in statistic_errors(folder, {each.number: each.columns for each in evidence.episodes}):
+        is_there = math.isfinite(error.error)
+        found = "does not match the rows" if is_there else "is missing"
         yield Fault(
             severity=_severity(error),
             episode=error.episode,
-            value=f"{error.error:.2g} deviations" if math.isfinite(error.error) else "missing",
-            message=f"the {error.quantity} of {error.feature} in {error.place} does not match the rows",
+            value=f"{error.error:.2g} deviations" if is_there else "missing",
+            message=f"the {error.quantity} of {error.feature} in {error.place} {found}",
         )
     if folder.info.is_old:
         return  # training aggregates the episodes' statistics
