@@ -195,6 +195,27 @@ def test_a_fast_start_of_the_whole_arm_is_not_a_jump(is_whole: bool, sound: Evid
     assert found(diagnose(spoilt(sound, start)), "state_jumps") == (set() if is_whole else {BAD})
 
 
+@pytest.mark.parametrize("num_resting", [1, EPISODES])
+def test_the_pose_of_an_object_rests_until_it_is_touched(num_resting: int, sound: Evidence) -> None:
+    """In simulation an object rests bit-exactly; a sensor that rests in one episode alone is frozen."""
+    roles = find_roles(
+        {
+            "observation.state": Column("float32", NAMES),
+            "action": Column("float32", NAMES),
+            "observation.object": Column("float32", ("x", "y", "yaw")),
+        },
+        NO_NAMES,
+    )
+    episodes = []
+    for number, each in enumerate(sound.episodes):
+        pose = np.random.default_rng(number).normal(size=(each.length, 3))
+        if number < num_resting:
+            pose[20:60] = pose[20]
+        episodes.append(replace(each, columns={**each.columns, "observation.object": pose}))
+    diagnosis = diagnose(replace(sound, roles=roles, episodes=episodes, cameras={}))
+    assert found(diagnosis, "frozen_sensors") == ({0} if num_resting == 1 else set())
+
+
 def test_a_copy_and_a_lone_instruction(sound: Evidence) -> None:
     twin = replace(sound.episodes[2], number=EPISODES)
     other = replace(sound.episodes[4], instruction="open the drawer")

@@ -15,6 +15,10 @@ MIN_LIVE_SHARE = 0.5
 """Minimum ratio of moving frames in which a sensor changes, for its rests to be judged."""
 MIN_REST_S = 0.3
 MIN_BROKEN_S = 1.0
+MIN_OTHERS = 3
+"""Minimum number of episodes to compare one with."""
+REST_TIMES = 4.0
+"""Minimum factor over the usual longest rest of the other episodes."""
 MIN_SPEED = 0.3
 """Minimum speed, relative to the root mean square, at which the robot counts as moving."""
 
@@ -30,26 +34,29 @@ MIN_SPEED = 0.3
 def frozen_sensors(evidence: Evidence) -> Iterator[Fault]:
     """Find measured columns that repeat bit-exactly while the robot moves, though they usually change.
 
-    A sensor may rest at zero, as a contact sensor does, or at a value that it keeps in half of the moving frames.
+    A sensor may rest at zero, as a contact sensor does, or at a value that it keeps in half of the moving frames. Rests
+    must exceed those of the other episodes: the pose of an object rests in each until the robot touches it.
     """
     episodes = evidence.need_state(8)
     measured = evidence.roles.having("sensor", "velocity", "pose")
     names = [name for name in measured if name not in evidence.roles.state and evidence.roles.columns[name].is_vector]
     if not names:
         raise NotMeasuredError("the state is the only measured column")
-    for episode, _ in episodes:
-        for name in names:
-            if name in episode.columns and (rest := _longest_rest(episode, episode.columns[name])) is not None:
-                first, end, moving = rest
-                seconds = evidence.seconds(moving)
-                if seconds > MIN_REST_S:
-                    yield Fault(
-                        severity="broken" if seconds > MIN_BROKEN_S else "look",
-                        episode=episode.number,
-                        frames=(first, end),
-                        value=f"{seconds:.1f} s",
-                        message=f"{name} keeps its values for {seconds:.1f} s while the robot moves",
-                    )
+    for name in names:
+        having = [episode for episode, _ in episodes if name in episode.columns]
+        rests = [_longest_rest(episode, episode.columns[name]) or (0, 0, 0) for episode in having]
+        for number, (episode, (first, end, moving)) in enumerate(zip(having, rests, strict=True)):
+            others = [other for _, _, other in rests[:number] + rests[number + 1 :]]
+            usual = float(np.median(others)) if len(others) >= MIN_OTHERS else 0.0
+            seconds = evidence.seconds(moving)
+            if seconds > MIN_REST_S and moving > REST_TIMES * usual:
+                yield Fault(
+                    severity="broken" if seconds > MIN_BROKEN_S else "look",
+                    episode=episode.number,
+                    frames=(first, end),
+                    value=f"{seconds:.1f} s",
+                    message=f"{name} keeps its values for {seconds:.1f} s while the robot moves",
+                )
 
 
 def _longest_rest(episode: EpisodeEvidence, table: Array) -> tuple[int, int, int] | None:
