@@ -45,7 +45,7 @@ MIN_RATE_CHANGE = 1.5
 MIN_REPEATED = 0.3
 """Minimum ratio of repeated images of a camera that is slower than the frames."""
 MIN_REPEATED_OF_FEW = 0.45
-"""The same ratio in a set of up to three episodes, in which a codec that skips every third image looks like one."""
+"""The same ratio in up to three episodes: a codec that skips every third image of slow motion looks like a camera."""
 MIN_FIT = 0.8
 """Minimum correlation of an episode's mean image with that of another camera, or with its rotated own, that implies the
 same view."""
@@ -229,7 +229,7 @@ def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_
 def repeated_images(evidence: Evidence) -> Iterator[Fault]:
     """Find cameras with regularly repeated images: short repeats in at least a third of the moving frames.
 
-    In a set of up to three episodes, it must be half of them.
+    In a single episode, or a set of up to three, it must be half of them.
     """
     evidence.need_state()
     for camera, images in evidence.need_images().items():
@@ -258,7 +258,7 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
                 f"{evidence.fps:g}",
             )
         elif float(np.median(list(shares.values()))) == 0:
-            for number in slow:
+            for number in (number for number in slow if shares[number] > MIN_REPEATED_OF_FEW):
                 yield Fault(
                     severity="look",
                     episode=number,

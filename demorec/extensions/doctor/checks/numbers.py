@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.episode.element_names import joint_of
-from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence, number_in_words
+from demorec.extensions.doctor.evidence import DROP, Evidence, number_in_words
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.units import MIN_UNIT_RATIO, other_units, state_bounds
 
@@ -177,7 +177,7 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     typical = [np.quantile(np.abs(np.diff(state, axis=0)), 0.98, axis=0) for _, state in episodes]
     lowest, highest = evidence.once(state_bounds)
     limit = np.maximum(MIN_JUMP_STEPS * np.median(typical, axis=0), MIN_JUMP_RANGE * (highest - lowest))
-    limit = np.maximum(limit, MIN_JUMP_TICKS * _ticks(episodes))
+    limit = np.maximum(limit, MIN_JUMP_TICKS * evidence.once(element_ticks))
     if len(episodes) > MIN_OTHERS:
         limit = np.maximum(limit, 2 * np.median(largest, axis=0))
     for episode, state in episodes:
@@ -219,9 +219,9 @@ def _accompanied(speeds: Array, jumps: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.asarray(beside[:, None] > MIN_COMPANY * speeds)
 
 
-def _ticks(episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Array:
+def element_ticks(evidence: Evidence) -> Array:
     """Compute the (D,) smallest difference between two frames of each element: at most its encoder's resolution."""
-    steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in episodes])
+    steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in evidence.with_state()])
     smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
     return np.where(np.isfinite(smallest), smallest, 0.0)
 
