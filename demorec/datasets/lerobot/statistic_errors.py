@@ -160,7 +160,9 @@ def _largest_error(
     scale = np.maximum(true["std"], MIN_DEVIATION)
     roundings = min(len(values), MAX_SUMMED) * float(np.finfo(np.float32).eps)
     variance_error = FLOAT32_VARIANCE * roundings * (values**2).mean(axis=0)
-    between = {quantity: _between(quantity, values, episodes) for quantity in QUANTILES}
+    width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
+    known = [_quantile_ranges(values), *episodes]
+    between = {quantity: _between([each[quantity] for each in known], width) for quantity in QUANTILES}
     worst = (0.0, "")
     for quantity in (*true, "count", *QUANTILES):
         found = numbers_of(stored.get(quantity))
@@ -185,13 +187,10 @@ def _largest_error(
     return worst
 
 
-def _between(quantity: str, values: Array, episodes: Sequence[Ranges]) -> tuple[Array, Array]:
-    """Compute the (D,) minimum and maximum value that a quantile may have."""
-    low, high = _quantile_ranges(values)[quantity]
-    width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
-    lows = [low, *(each[quantity][0] for each in episodes)]
-    highs = [high, *(each[quantity][1] for each in episodes)]
-    return np.min(lows, axis=0) - width, np.max(highs, axis=0) + width
+def _between(ranges: Sequence[Array], width: Array) -> tuple[Array, Array]:
+    """Compute the (D,) minimum and maximum value that a quantile may have, from N times (2, D)."""
+    stacked = np.stack(ranges)
+    return stacked[:, 0].min(axis=0) - width, stacked[:, 1].max(axis=0) + width
 
 
 def numbers_of(value: Any) -> Array:

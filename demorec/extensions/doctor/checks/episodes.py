@@ -25,7 +25,7 @@ MIN_END_SPEED = 0.8
 """Minimum final speed, relative to the episode's root mean square, of an episode that ends during a motion."""
 MAX_REST_SPEED = 0.3
 """Maximum final speed, relative to the same, of an episode that ends at rest."""
-MIN_RESTING_SHARE = 0.8
+MIN_RESTING_SHARE = 0.9
 """Minimum ratio of other episodes ending at rest for a moving end to count as cut off."""
 END_S = 0.2
 MIN_IDLE_S = 3.0
@@ -59,7 +59,7 @@ def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
             speeds[episode.number] = float(speed[-count:].mean()) / size
     if len(speeds) <= MIN_OTHERS:
         raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
-    at_rest = np.mean([each < MAX_REST_SPEED for each in speeds.values()])
+    at_rest = sum(each < MAX_REST_SPEED for each in speeds.values()) / (len(speeds) - 1)  # of the others
     for number, end_speed in speeds.items() if at_rest >= MIN_RESTING_SHARE else ():
         if end_speed > MIN_END_SPEED:
             yield Fault(

@@ -24,6 +24,8 @@ MIN_SHIFT = 1.5
 MIN_GAIN = 1.4
 """Minimum factor by which an episode's own lag reduces the unexplained variance, compared with the usual one."""
 
+MIN_TAKES = 8
+"""Minimum number of episodes to find one of another take: a fit to fewer does not reach where only one episode goes."""
 MIN_OTHER_RATIO = 0.5
 """Minimum part of the usually explained variance that another episode's state must explain."""
 MIN_OTHER_GAIN = 2.0
@@ -41,7 +43,7 @@ factor of episodes whose own state explains the images as usual."""
 )
 def image_lag(evidence: Evidence) -> Iterator[Fault]:
     """Find the delay at which the images match the state best: in the set, and in each episode against the others."""
-    for camera, fits in _judged(evidence):
+    for camera, fits in _judged(evidence, MIN_EPISODES):
         lags = {number: fit.lag for number, fit in fits.items()}
         usual_lag, spread = usual(list(lags.values()), floor=0.2)
         if abs(usual_lag) > max(MAX_SET_LAG_S * evidence.fps, 2.0):
@@ -69,7 +71,7 @@ def _gain(fit: ViewFit, usual_lag: float) -> float:
 
 @check(
     family="images",
-    needs="images, state, five episodes",
+    needs="images, state, eight episodes",
     measures="images of another recording",
     unit="% explained",
     why="The policy learns actions that do not belong to the images.",
@@ -82,7 +84,7 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
     outlier among those of usual episodes, since the states of similar episodes explain each other's images. All cameras
     are of one take: an episode is not reported if its state explains the images of another camera as usual.
     """
-    judged = dict(_judged(evidence))
+    judged = dict(_judged(evidence, MIN_TAKES))
     usual_bests = {camera: float(np.median([fit.best for fit in fits.values()])) for camera, fits in judged.items()}
     confirmed = {
         number
@@ -113,14 +115,14 @@ def _other_gain(fit: ViewFit) -> float:
     return (1 - fit.best) / max(1 - (fit.by_another or 0.0), 1e-3)
 
 
-def _judged(evidence: Evidence) -> Iterator[tuple[str, Mapping[int, ViewFit]]]:
+def _judged(evidence: Evidence, min_episodes: int) -> Iterator[tuple[str, Mapping[int, ViewFit]]]:
     """Yield each camera with images that the state usually explains."""
     evidence.need_state(MIN_FRAMES)
     reasons = []
     for camera in evidence.need_images():
         fits = evidence.once(view_fits).get(camera, {})
-        if len(fits) < MIN_EPISODES:
-            reasons.append(f"{camera} has fewer than {MIN_EPISODES} episodes of {MIN_FRAMES} frames")
+        if len(fits) < min_episodes:
+            reasons.append(f"{camera} has fewer than {min_episodes} episodes of {MIN_FRAMES} frames")
         elif np.median([fit.explained.max() for fit in fits.values()]) < MIN_EXPLAINED:
             reasons.append(f"{camera} shows too little of the robot")
         else:
