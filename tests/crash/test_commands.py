@@ -29,6 +29,18 @@ from demorec.core.limited import VARIABLE
 from demorec.core.tables import EXPORTERS
 
 KILLS = 8
+PROGRAM = """
+from demorec.core.streams import open_closed_streams
+
+open_closed_streams()
+
+import sys
+
+from support import crash_rows
+
+crash_rows.{name}(sys.argv[1:])
+"""
+"""As `demorec/__main__.py` begins, with the program of a row."""
 MINE = "years of work"
 
 pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
@@ -293,11 +305,15 @@ def test_a_second_interrupt_during_the_clean_up(name: str, sources: Path, tmp_pa
 def test_closed_streams(name: str, sources: Path, tmp_path: Path) -> None:
     """The output is lost, and no target is left incomplete."""
     case = Case(name, sources, tmp_path, replaces=False)
-    program = [sys.executable, "-m", "demorec", *case.words]
+    program = [sys.executable, "-c", PROGRAM.format(name=case.row.program.__name__), *case.words]
     for line in ('"$@" >&-', '"$@" 2>&-', '"$@" | true; exit ${PIPESTATUS[0]}'):
         case.start_anew()
         ended = subprocess.run(
-            ["bash", "-c", line, "bash", *program], cwd=case.folder, capture_output=True, check=False
+            ["bash", "-c", line, "bash", *program],
+            cwd=case.folder,
+            env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])},
+            capture_output=True,
+            check=False,
         )
         assert ended.returncode in (0, 1), line
         case.check_whole(line)
