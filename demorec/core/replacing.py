@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, DemorecError, resource_error, write_error
 from demorec.core.files import MAX_JSON_BYTES, MCAP_MAGIC, RERUN_MAGICS, read_json_limited
 
 _SHOWN = 5
@@ -175,10 +175,18 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
         folder: Folder of the parts.
         names: Names of files and folders, existing or not. The presence of the first one means that the replacements
         are complete: it is moved away first and restored last.
+
+    Raises:
+        ConfigError: The folder cannot be written to.
+        ResourceError: The disk is full.
     """
     aside = folder / _ASIDE
-    aside.mkdir()
-    (aside / _MARK).write_text(_MARK_TEXT)
+    try:
+        aside.mkdir()
+        (aside / _MARK).write_text(_MARK_TEXT)
+    except OSError as error:
+        _put_back(folder, ())
+        raise resource_error(error) or write_error("The folder", error, folder, DemorecError) from error
     try:
         for name in names:
             if os.path.lexists(folder / name):
@@ -238,5 +246,6 @@ def _put_back(folder: Path, names: Sequence[str]) -> None:
             if _is_empty(folder / name):
                 (folder / name).rmdir()
             (aside / name).rename(folder / name)
-    (aside / _MARK).unlink(missing_ok=True)
-    aside.rmdir()
+    if aside.is_dir():
+        (aside / _MARK).unlink(missing_ok=True)
+        aside.rmdir()
