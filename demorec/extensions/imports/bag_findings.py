@@ -15,7 +15,7 @@ from demorec.extensions.imports.findings import (
     LOST,
     NOTE,
     STILL_S,
-    Finding,
+    ImportFinding,
     frozen_images,
     of_stream,
     stream_findings,
@@ -31,22 +31,22 @@ _SLOW = 1.15
 """Minimum ratio of a stream's period to the rows' period for a slow stream."""
 
 
-def all_findings(lines: Timelines) -> tuple[Finding, ...]:
+def all_findings(lines: Timelines) -> tuple[ImportFinding, ...]:
     """All findings about a bag, each once."""
-    once: dict[tuple[str, str], Finding] = {}
+    once: dict[tuple[str, str], ImportFinding] = {}
     for finding in _findings(lines):
         once.setdefault((finding.kind, finding.text.partition(":")[0] if finding.stream else finding.text), finding)
     return tuple(once.values())
 
 
-def _findings(bag: Timelines) -> Iterator[Finding]:
+def _findings(bag: Timelines) -> Iterator[ImportFinding]:
     lines = list(bag.lines.values())
     regular = [line for line in lines if line.is_regular]
     skews = _comparable_skews(lines)
     for line in lines:
         yield from stream_findings(line, skews[line])
     for problem in bag.streams.problems:
-        yield Finding(kind="cut_off", stream="", text=problem)
+        yield ImportFinding(kind="cut_off", stream="", text=problem)
     yield from _joint_findings(regular)
     yield from _extent_findings(regular)
     yield from _offset_findings(lines)
@@ -82,7 +82,7 @@ def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
     return known if all(abs(np.median(line.skews_ns)) >= EPOCH_S * NS for line in known) else []
 
 
-def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """Header times of a simulated or unset clock that the rows use."""
     known = [line for line in _of_another_epoch(lines) if line.is_header]
     if known:
@@ -91,10 +91,10 @@ def _epoch_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
             f"all headers are {abs(years):.1f} years {'behind' if years > 0 else 'ahead of'} the times of recording, "
             "and rows follow them: simulated time, or a clock that was never set"
         )
-        yield Finding(kind=NOTE, stream="", text=text)
+        yield ImportFinding(kind=NOTE, stream="", text=text)
 
 
-def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Finding]:
+def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """Streams on log time, although others use header times with another epoch."""
     skews = [float(np.median(line.skews_ns)) / NS for line in lines if line.is_header]
     if not skews or abs(usual := float(np.median(skews))) <= SKEW_S:
@@ -104,10 +104,10 @@ def _mixed_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Findi
         yield of_stream(line.stream, "clock_offset", text)
     for topic, texts in bag.streams.texts.items():
         if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
-            yield Finding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
+            yield ImportFinding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
 
 
-def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
+def _joint_findings(regular: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """Joints that end while others of their topic, or the same ones from another publisher, continue."""
     for line in regular:
         joints = line.stream.reader.joints if line.stream.reader else ()
@@ -120,7 +120,7 @@ def _joint_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
             yield of_stream(line.stream, "early_end", text)
 
 
-def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
+def _extent_findings(regular: Sequence[Timeline]) -> Iterator[ImportFinding]:
     if len(regular) < 2:
         return
     begin = float(np.median([line.times_ns[0] for line in regular]))
@@ -133,7 +133,7 @@ def _extent_findings(regular: Sequence[Timeline]) -> Iterator[Finding]:
             yield of_stream(line.stream, "early_end", f"ends {early:.2f} s early")
 
 
-def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+def _offset_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """Streams with another header clock than most."""
     skews = {line.stream.label: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
     if len(skews) < 2:
@@ -142,10 +142,10 @@ def _offset_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
     for label, skew in skews.items():
         if abs(skew - usual) > SKEW_S:
             text = f"its clock is off by {usual - skew:+.3f} s against that of the other streams"
-            yield Finding(kind="clock_offset", stream=label, text=text)
+            yield ImportFinding(kind="clock_offset", stream=label, text=text)
 
 
-def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """Cameras that froze. A rendered camera repeats its image while the robot rests for a moment."""
     for line in lines:
         if (run := frozen_images(line)) is None:
@@ -157,12 +157,12 @@ def _frozen_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
             yield of_stream(line.stream, "frozen", text)
 
 
-def _still_findings(lines: Sequence[Timeline]) -> Iterator[Finding]:
+def _still_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
     """A robot without any motion in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
     measured = [line for line in lines if line.stream.names and len(line.times_ns) > 1]
     if measured and not any(_moves(line) for line in measured):
         text = f"nothing moves: no number of {', '.join(line.stream.label for line in measured)} changes in this bag"
-        yield Finding(kind="still", stream="", text=text)
+        yield ImportFinding(kind="still", stream="", text=text)
 
 
 def _moves(line: Timeline) -> bool:
@@ -191,7 +191,7 @@ def _rests(lines: Sequence[Timeline], begin_ns: int, end_ns: int) -> bool:
     return bool(moves) and not any(moves)
 
 
-def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
+def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[ImportFinding]:
     """Streams slower than the rows: a note for numbers, which are held; cameras if none has enough images."""
     slow = [line for line in regular if line.period_ns * fps > _SLOW * NS]
     is_filmed = any(line.stream.heads and line not in slow for line in regular)
@@ -204,7 +204,7 @@ def _slow_findings(regular: Sequence[Timeline], fps: int) -> Iterator[Finding]:
             yield of_stream(line.stream, "slow", f"{text}: use fps = {max(1, round(rate))}")
 
 
-def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:
     """Findings about the rows of a bag's episodes, each once."""
     fps = lines.mapping.clock.fps
     for rows in (rows for rows in episodes if rows.follows and len(rows.table.time_ns) > 1):
@@ -212,7 +212,7 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
         rate = NS / float(steps[steps <= LOST * np.median(steps)].mean())
         if abs(rate - fps) > RATE * fps:
             text = f"rows follow its messages, {rate:.1f} a second, but fps is {fps}"
-            yield Finding(kind="fps", stream=rows.follows, text=text)
+            yield ImportFinding(kind="fps", stream=rows.follows, text=text)
             break
     for name in lines.mapping.cameras if episodes else ():
         yield from _use_findings(name, lines, episodes)
@@ -220,7 +220,7 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
         yield from _skip_notes(lines, episodes)
 
 
-def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:
     """Streams of numbers with many messages in no row; cameras, if any, decide the rows."""
     for line in (line for line in lines.lines.values() if line.stream.names and line.is_regular):
         num_unused = num_messages = 0
@@ -237,7 +237,7 @@ def _skip_notes(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[F
             yield of_stream(line.stream, NOTE, text)
 
 
-def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[Finding]:
+def _use_findings(name: str, lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:
     """Use of a camera's images: a finding if other rows could show more of them, else a note."""
     line, clock = lines.lines[name], lines.mapping.clock
     num_repeated = num_free = num_skipped = num_images = 0

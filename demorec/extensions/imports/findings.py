@@ -35,7 +35,7 @@ NOTE = "note"
 
 
 @dataclass(frozen=True, kw_only=True)
-class Finding:
+class ImportFinding:
     """A finding or note.
 
     Attributes:
@@ -49,16 +49,16 @@ class Finding:
     text: str
 
 
-def stream_findings(line: Timeline, skew: Numbers) -> Iterator[Finding]:
+def stream_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
     """Findings about a stream; (K,) its skews relative to the others."""
     found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skew), *_image_findings(line))
     for kind, text in found:
         yield of_stream(line.stream, kind, text)
 
 
-def of_stream(stream: Stream, kind: str, text: str) -> Finding:
+def of_stream(stream: Stream, kind: str, text: str) -> ImportFinding:
     """Create a finding about a stream."""
-    return Finding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
+    return ImportFinding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
 
 
 def _message_findings(line: Timeline) -> Iterator[tuple[str, str]]:

@@ -14,7 +14,7 @@ from demorec.core.files import read_text_limited, replace_text
 from demorec.core.plain import from_json, to_json
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.clock import NS, Timeline
-from demorec.extensions.imports.findings import NOTE, Finding, lost_in
+from demorec.extensions.imports.findings import NOTE, ImportFinding, lost_in
 from demorec.extensions.imports.rows import EpisodeRows
 from demorec.runs.run_file import IMPORT_NAME
 
@@ -73,11 +73,11 @@ class BagReport:
     files: tuple[tuple[str, str], ...]
     num_bytes: int
     streams: tuple[dict[str, str], ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[ImportFinding, ...]
     episodes: tuple[EpisodeReport, ...]
 
     @property
-    def odd(self) -> tuple[Finding, ...]:
+    def odd(self) -> tuple[ImportFinding, ...]:
         """Findings except notes."""
         return tuple(finding for finding in self.findings if finding.kind != NOTE)
 

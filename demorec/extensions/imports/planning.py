@@ -23,7 +23,7 @@ from demorec.extensions.imports.bag_findings import all_findings, row_findings
 from demorec.extensions.imports.clock import NS
 from demorec.extensions.imports.description import imported_feature, imported_info
 from demorec.extensions.imports.fields import FieldError
-from demorec.extensions.imports.findings import Finding
+from demorec.extensions.imports.findings import ImportFinding
 from demorec.extensions.imports.import_file import BagReport, EpisodeReport, stream_figures
 from demorec.extensions.imports.mapping import Episodes, SourceMapping
 from demorec.extensions.imports.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
@@ -123,7 +123,7 @@ def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoCon
     return PlannedBag(bag=bag, report=report, episodes=tuple(episodes))
 
 
-def _reported(findings: Sequence[Finding]) -> str:
+def _reported(findings: Sequence[ImportFinding]) -> str:
     """Other findings in a bag without a complete episode, as possible causes."""
     kinds = {finding.kind: finding.kind for finding in findings}
     offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]

@@ -28,6 +28,8 @@ FROZEN_RATIO = 0.08
 MIN_MISSING_CHANGE = 4.0
 """Minimum change expected from the joints' motion while images repeat, in multiples of an image's usual change."""
 MIN_FROZEN_FRAMES = 3
+MIN_EQUAL = 0.5
+"""Minimum ratio of images that repeat every pixel: videos of a low rate skip small changes, but seldom all."""
 FROZEN_TIMES = 4.0
 """Minimum factor over the longest usual missing change: cameras that rarely see the arm repeat images for long."""
 MIN_VISIBLE = 0.25
@@ -96,7 +98,7 @@ def blank_images(evidence: Evidence) -> Iterator[Fault]:
                 severity="broken",
                 value="all frames",
                 message=f"{camera} shows nothing in any episode",
-                do="leave the camera out: demorec dataset drop-features {path} --features " + camera + " --out NEW",
+                do="leave the camera out: demorec dataset drop-features {path} " + camera + " --out NEW",
             )
             continue
         for number, flags in blank.items():
@@ -174,17 +176,16 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
         visible = evidence.once(visible_motion, images)
         if visible is None or (len(rests) <= MIN_OTHERS and visible.usual_change < MIN_RATE_CHANGE):
             continue
-        longest = {number: max((missing for missing, _, _ in found), default=0.0) for number, found in rests.items()}
+        longest = {number: max((rest[0] for rest in found), default=0.0) for number, found in rests.items()}
         for number, found in rests.items():
             others = [missing for other, missing in longest.items() if other != number]
             least = MIN_MISSING_CHANGE if len(others) >= MIN_OTHERS else 3 * MIN_MISSING_CHANGE
             limit = max(least, FROZEN_TIMES * float(np.median(others or [0.0])))
-            bad = [(missing, first, end) for missing, first, end in found if missing > limit]
-            bad = [each for each in bad if each[2] - each[1] >= MIN_FROZEN_FRAMES]
+            bad = [rest for rest in found if rest[0] > limit and rest[2] - rest[1] >= MIN_FROZEN_FRAMES]
             if bad:
-                _, first, end = max(bad)
+                _, first, end, equal = max(bad)
                 yield Fault(
-                    severity="broken",
+                    severity="broken" if equal >= MIN_EQUAL else "look",
                     episode=number,
                     frames=(first, end),
                     value=f"{evidence.seconds(end - first):.1f} s",
@@ -194,8 +195,8 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
 
 def _rests(
     evidence: Evidence, number: int, images: EpisodeThumbnails, camera: CameraThumbnails
-) -> list[tuple[float, int, int]]:
-    """Find (missing change, in images; first frame, last frame) of each run of repeated images."""
+) -> list[tuple[float, int, int, float]]:
+    """Find (missing change, in images; first frame, last frame, ratio of equal images) of each run of repeats."""
     visible = evidence.once(visible_motion, camera)
     episode = evidence.by_number.get(number)
     if visible is None or episode is None or episode.state is None or len(images.frames) < 2:
@@ -207,6 +208,7 @@ def _rests(
             float(expected[end] - expected[first]) / visible.usual_change,
             int(images.frames[first]),
             int(images.frames[end]),
+            float(np.mean(images.change[first + 1 : end + 1] == 0)),
         )
         for first, end in runs(same)
     ]
@@ -363,7 +365,7 @@ def doubled_cameras(evidence: Evidence) -> Iterator[Fault]:
                     severity="broken",
                     value=f"{len(same)} episodes",
                     message=f"{name} and {other_name} show the same in {len(same)} of {len(both)} episodes",
-                    do="leave one out: demorec dataset drop-features {path} --features " + other_name + " --out NEW",
+                    do="leave one out: demorec dataset drop-features {path} " + other_name + " --out NEW",
                 )
                 continue
             for number in same:
