@@ -95,14 +95,18 @@ def _never_acting(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, 
         return
     usual_range = float(np.median([evidence.ranges[element] for element, _ in pairs]))
     constant = np.ptp(np.concatenate(acting), axis=0) == 0
-    for element, column in pairs:
-        if constant[column] and evidence.ranges[element] > MIN_UNCOMMANDED_RANGE * usual_range > 0:
-            yield Fault(
-                severity="broken",
-                value="0",
-                message=f"{element_name(evidence, element)} moves although its action never changes",
-                do="record the command that was sent to this joint",
-            )
+    names = [
+        element_name(evidence, element)
+        for element, column in pairs
+        if constant[column] and evidence.ranges[element] > MIN_UNCOMMANDED_RANGE * usual_range > 0
+    ]
+    if names:
+        yield Fault(
+            severity="look",  # a finger that another one drives moves like this
+            value="0",
+            message=f"{', '.join(names)}: the state moves although the action never changes",
+            do="record the command that was sent to these joints, unless they have no motor",
+        )
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
