@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 
 import numpy as np
@@ -98,7 +99,7 @@ def blank_images(evidence: Evidence) -> Iterator[Fault]:
                 severity="broken",
                 value="all frames",
                 message=f"{camera} shows nothing in any episode",
-                do="leave the camera out: demorec dataset drop-features {path} " + camera + " --out NEW",
+                do="leave the camera out: demorec dataset drop-features {path} " + shlex.quote(camera) + " --out NEW",
             )
             continue
         for number, flags in blank.items():
@@ -365,7 +366,7 @@ def doubled_cameras(evidence: Evidence) -> Iterator[Fault]:
                     severity="broken",
                     value=f"{len(same)} episodes",
                     message=f"{name} and {other_name} show the same in {len(same)} of {len(both)} episodes",
-                    do="leave one out: demorec dataset drop-features {path} " + other_name + " --out NEW",
+                    do="leave one out: demorec dataset drop-features {path} " + shlex.quote(other_name) + " --out NEW",
                 )
                 continue
             for number in same:
