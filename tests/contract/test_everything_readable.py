@@ -277,7 +277,7 @@ def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsy
     assert exit_code("check", bag, "--mapping", mapping, "--all") == 0
     printed = capsys.readouterr().out
     assert printed.startswith(f"{bag}: state observation.state; ")
-    assert "look: 1 episode, " in printed
+    assert "look as a whole: 1 episode, " in printed
     (judged,) = [line for line in printed.splitlines() if "  import_findings  " in line]
     assert judged.lstrip().startswith("look")
     assert "gap, observation.state" in judged
