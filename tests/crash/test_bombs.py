@@ -84,7 +84,8 @@ def test_a_small_recording_never_becomes_large(
     flags = ["--out", str(tmp_path / "kept.mcap")] if command == "recover" else []
     told = commands.run(command, path, *flags)
     assert problem_of(told) == "", told
-    assert told.code == 1 or command == "recover"
+    # Unknown records are valid, so a fast machine reads all of them within the limits.
+    assert told.code == 1 or command == "recover" or bomb is many_large_chunks
 
 
 @pytest.mark.parametrize("opening", ["[", '{"a":'])
