@@ -139,23 +139,28 @@ class CheckSummaries:
     Attributes:
         worst: Name of a check -> its first result of the worst verdict, and the subject.
         counts: Name of a check -> number of its results of each verdict.
-        num_subjects: Number of recordings, runs and datasets.
+        num_silent: Number of the doctor's checks without a finding.
+        not_measured: The doctor's checks without a result -> the reason.
     """
 
     def __init__(self) -> None:
         self.worst: dict[str, tuple[CheckResult, str]] = {}
         self.counts: dict[str, Counter[str]] = {}
-        self.num_subjects = 0
+        self.num_silent = 0
+        self.not_measured: Mapping[str, str] = {}
 
     def add(self, results: Iterable[CheckResult], where: str) -> None:
         """Count the results of one recording, run or dataset."""
-        self.num_subjects += 1
         for result in results:
             self._count(result, where)
 
     def add_judged(self, judged: Diagnosis | None) -> None:
         """Count the doctor's findings."""
-        for finding in () if judged is None else judged.findings:
+        if judged is None:
+            return
+        self.num_silent = judged.num_checks - len({finding.check for finding in judged.findings})
+        self.not_measured = judged.not_measured
+        for finding in judged.findings:
             where = "the whole set" if finding.episode is None else f"episode {finding.episode}"
             self._count(CheckResult(check=finding.check, findings=(finding,)), where)
 
