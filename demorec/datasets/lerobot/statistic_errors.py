@@ -34,8 +34,8 @@ FLOAT32_VARIANCE = 3 * FLOAT32_SUM
 """Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
 Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
 """Episode -> feature -> quantity -> its numbers."""
-Ranges = Mapping[str, Array]
-"""Quantile -> (2, D) minimum and maximum allowed value."""
+Ranges = Array
+"""(2, Q, D) minimum and maximum allowed value of each quantile."""
 
 
 class StatisticError(NamedTuple):
@@ -137,10 +137,9 @@ def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
 def _quantile_ranges(values: Array) -> Ranges:
     """Compute the values of the neighbouring ranks: LeRobot reads quantiles off a histogram, others interpolate."""
     ordered, last = np.sort(values, axis=0), len(values) - 1
-    ranks = {name: share * last for name, share in QUANTILES.items()}
-    return {
-        name: ordered[[max(math.ceil(rank) - 1, 0), min(math.floor(rank) + 1, last)]] for name, rank in ranks.items()
-    }
+    ranks = np.array(list(QUANTILES.values())) * last
+    first_ranks, last_ranks = np.ceil(ranks) - 1, np.floor(ranks) + 1
+    return ordered[np.clip([first_ranks, last_ranks], 0, last).astype(np.intp)]
 
 
 def _largest_error(
@@ -156,15 +155,11 @@ def _largest_error(
     """
     if not stored:
         return math.inf, "mean"
-    true = {quantity: getattr(values, quantity)(axis=0) for quantity in ("min", "max", "mean", "std")}
-    scale = np.maximum(true["std"], MIN_DEVIATION)
-    roundings = min(len(values), MAX_SUMMED) * float(np.finfo(np.float32).eps)
-    variance_error = FLOAT32_VARIANCE * roundings * (values**2).mean(axis=0)
-    width = np.ptp(values, axis=0) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
-    known = [_quantile_ranges(values), *episodes]
-    between = {quantity: _between([each[quantity] for each in known], width) for quantity in QUANTILES}
+    std = values.std(axis=0)
+    scale = np.maximum(std, MIN_DEVIATION)
+    bounds = _bounds(values, std, episodes)
     worst = (0.0, "")
-    for quantity in (*true, "count", *QUANTILES):
+    for quantity in NAMES:
         found = numbers_of(stored.get(quantity))
         if quantity not in stored and quantity in QUANTILES:
             continue  # older writers have no quantiles
@@ -172,25 +167,30 @@ def _largest_error(
             error = float(np.abs(found - count).max(initial=0.0)) if len(found) else math.inf
         elif found.shape != scale.shape:
             error = math.inf
-        elif quantity == "std":
-            low = np.sqrt(np.maximum(true["std"] ** 2 - variance_error, 0.0))
-            high = np.sqrt(true["std"] ** 2 + variance_error)
-            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
-        elif quantity in between:
-            low, high = between[quantity]
-            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
         else:
-            steps = FLOAT32_SUM * roundings if quantity == "mean" else 4 * float(np.finfo(np.float32).eps)
-            slack = steps * np.abs(true[quantity])
-            error = float((np.maximum(np.abs(found - true[quantity]) - slack, 0.0) / scale).max())
+            low, high = bounds[quantity]
+            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
         worst = max(worst, (error, quantity))
     return worst
 
 
-def _between(ranges: Sequence[Array], width: Array) -> tuple[Array, Array]:
-    """Compute the (D,) minimum and maximum value that a quantile may have, from N times (2, D)."""
-    stacked = np.stack(ranges)
-    return stacked[:, 0].min(axis=0) - width, stacked[:, 1].max(axis=0) + width
+def _bounds(values: Array, std: Array, episodes: Sequence[Ranges]) -> Mapping[str, tuple[Array, Array]]:
+    """Compute quantity -> its (D,) minimum and maximum value, given the rounding of LeRobot's float32."""
+    low, high = values.min(axis=0), values.max(axis=0)
+    mean, variance = values.mean(axis=0), std**2
+    float32 = float(np.finfo(np.float32).eps)
+    roundings = min(len(values), MAX_SUMMED) * float32
+    slack, variance_slack = FLOAT32_SUM * roundings * np.abs(mean), FLOAT32_VARIANCE * roundings * (variance + mean**2)
+    width = (high - low) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
+    ranges = np.stack([_quantile_ranges(values), *episodes])
+    lowest, highest = ranges[:, 0].min(axis=0) - width, ranges[:, 1].max(axis=0) + width
+    return {
+        "min": (low - 4 * float32 * np.abs(low), low + 4 * float32 * np.abs(low)),
+        "max": (high - 4 * float32 * np.abs(high), high + 4 * float32 * np.abs(high)),
+        "mean": (mean - slack, mean + slack),
+        "std": (np.sqrt(np.maximum(variance - variance_slack, 0.0)), np.sqrt(variance + variance_slack)),
+        **{name: (lowest[place], highest[place]) for place, name in enumerate(QUANTILES)},
+    }
 
 
 def numbers_of(value: Any) -> Array:

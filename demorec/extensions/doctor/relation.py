@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
-from demorec.extensions.doctor.robust import finest
+from demorec.extensions.doctor.robust import finest, lagged_correlations
 
 MAX_LAG_S = 0.7
 """Range of tried lags, s, in both directions: a hobby servo under teleoperation needs 0.1 to 0.3 s."""
@@ -107,22 +107,11 @@ def _curves(
     """Compute (L, K) ratio of each element's variance left unexplained by its action at each lag; NaN if it rests."""
     assert episode.state is not None
     assert episode.action is not None
-    state = episode.state[:, elements]
+    state, action = episode.state[:, elements], episode.action[:, columns]
     moved = np.ptp(state, axis=0) >= MIN_MOTION * evidence.ranges[elements]
     follows = state if kind == "target" else np.diff(state, axis=0, append=state[-1:])
-    reach = int(lags[-1])
-    core = follows[reach : len(follows) - reach]
-    action = episode.action[:, columns]
-    rows = [_unexplained(core, action[reach - lag : len(action) - reach - lag]) for lag in lags]
-    return np.where(moved & (np.ptp(action, axis=0) > 0), np.array(rows), np.nan)
-
-
-def _unexplained(values: Array, others: Array) -> Array:
-    """Compute (K,) one minus the squared correlation of columns, 1 if one of them rests."""
-    one, two = values - values.mean(axis=0), others - others.mean(axis=0)
-    size = (one**2).sum(axis=0) * (two**2).sum(axis=0)
-    squared = (one * two).sum(axis=0) ** 2 / np.where(size > 0, size, 1.0)
-    return np.where(size > 0, np.maximum(1 - squared, 1e-9), 1.0)
+    unexplained = 1 - lagged_correlations(follows, action, int(lags[0]), int(lags[-1])) ** 2
+    return np.where(moved & (np.ptp(action, axis=0) > 0), np.maximum(unexplained, 1e-9), np.nan)
 
 
 def _usual_minimum(curves: list[Array]) -> float:

@@ -5,12 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 
 NORMAL = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
+_RESTING = 1e-9
+"""Maximum variance of a column at rest, relative to its variance in the whole episode."""
 
 
 def usual(values: Sequence[float] | NDArray[np.floating], floor: float = 0.0) -> tuple[float, float]:
@@ -41,7 +44,7 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Return (first, end) of each run of true values in (N,) flags."""
     padded = np.concatenate([[False], flags, [False]])
     edges = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
-    return [(int(first), int(end)) for first, end in edges]
+    return [(first, end) for first, end in edges.tolist()]
 
 
 def finest(lags: Sequence[int], errors: NDArray[np.floating]) -> float:
@@ -52,3 +55,24 @@ def finest(lags: Sequence[int], errors: NDArray[np.floating]) -> float:
     low, middle, high = (float(error) for error in errors[best - 1 : best + 2])
     bend = low - 2 * middle + high
     return lags[best] + (0.5 * (low - high) / bend if bend > 0 else 0.0)
+
+
+def lagged_correlations(values: Array, others: Array, earliest: int, latest: int) -> Array:
+    """Compute (L, K) correlations of columns (T, K) with the others, delayed by `earliest` to `latest` frames.
+
+    All lags are judged by the same frames of the values. The correlation is 0 where one of the two rests.
+    """
+    core = values[latest : len(values) + earliest]
+    core = core - core.mean(axis=0)
+    others = others - others.mean(axis=0)
+    windows = sliding_window_view(others, len(core), axis=0)[::-1]
+    sums, squares = (np.cumsum(np.vstack([np.zeros_like(part[:1]), part]), axis=0) for part in (others, others**2))
+    sizes = _ends(squares, len(core)) - _ends(sums, len(core)) ** 2 / len(core)
+    sizes = np.where(sizes > _RESTING * squares[-1], sizes, 0.0) * (core**2).sum(axis=0)
+    products = np.einsum("lkn,nk->lk", windows, core)
+    return np.where(sizes > 0, products / np.sqrt(np.where(sizes > 0, sizes, 1.0)), 0.0)
+
+
+def _ends(sums: Array, length: int) -> Array:
+    """Compute (L, K) sums over windows of some length from cumulative sums, the last window first."""
+    return (sums[length:] - sums[:-length])[::-1]

@@ -17,8 +17,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import NORMAL
 
 MIN_EPISODES = 12
@@ -49,7 +51,6 @@ _STILL_RATIO = 0.08
 """Maximum speed of an arm at rest, relative to the episode's fast speed (its 90 % quantile)."""
 _STEADY = 0.02
 """Maximum motion of a gripper at rest, as a ratio of its range."""
-_MAX_LAG_S = 0.5
 
 
 class Reason(NamedTuple):
@@ -143,7 +144,18 @@ def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
         motions[episode.number] = ArmMotion(state, acted)
     known = list(motions.values())
     ranges = ArmMotion(_range([motion.state for motion in known]), _range([motion.action for motion in known]))
-    return {n: _readings(motion, ranges, evidence.is_gripper, evidence.fps) for n, motion in motions.items()}
+    found = {n: _readings(motion, ranges, evidence.is_gripper, evidence.fps) for n, motion in motions.items()}
+    for number, lag in _lags(evidence).items():
+        found[number]["lag"] = QuantityReading(lag, 0, len(motions[number].state) - 1)
+    return found
+
+
+def _lags(evidence: Evidence) -> dict[int, float]:
+    """Find episode number -> frames by which the state follows the action; empty if it does not."""
+    try:
+        return {number: episode.lag for number, episode in evidence.once(relation_of).episodes.items()}
+    except NotMeasuredError:
+        return {}
 
 
 def _range(values: Sequence[Array]) -> Array:
@@ -171,15 +183,13 @@ def _readings(
     commands = _shares(motion.action[:, is_gripper], ranges.action[:, is_gripper])
     switches = sorted({frame for command in commands.T for frame in _switches(command)})
     last = len(state) - 1
-    readings = {
+    return {
         "pause": _pause(state, openings, fps),
         "duration": QuantityReading(float(np.log(len(state) / fps)), 0, last),
         "switches": QuantityReading(len(switches), 0, last),
         "path": _detour(state, [0, *(frame for frame in switches if frame < last), last]),
         "noise": _roughness(action),
     }
-    lag = None if motion.action is motion.state else _lag(state, action, fps)
-    return readings if lag is None else readings | {"lag": QuantityReading(lag, 0, last)}
 
 
 def _pause(state: Array, openings: Array, fps: float) -> QuantityReading:
@@ -209,20 +219,6 @@ def _roughness(values: Array) -> QuantityReading:
     """Return the logarithm of the third differences: small for smooth motion, maximal for white noise."""
     third = np.linalg.norm(np.diff(values, 3, axis=0), axis=1)
     return QuantityReading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
-
-
-def _lag(state: Array, action: Array, fps: float) -> float | None:
-    """Return the frames by which the state follows the action, a target or an increment; None if it does not."""
-    reach = max(2, round(_MAX_LAG_S * fps))
-    if len(state) < 4 * reach:
-        return None
-    lags = range(-reach, reach + 1)
-    for values in (state, np.diff(state, axis=0, prepend=state[:1]) * fps):
-        core = values[reach:-reach]
-        errors = [float((core - action[reach - lag : len(action) - reach - lag]).var(axis=0).sum()) for lag in lags]
-        if min(errors) < 0.5 * float(core.var(axis=0).sum()):
-            return float(lags[int(np.argmin(errors))])
-    return None
 
 
 def _switches(command: Array) -> list[int]:

@@ -10,7 +10,7 @@ from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.relation import ActionRelation, EpisodeLag, relation_of
-from demorec.extensions.doctor.robust import usual
+from demorec.extensions.doctor.robust import lagged_correlations, usual
 from demorec.extensions.doctor.units import BOUND_QUANTILES
 
 MIN_OTHERS = 3
@@ -293,9 +293,5 @@ def _have_one_unit(evidence: Evidence, element: int, column: int) -> bool:
 
 def _best_correlation(values: Array, others: Array, reach: int) -> float:
     """Find the correlation of largest magnitude with the action some frames before."""
-    found = []
-    for lag in range(min(reach, len(values) - 8) + 1):
-        one, two = values[lag:], others[: len(others) - lag]
-        if np.ptp(one) > 0 and np.ptp(two) > 0:
-            found.append(float(np.corrcoef(one, two)[0, 1]))
-    return max(found, key=abs, default=0.0)
+    found = lagged_correlations(values[:, None], others[:, None], 0, min(reach, len(values) - 8))[:, 0]
+    return float(found[np.argmax(np.abs(found))])

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import pairwise
+from itertools import groupby
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,11 +13,13 @@ from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, chec
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
 
-PIECE_S = 1.0
+PIECE_S = 0.5
 """Minimum duration of a shared segment, s."""
 MIN_PIECE = 8
 """Minimum frames of a shared segment: that many moving readings of all elements do not repeat by chance."""
 _MOMENTS = 32
+_NOWHERE = (-1, -1)
+"""Episode and frame of a row that the other set lacks."""
 MAX_DISTANCE = 1e-3
 """Maximum root mean square difference of two motions, as a ratio of the usual range, at which one is a copy: it is the
 size of an encoder step, and people never repeat a motion so closely."""
@@ -83,46 +84,43 @@ def _moments(state: Array, ranges: Array, alive: NDArray[np.bool_]) -> Array:
 def shared_pieces(evidence: Evidence) -> Iterator[Fault]:
     """Find runs of moving frames with bit-exact state and action in two episodes, or twice in one."""
     episodes = evidence.need_state(MIN_PIECE)
-    size = max(MIN_PIECE, round(PIECE_S * evidence.fps / 2))
     whole = {later.number for later, _ in copies(episodes, episodes, evidence.ranges)}
     first_seen: dict[bytes, tuple[int, int]] = {}
     for episode, _ in episodes:
-        if episode.number in whole:
+        number = episode.number
+        if number in whole:
             continue
-        shared = _shared(episode, size, first_seen)
-        for other, frames in shared.items():
-            if len(frames) + size - 1 >= PIECE_S * evidence.fps or len(frames) > 1:
-                first, last = frames[0], frames[-1] + size - 1
-                where = "twice" if other == episode.number else f"in episode {other} too"
-                yield Fault(
-                    severity="broken",
-                    episode=episode.number,
-                    frames=(first, last),
-                    value=f"{last - first + 1} frames",
-                    message=f"frames {first} to {last} occur {where}, to the last bit",
-                )
+        places = [first_seen.setdefault(row, (number, frame)) for frame, row in enumerate(_rows(episode))]
+        for other, (first, last) in _pieces(places, number, evidence.fps).items():
+            where = "twice" if other == number else f"in episode {other} too"
+            yield Fault(
+                severity="broken",
+                episode=number,
+                frames=(first, last),
+                value=f"{last - first + 1} frames",
+                message=f"frames {first} to {last} occur {where}, to the last bit",
+            )
 
 
-def _shared(episode: EpisodeEvidence, size: int, first_seen: dict[bytes, tuple[int, int]]) -> Mapping[int, list[int]]:
-    """Map earlier episodes, and this one, to the first frames of shared windows; also register new windows."""
-    rows = _digests(episode)
-    found: dict[int, list[int]] = defaultdict(list)
-    moving = np.flatnonzero([one != two for one, two in pairwise(rows)])
-    is_moving = np.zeros(len(rows), dtype=np.int64)
-    is_moving[moving + 1] = 1
-    counts = np.concatenate([[0], np.cumsum(is_moving)])
-    for first in range(len(rows) - size + 1):
-        if counts[first + size] - counts[first + 1] < size - 1:
-            continue  # part of it rests
-        window = b"".join(rows[first : first + size])
-        key = hashlib.blake2b(window, digest_size=12).digest()
-        seen = first_seen.setdefault(key, (episode.number, first))
-        if seen != (episode.number, first):
-            found[seen[0]].append(first)
+def _pieces(places: Sequence[tuple[int, int]], number: int, fps: float) -> Mapping[int, tuple[int, int]]:
+    """Find episode -> first and last frame of moving segments that it shares with this one.
+
+    Frames at rest were first seen in one frame, moving ones in consecutive frames.
+
+    Args:
+        places: Episode and frame in which each frame was first seen.
+        number: This episode; frames at their own place are not shared.
+        fps: Frames per second.
+    """
+    found: dict[int, tuple[int, int]] = {}
+    for (owner, offset), group in groupby(enumerate(places), key=lambda each: (each[1][0], each[1][1] - each[0])):
+        frames = [frame for frame, _ in group]
+        if (owner, offset) != (number, 0) and len(frames) > max(MIN_PIECE, PIECE_S * fps):
+            found[owner] = (found.get(owner, frames)[0], frames[-1])
     return found
 
 
-def _digests(episode: EpisodeEvidence) -> list[bytes]:
+def _rows(episode: EpisodeEvidence) -> list[bytes]:
     """Return the bytes of state and action of each frame."""
     assert episode.state is not None
     parts = [episode.state] if episode.action is None else [episode.state, episode.action]
@@ -159,14 +157,15 @@ def _leaks(train: Evidence, other: Evidence) -> Iterator[Fault]:
             value=f"episode {earlier.number}",
             message=f"it is episode {earlier.number} of {train.path}",
         )
-    size = max(MIN_PIECE, round(PIECE_S * train.fps / 2))
     first_seen: dict[bytes, tuple[int, int]] = {}
     for episode, _ in ours:
-        _shared(episode, size, first_seen)
+        for frame, row in enumerate(_rows(episode)):
+            first_seen.setdefault(row, (episode.number, frame))
     for episode, _ in theirs:
-        shared = {} if episode.number in copied else _shared(episode, size, dict(first_seen))
-        for owner, frames in list(shared.items())[:1]:
-            first, last = frames[0], frames[-1] + size - 1
+        if episode.number in copied:
+            continue
+        places = [first_seen.get(row, _NOWHERE) for row in _rows(episode)]
+        for owner, (first, last) in list(_pieces(places, _NOWHERE[0], train.fps).items())[:1]:
             yield Fault(
                 severity="broken",
                 episode=episode.number,

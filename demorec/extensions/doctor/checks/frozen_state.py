@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -119,6 +120,7 @@ class _ElementTarget:
         wanted: Episode number -> (T,) target, at the frames at which the state usually reaches it.
         min_distance: Minimum distance of a state that does not follow.
         offset: Usual difference between target and state.
+        end_stops: Lowest and highest position; infinite if unknown.
     """
 
     element: int
@@ -126,18 +128,16 @@ class _ElementTarget:
     wanted: Mapping[int, Array]
     min_distance: float
     offset: float
+    end_stops: tuple[float, float]
 
-    def unfollowed(self, evidence: Evidence, number: int, held: float, first: int, end: int) -> Array:
+    def unfollowed(self, number: int, held: float, first: int, end: int) -> Array:
         """Compute (N,) distance of the held state from its target in some frames, excluding end stops."""
         wanted = self.wanted[number][first : end + 1]
         found = wanted - (wanted[0] if self.kind == "increment" else held + self.offset)
-        if len(self.wanted) <= MIN_OTHERS:
-            return found  # too few to distinguish an end stop from the position where the reading froze
-        lowest, highest = (bound[self.element] for bound in evidence.once(state_bounds))
-        margin = MAX_END_STOP_RANGE * (highest - lowest)
-        if held <= lowest + margin:
+        lowest, highest = self.end_stops
+        if held <= lowest:
             found = np.maximum(found, 0.0)
-        if held >= highest - margin:
+        if held >= highest:
             found = np.minimum(found, 0.0)
         return found
 
@@ -149,11 +149,16 @@ def _targets(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array
     except NotMeasuredError:
         return []
     lag = max(round(relation.usual_lag), 0)
+    lowest, highest = evidence.once(state_bounds)
+    margin = MAX_END_STOP_RANGE * (highest - lowest)
     found = []
     for element, column in enumerate(evidence.action_of):
         if column is None or evidence.is_gripper[element] or not evidence.ranges[element]:
             continue
         wanted = {each.number: each.action[:, column] for each, _ in episodes if each.action is not None}
+        end_stops = (float(lowest[element] + margin[element]), float(highest[element] - margin[element]))
+        if len(wanted) <= MIN_OTHERS:  # too few to distinguish an end stop from the position where the reading froze
+            end_stops = (-math.inf, math.inf)
         errors: list[Array] = [np.zeros(1)]
         if relation.kind == "increment":
             gain = evidence.ranges[element] / max(_usual_sum(evidence, column), 1e-12)
@@ -170,6 +175,7 @@ def _targets(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array
                 wanted=wanted,
                 min_distance=MIN_FROZEN_ERRORS * usual_error,
                 offset=offset,
+                end_stops=end_stops,
             )
         )
     return found
@@ -205,7 +211,7 @@ def _frozen_element(
         for first, end in runs(values[1:] == values[:-1]):
             if end - first < longest:
                 continue
-            distance = target.unfollowed(evidence, episode.number, float(values[first]), first, end)
+            distance = target.unfollowed(episode.number, float(values[first]), first, end)
             moved = float(np.ptp(distance))
             if moved > min_motion and float(np.abs(distance).max()) > target.min_distance:
                 longest = end - first + 1
