@@ -8,8 +8,7 @@ from functools import cache
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.base import RANK, Check, CheckResult, Finding, Form, Verdict
-from demorec.check.dataset import CheckedDataset
+from demorec.check.base import RANK, Check, Checkable, CheckResult, Finding, Form, Verdict
 from demorec.check.episode import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import check_option
@@ -139,19 +138,20 @@ def check_subject(subject: Subject, options: CheckOptions) -> SubjectReport:
     """Run all checks of one recording, run or dataset."""
     if subject.kind == "recording":
         with CheckedEpisode(subject.path, colours=options.colours) as episode:
-            found = tuple(_run(options, episode))
+            found = tuple(_run(options, episode, episode.form))
     elif subject.kind == "run":
-        found = tuple(_run(options, CheckedRun(subject.path)))
+        run = CheckedRun(subject.path)
+        found = tuple(_run(options, run, run.form))
     else:
-        found = tuple(_run(options, CheckedDataset(subject.path)))
+        found = tuple(_run(options, subject, "dataset"))
     return SubjectReport(**vars(subject), results=found)
 
 
-def _run(options: CheckOptions, subject: CheckedEpisode | CheckedDataset | CheckedRun) -> Iterator[CheckResult]:
+def _run(options: CheckOptions, subject: Checkable, form: Form) -> Iterator[CheckResult]:
     """Run the checks of a subject in order, except those that fail on the same unreadable part as an earlier one."""
     path = subject.path
     known: set[str] = set()
-    for check in options.checks(subject.form):
+    for check in options.checks(form):
         result = None if check.needs_images and not options.images else check.run(subject)
         if result is None or (result.findings and {finding.message for finding in result.findings} <= known):
             continue

@@ -39,13 +39,13 @@ def run_dataset(run: CheckedRun) -> Iterator[Fault]:
     if not is_dataset(path):
         raise NotApplicableError("the run has no dataset")
     dataset = CheckedDataset(path)
-    if not dataset.sidecar or any(row["source"] is None for row in dataset.sidecar):
+    if not dataset.records or any(row["source"] is None for row in dataset.records):
         return listed(["the dataset does not name its source recordings"])
     dataset.check_simulated()
     options = export_options(path)
     wrong = list(dict.fromkeys(dataset.unreadable.values()))
     successes = len(run.run.successes)
-    found = sum(bool(row["success"]) for row in dataset.sidecar)
+    found = sum(bool(row["success"]) for row in dataset.records)
     if found != successes:
         wrong.append(f"it has {found} successes, the run {successes}")
     for episode in dataset.described():
@@ -106,7 +106,7 @@ def episode_differences(
             raise lack from error
         yield f"its recording cannot be exported as this episode ({describe_error(error)})", ()
         return
-    place = dataset.folder.listed[episode.number]
+    place = dataset.listed[episode.number]
     if place.tasks != (expected.info.instruction,):
         yield "instruction", ()
     for name, values in columns.items():
@@ -115,7 +115,7 @@ def episode_differences(
             yield name, ()
         elif len(frames := np.flatnonzero((found != true).any(axis=1))):
             yield name, tuple(frames.tolist())
-    videos = video_digests(dataset.folder, place)
+    videos = video_digests(dataset, place)
     for key, video in recorded.items():
         if videos.get(key) != video.digest:
             yield key, ()

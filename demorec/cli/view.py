@@ -160,9 +160,9 @@ class View:
         assert self.rank is not None
         ranked = RANKINGS.load(self.rank)(self.paths, self.roles.named)
         names = {source.name for source in sources}
-        shown = [each for each in ranked if each.name in names]
-        tell(*(each.line for each in shown[:_MOST_REASONS]))
-        places = {each.name: place for place, each in enumerate(shown)}
+        shown = [name for name in ranked if name in names]
+        tell(*(ranked[name] for name in shown[:_MOST_REASONS]))
+        places = {name: place for place, name in enumerate(shown)}
         return sorted(sources, key=lambda source: places.get(source.name, len(places)))
 
     def _validate(self) -> None:

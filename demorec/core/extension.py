@@ -82,7 +82,7 @@ class Extension:
         columns: Column of a dataset's episodes for `--where` and `--by` -> function (folder, names) that returns a
         mapping with these names for each episode.
         rankings: Name for `demorec view --rank` -> function (paths, named roles) that returns the episodes, worst
-            first, as `demorec.view.sources.RankedEpisode`.
+            first: name -> the reason for its place.
         lists: Name for `demorec list` -> function that returns (name, summary) of each row.
         proofs: Name -> function (recordings, allowed modules) that yields a `Proof` for each recording.
     """

@@ -41,7 +41,7 @@ class SceneMotion:
 
 
 class Episode(Protocol):
-    """An open episode of any source; unknown parts are absent.
+    """An open episode of any source; unknown parts are absent, as in the bodies of this class.
 
     Attributes:
         path: File, or folder of the dataset.
@@ -68,6 +68,7 @@ class Episode(Protocol):
     @property
     def phases(self) -> tuple[str, ...]:
         """T phases of the motion; empty if unknown."""
+        return ()
 
     @property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
@@ -83,6 +84,7 @@ class Episode(Protocol):
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """Yield (time_ns, event) in order of time."""
+        return iter(())
 
     def table(self) -> Table:
         """Read the features of every frame, and which images the frames show."""
@@ -110,12 +112,16 @@ class Episode(Protocol):
 
     def has_segmentation(self, camera: str) -> bool:
         """Check whether a camera has segmentation images."""
+        return False
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Yield the segmentation images of a camera in order, (H, W) int32."""
+        return iter(())
 
     def segment_names(self) -> Mapping[int, str]:
         """Read the names of the segments: number -> name."""
+        return {}
 
     def boxes(self, camera: str) -> Iterator[Box]:
         """Yield the boxes in a camera's images, frame by frame."""
+        return iter(())

@@ -39,19 +39,6 @@ class PlaybackSource:
     notes: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True, kw_only=True)
-class RankedEpisode:
-    """An episode in an order of `demorec view --rank`.
-
-    Attributes:
-        name: That of its `PlaybackSource`.
-        line: Why it has this place, in one line.
-    """
-
-    name: str
-    line: str
-
-
 def find_episodes(
     paths: Sequence[Path], *, include_failures: bool = False, named: NamedRoles = NO_NAMES
 ) -> list[PlaybackSource]:

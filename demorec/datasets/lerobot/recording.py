@@ -20,10 +20,10 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
-from demorec.episode.episode import Event, Outcome, Table
+from demorec.episode.episode import Outcome, Table
 from demorec.episode.features import DEPTH_SUFFIX
 from demorec.episode.info import Camera, EpisodeInfo, Origin
-from demorec.episode.protocol import SceneMotion
+from demorec.episode.protocol import Episode, SceneMotion
 from demorec.episode.roles import Roles
 from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.streams import frame_times
@@ -35,7 +35,7 @@ _UNNAMED_ROBOT = "unknown"
 _MAX_REASON = 10_000
 
 
-class DatasetRecording:
+class DatasetRecording(Episode):
     """One episode of a dataset, with the interface of `demorec.mcap.Recording`; frames are at multiples of 1/fps, or at
     measured timestamps.
 
@@ -59,9 +59,17 @@ class DatasetRecording:
         self.path, self.dataset, self._number = dataset.root, dataset, number
         self.num_frames = place.length
         self.known: Mapping[str, Any] = dataset.known.get(place.episode_index, {})
-        is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
-        self.cameras = tuple(name for name, depth in is_depth.items() if not depth)
-        self.depth_cameras = tuple(name for name, depth in is_depth.items() if depth)
+        self._is_depth = {name: dataset.info.features[key].is_depth for name, key in dataset.keys.items()}
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the colour cameras."""
+        return tuple(name for name, is_depth in self._is_depth.items() if not is_depth)
+
+    @property
+    def depth_cameras(self) -> tuple[str, ...]:
+        """Names of the cameras with distances."""
+        return tuple(name for name, is_depth in self._is_depth.items() if is_depth)
 
     @cached_property
     def info(self) -> EpisodeInfo:
@@ -153,15 +161,6 @@ class DatasetRecording:
         """(T,) time of each frame, ns."""
         return self.table().time_ns
 
-    @property
-    def phases(self) -> tuple[str, ...]:
-        """Empty: datasets have no phase for each row."""
-        return ()
-
-    def events(self) -> Iterator[tuple[int, Event]]:
-        """Empty: datasets have no events."""
-        return iter(())
-
     def table(self) -> Table:
         """Read the features of every frame, in recordings' types."""
         return self._table
@@ -193,18 +192,6 @@ class DatasetRecording:
         """URDF of the robot; "" if unknown, and for bodies."""
         return "" if body else self.info.urdf
 
-    def has_segmentation(self, camera: str) -> bool:
-        """Return False: datasets have no segmentation images."""
-        return False
-
-    def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
-        """Empty, see `has_segmentation`."""
-        return iter(())
-
-    def segment_names(self) -> Mapping[int, str]:
-        """Empty, see `has_segmentation`."""
-        return {}
-
     def lead(self, camera: str) -> int:
         """Count a camera's images before the first frame from which that frame is decoded."""
         video = self._video(camera) if self._has_packets(camera) else None
@@ -212,7 +199,7 @@ class DatasetRecording:
 
     def _has_packets(self, camera: str) -> bool:
         """Whether recordings can hold a camera's codec."""
-        return camera not in self.depth_cameras and self.dataset.camera(camera).kept != ""
+        return not self._is_depth[camera] and self.dataset.camera(camera).kept != ""
 
     def _video(self, camera: str) -> EpisodeVideo | None:
         """Video of a camera; None if its images are in table rows."""

@@ -12,7 +12,6 @@ from demorec.episode.roles import NamedRoles
 from demorec.extensions.doctor.diagnosis import diagnose
 from demorec.extensions.doctor.from_dataset import ReadOptions, evidence_of_dataset
 from demorec.runs.find import find
-from demorec.view.sources import RankedEpisode
 
 
 def judged_columns(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:
@@ -26,8 +25,8 @@ def judged_columns(folder: LeRobotFolder, names: Collection[str]) -> list[dict[s
     return [{name: getattr(found.get(number), name, None) for name in names} for number in numbers]
 
 
-def by_score(paths: Sequence[Path], named: NamedRoles) -> list[RankedEpisode]:
-    """Rank the episodes of datasets by verdict and score, the worst first.
+def by_score(paths: Sequence[Path], named: NamedRoles) -> dict[str, str]:
+    """Rank the episodes of datasets by verdict and score, the worst first: name of its `PlaybackSource` -> its reason.
 
     Raises:
         ConfigError: A path is not a dataset.
@@ -36,13 +35,9 @@ def by_score(paths: Sequence[Path], named: NamedRoles) -> list[RankedEpisode]:
         raise ConfigError(f"--rank score is for LeRobot datasets, and this is not one: {others[0]}")
     options = ReadOptions(images=False, named=named)
     found = [(path, each) for path in paths for each in diagnose(evidence_of_dataset(path, options)).episodes]
-    ranked = []
+    ranked = {}
     for path, each in sorted(found, key=lambda pair: pair[1].rank):
         reasons = "; ".join(each.reasons)
-        ranked.append(
-            RankedEpisode(
-                name=f"{path}: episode {each.episode}",
-                line=f"{each.verdict}, {each.score:.2f}  episode {each.episode}{': ' * bool(reasons)}{reasons}",
-            )
-        )
+        line = f"{each.verdict}, {each.score:.2f}  episode {each.episode}{': ' * bool(reasons)}{reasons}"
+        ranked[f"{path}: episode {each.episode}"] = line
     return ranked

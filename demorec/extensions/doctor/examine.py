@@ -72,14 +72,13 @@ def examine(
 def _evidence(path: Path, options: ReadOptions) -> Evidence:
     from demorec.extensions.doctor.from_dataset import evidence_of_dataset
     from demorec.extensions.doctor.from_recordings import evidence_of_recordings
-    from demorec.mcap import open_recording
     from demorec.runs.find import find
 
     found = find(path)
     if found.kind == "dataset":
         return evidence_of_dataset(path, options)
     rollouts = found.failed if found.kind == "evaluation" else ()  # failed rollouts are results, not rejects
-    return evidence_of_recordings(path, (*found.recordings, *rollouts), open_recording, options)
+    return evidence_of_recordings(path, (*found.recordings, *rollouts), options)
 
 
 def _with_dataset(diagnosis: Diagnosis, run: Path, options: ReadOptions, chosen: Sequence[Check]) -> Diagnosis:

@@ -2,61 +2,32 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, resource_error, without_path
 from demorec.core.geometry import Array
-from demorec.episode.episode import NO_IMAGE, Outcome, Table
+from demorec.episode.episode import NO_IMAGE, Table
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.protocol import Episode
 from demorec.episode.roles import COUNTERS, Column, NamedRoles, Roles, find_roles, roles_of_recording
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
 from demorec.extensions.doctor.from_dataset import ReadOptions
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
+from demorec.mcap import open_recording
 
 _NANOSECONDS = 1e9
 
 
-class ReadableEpisode(Protocol):
-    """Interface of a recording for the doctor."""
-
-    @property
-    def info(self) -> EpisodeInfo:
-        """Description before its first frame."""
-
-    @property
-    def cameras(self) -> Sequence[str]:
-        """Names of the cameras with colour images."""
-
-    @property
-    def outcome(self) -> Outcome | None:
-        """Outcome; None if a crash cut it off."""
-
-    def table(self) -> Table:
-        """Read its numbers, and the images of its frames."""
-
-    def description(self) -> str:
-        """Read the URDF of a simulated robot."""
-
-    def images(self, camera: str) -> Iterator[NDArray[np.uint8]]:
-        """Yield the (H, W, 3) images of a camera, in order."""
-
-
-Opener = Callable[[Path], AbstractContextManager[ReadableEpisode]]
-
-
-def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, options: ReadOptions) -> Evidence:
+def evidence_of_recordings(path: Path, files: Sequence[Path], options: ReadOptions) -> Evidence:
     """Read recordings as one set; an unreadable one is excluded alone.
 
     Args:
         path: Path given by the user.
         files: The recordings, in order; they are numbered by their index here.
-        opened: Opens a recording.
         options: Options for reading.
 
     Raises:
@@ -71,13 +42,13 @@ def evidence_of_recordings(path: Path, files: Sequence[Path], opened: Opener, op
     urdf = options.urdf
     for number, file in enumerate(files):
         try:
-            with opened(file) as recording:
+            with open_recording(file) as recording:
                 own = roles_of_recording(recording.info, options.named)
                 if first is None or roles is None:
                     first, roles = recording.info, own
                     urdf = urdf or recording.info.urdf or recording.description()
                 table = recording.table()
-                episodes.append(_episode(number, file, recording, table, roles))
+                episodes.append(_episode(number, recording, table, roles))
                 for camera in recording.cameras if options.images else ():
                     seen, failed = images.setdefault(camera, {}), errors.setdefault(camera, {})
                     _read_images(number, recording, table, camera, seen, failed)
@@ -115,7 +86,7 @@ def _with_cameras(roles: Roles | None, images: Mapping[str, Any]) -> Roles:
     )
 
 
-def _episode(number: int, file: Path, recording: ReadableEpisode, table: Table, roles: Roles) -> EpisodeEvidence:
+def _episode(number: int, recording: Episode, table: Table, roles: Roles) -> EpisodeEvidence:
     info = recording.info
     known = {feature.name: feature for feature in info.features}
     columns = dict(table.features)
@@ -143,7 +114,7 @@ def _episode(number: int, file: Path, recording: ReadableEpisode, table: Table, 
 
 def _read_images(
     number: int,
-    recording: ReadableEpisode,
+    recording: Episode,
     table: Table,
     camera: str,
     episodes: dict[int, EpisodeThumbnails],

@@ -246,18 +246,18 @@ def dataset_demonstrations(
             "--states and --export-hz are for recordings: a dataset has no full states and a single rate."
         )
     dataset = CheckedDataset(path, motors=options.motors, named=options.named)
-    if missing := dataset.folder.missing:
+    if missing := dataset.missing:
         raise ExportError(missing)
     if bad := [problem for number, problem in dataset.unreadable.items() if wanted(number)]:
         raise ExportError(f"{bad[0]}, in {path}")
     if options.robot is not None:
-        for number, motion in zip(dataset.rows, motions_of_dataset(dataset), strict=False):
+        for number, motion in zip(dataset.numbers, motions_of_dataset(dataset), strict=False):
             if not wanted(number):
                 continue
             name = f"{path.name}_episode_{number:06d}"
             yield demonstration_of(motion, options.robot, name=name, where=path, episode_index=number)
         return
-    if not dataset.sidecar:
+    if not dataset.records:
         raise ConfigError(
             f"The dataset does not record its scenes (no demorec/episodes): --robot replays a real arm's actions: "
             f"{path}"

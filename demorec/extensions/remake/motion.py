@@ -71,7 +71,7 @@ def motions_of_dataset(dataset: CheckedDataset) -> Iterator[RobotMotion]:
     described = {name: Feature(name=name, names=item.elements) for name, item in roles.columns.items() if item.elements}
     arms = _arms(dataset)
     unnamed = _named_joints(roles.elements(roles.state), "")
-    for number, rows in dataset.rows.items():
+    for number, rows in dataset.numbers.items():
         if (robot := arms.get(number)) is None:
             yield _motion(info.fps, rows, described, roles, unnamed)
             continue
@@ -81,11 +81,10 @@ def motions_of_dataset(dataset: CheckedDataset) -> Iterator[RobotMotion]:
 
 def _arms(dataset: CheckedDataset) -> dict[int, DatasetRobot]:
     """Episode -> its arm, if the sidecar has it or the user has named its servos."""
-    roles = dataset.roles
-    if dataset.motors is not None and roles.elements(roles.state) == dataset.motors.names:
-        return dict.fromkeys(range(len(dataset.folder.listed)), robot_of_motors(dataset.motors))
-    named = {row["episode_index"]: row["robot_digest"] for row in dataset.sidecar if row["robot_digest"]}
-    return {number: dataset.folder.robot(digest) for number, digest in named.items()}
+    if dataset.motors is not None:
+        return dict.fromkeys(range(len(dataset.listed)), robot_of_motors(dataset.motors))
+    named = {row["episode_index"]: row["robot_digest"] for row in dataset.records if row["robot_digest"]}
+    return {number: dataset.robot(digest) for number, digest in named.items()}
 
 
 def _joints(parts: Sequence[Feature]) -> tuple[str, ...]:

@@ -242,13 +242,13 @@ def deep_dataset_checks(path: Path, *, allowed: Sequence[str] = ()) -> Iterator[
     with closing(SimulatorCache()) as simulators:
         try:
             dataset = CheckedDataset(path)
-            if not dataset.sidecar:
+            if not dataset.records:
                 raise ConfigError(
                     f"The dataset does not record how its episodes were made (no demorec/episodes): {path}"
                 )
             dataset.check_simulated()
             options = export_options(path)
-            if missing := dataset.folder.missing:
+            if missing := dataset.missing:
                 raise ExportError(missing)
             for number, problem in dataset.unreadable.items():
                 yield _impossible(DeepReport(path=path / f"episode {number}"), ExportError(problem))
