@@ -58,8 +58,7 @@ EXTENSION = Extension(
     exporters={"lerobot": "demorec.datasets.lerobot.options:LEROBOT"},
     file_checks={
         **_checks("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps"),
-        **_checks("file", "video_frames", "missing_images"),
-        **_checks("images", "images_decode"),
+        **_checks("file", "video_frames", "missing_images", "images_decode"),
         **_checks("run", "run_files", "run_complete", "run_agrees"),
         **_checks("run_dataset", "run_dataset"),
         **_checks("sidecar", "dataset_sidecar"),

@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from demorec.check.base import Fault, check, listed
+from demorec.check.base import Fault, NotApplicableError, check, listed
 from demorec.check.episode import CheckedEpisode
 from demorec.episode.episode import NO_IMAGE
-from demorec.mcap import channels, messages
+from demorec.mcap import Recording, channels, messages
 
 MAX_MISSING_RATIO = 0.5
 """Maximum ratio of frames without an image: a camera that is missing more often shows nothing."""
@@ -40,8 +40,8 @@ stream_check = partial(
 @file_check(measures="recordings that cannot be opened")
 def opens(episode: CheckedEpisode) -> Iterator[Fault]:
     """Verify the checksums of index and metadata, and the format version."""
-    episode.recording.num_frames  # noqa: B018
-    yield from ()
+    Recording(episode.path).close()
+    return iter(())
 
 
 @file_check(measures="damaged chunks, and messages that differ from the index")
@@ -103,9 +103,9 @@ def _image_streams(episode: CheckedEpisode, camera: str) -> Iterator[tuple[str, 
 def readable(episode: CheckedEpisode) -> Iterator[Fault]:
     """Decode every message by the layout in the metadata, at its frame's time."""
     list(episode.recording.events())
-    episode.recording.subtasks  # noqa: B018
+    list(episode.recording.subtasks)
     episode.recording.table()
-    yield from ()
+    return iter(())
 
 
 @file_check(measures="recordings that a crash cut off")
@@ -201,3 +201,20 @@ def missing_images(subject: CheckedEpisode) -> Iterator[Fault]:
                 value=f"{share:.0%} of frames",
                 message=f"camera {camera}: {len(without)} of {len(numbers)} frames have no image",
             )
+
+
+@check(
+    family="files",
+    on=("simulated", "external"),
+    measures="cameras whose images do not all decode",
+    needs="images",
+    why="Images are missing or damaged.",
+    do="record it again, or leave it out",
+    needs_images=True,
+)
+def images_decode(subject: CheckedEpisode) -> Iterator[Fault]:
+    """Decode every image: colour, depth and labels."""
+    cameras, wrong = subject.undecoded()
+    if not cameras:
+        raise NotApplicableError("the recording has no images")
+    return listed([f"{camera}: {problem}" for camera, problem in wrong])

@@ -82,15 +82,15 @@ MAX_JSON_BYTES = 2 << 30
 """Maximum size of a JSON file: a run.json of about a million episodes, which takes ten times as much memory."""
 
 
-def read_json_limited(path: Path, limit: int) -> Any:
-    """Read a regular JSON file of at most `limit` bytes.
+def read_json_limited(path: Path) -> Any:
+    """Read a regular JSON file of at most `MAX_JSON_BYTES`.
 
     Raises:
         OSError: As in `read_text_limited`.
         ValueError: It is not UTF-8, not JSON, or nested too deeply.
     """
     try:
-        return json.loads(read_text_limited(path, limit))
+        return json.loads(read_text_limited(path, MAX_JSON_BYTES))
     except RecursionError:
         raise ValueError("its values are nested too deeply") from None
 

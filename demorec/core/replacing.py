@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, resource_error, write_error
-from demorec.core.files import MAX_JSON_BYTES, MCAP_MAGIC, RERUN_MAGICS, read_json_limited
+from demorec.core.files import MCAP_MAGIC, RERUN_MAGICS, read_json_limited
 
 _SHOWN = 5
 """Maximum foreign files in an error message."""
@@ -159,7 +159,7 @@ def files_below(folder: Path) -> Iterator[str]:
 def json_object(path: Path) -> dict[str, Any]:
     """Read the JSON object in a regular file; {} if it is missing or larger than any of demorec's."""
     try:
-        found = read_json_limited(path, MAX_JSON_BYTES)
+        found = read_json_limited(path)
     except (OSError, ValueError):
         return {}
     return found if isinstance(found, dict) else {}

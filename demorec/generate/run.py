@@ -202,9 +202,9 @@ class _Driver:
             self._progress.says(
                 f"Interrupted: the current episodes may end within {GRACE_S:.0f} s (Ctrl-C again ends at once)."
             )
-            self._drain(GRACE_S)
+            self._drain()
             self._executor.interrupt()
-            self._drain(GRACE_S)
+            self._drain()
             return True
 
     def _reports(self) -> Iterator[list[Report]]:
@@ -213,8 +213,8 @@ class _Driver:
         except GenerationError as error:  # the executor does not know the run
             raise GenerationError(f"{error} {self._folder.kept}") from error
 
-    def _drain(self, seconds: float) -> None:
-        deadline = time.monotonic() + seconds
+    def _drain(self) -> None:
+        deadline = time.monotonic() + GRACE_S
         while self._executor.pending and time.monotonic() < deadline:
             for report in self._executor.wait(POLL_S):
                 if isinstance(report, Made):

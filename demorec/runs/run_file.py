@@ -17,7 +17,7 @@ from typing import Any
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, DemorecError, describe_error, resource_error
-from demorec.core.files import MAX_JSON_BYTES, read_json_limited, replace_text, sync_path
+from demorec.core.files import read_json_limited, replace_text, sync_path
 from demorec.core.plain import digest, from_plain, to_plain
 from demorec.core.replacing import json_object, shown
 
@@ -306,7 +306,7 @@ def load_any_run_file(folder: Path) -> RunFile:
     """Read run.json of any run; errors as in `load_run_file`."""
     path = folder / RUN_NAME
     try:
-        plain = read_json_limited(path, MAX_JSON_BYTES)
+        plain = read_json_limited(path)
         if not isinstance(plain, dict):
             raise ValueError("not a JSON object")
         if (version := plain.pop("format")) > RUN_FORMAT:

@@ -14,7 +14,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cached_property, lru_cache
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -26,7 +26,7 @@ from demorec.datasets.lerobot.files import open_table, read_json, table_batches,
 from demorec.datasets.lerobot.language import COLUMNS
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.row_episodes import REPAIR, places_by_rows, relocated
+from demorec.datasets.lerobot.row_episodes import REPAIR, places_by_rows, relocated, rows_by_file
 from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, IndexedRows
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
@@ -64,6 +64,9 @@ class LeRobotFolder:
         own_counters: Columns that verify the episode of a row, if the files have them.
         keeps_timestamps: Whether edits keep timestamps that are not multiples of 1/fps.
         keeps_statistics: Whether edits keep the stored statistics of images.
+        camera: Describes a camera from its first readable file or image.
+        robot: Reads the arm with a digest.
+        boxes: Opens the boxes of a camera feature; None if the dataset has none.
 
     Raises:
         ConfigError: The dataset has no state from these servos.
@@ -88,9 +91,9 @@ class LeRobotFolder:
                 f"The dataset has no state of the servos {', '.join(motors.names)}: leave --motor-units out: {root}"
             )
         self.open_video = lru_cache(maxsize=_MAX_OPEN_VIDEOS)(self._video_file)
-        self._cameras: dict[str, Camera] = {}
-        self._robots: dict[str, DatasetRobot] = {}
-        self._boxes: dict[str, StoredBoxes | None] = {}
+        self.camera = cache(self._camera)
+        self.robot = cache(self._robot)
+        self.boxes = cache(self._stored_boxes)
 
     def _video_file(self, path: Path) -> VideoFile:
         from demorec.datasets.lerobot.videos import VideoFile
@@ -219,10 +222,7 @@ class LeRobotFolder:
     @cached_property
     def num_rows(self) -> Mapping[Path, int]:
         """Data file -> number of its episodes' rows."""
-        found: dict[Path, int] = {}
-        for place in self.listed:
-            found[place.data] = found.get(place.data, 0) + place.length
-        return found
+        return rows_by_file(self.listed)
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files."""
@@ -317,15 +317,11 @@ class LeRobotFolder:
 
         return Attempts(self.sidecar_tables("attempts"))
 
-    def boxes(self, key: str) -> StoredBoxes | None:
-        """Open the boxes of a camera feature; None if the dataset has none."""
+    def _stored_boxes(self, key: str) -> StoredBoxes | None:
         from demorec.datasets.lerobot.boxes import BOXES_DIR, StoredBoxes
 
-        if key not in self._boxes:
-            path = self.root / BOXES_DIR / f"{key}.json"
-            starts = [place.from_index for place in self.places]
-            self._boxes[key] = StoredBoxes(path, starts) if path.is_file() else None
-        return self._boxes[key]
+        path = self.root / BOXES_DIR / f"{key}.json"
+        return StoredBoxes(path, [place.from_index for place in self.places]) if path.is_file() else None
 
     @cached_property
     def fact_types(self) -> Mapping[str, pa.DataType]:
@@ -344,13 +340,10 @@ class LeRobotFolder:
         """Whether the sidecar describes the same robot for all episodes, or none at all."""
         return len({self.known.get(place.episode_index, {}).get("robot_digest") for place in self.places}) <= 1
 
-    def robot(self, digest: str) -> DatasetRobot:
-        """Read the arm with this digest."""
+    def _robot(self, digest: str) -> DatasetRobot:
         from demorec.datasets.lerobot.robots import read_robot
 
-        if digest not in self._robots:
-            self._robots[digest] = read_robot(self.root, digest)
-        return self._robots[digest]
+        return read_robot(self.root, digest)
 
     @cached_property
     def features(self) -> tuple[Feature, ...]:
@@ -389,15 +382,10 @@ class LeRobotFolder:
             found[name] = key
         return found
 
-    def camera(self, name: str) -> Camera:
-        """Describe a camera from its first readable file or image."""
-        if name not in self._cameras:
-            self._cameras[name] = self._described(name, self.keys[name])
-        return self._cameras[name]
-
-    def _described(self, name: str, key: str) -> Camera:
+    def _camera(self, name: str) -> Camera:
         from demorec.episode.info import Camera
 
+        key = self.keys[name]
         problem = ExportError(f"The dataset has no image of {key}: {self.root}")
         for number, place in enumerate(self.listed):
             try:

@@ -191,7 +191,7 @@ def relocated(root: Path, listed: Sequence[EpisodePlace]) -> tuple[EpisodePlace,
     """
     files = tables_in(root, "data")
     there = {path: open_table(path).metadata.num_rows for path in files}
-    if _num_rows(listed).items() >= {path: count for path, count in there.items() if count}.items():
+    if rows_by_file(listed).items() >= {path: count for path, count in there.items() if count}.items():
         return None
     runs = {run.episode_index: run for run in episode_runs(files)}
     found = tuple(
@@ -200,10 +200,10 @@ def relocated(root: Path, listed: Sequence[EpisodePlace]) -> tuple[EpisodePlace,
         else place
         for place in listed
     )
-    return found if _num_rows(found).items() >= there.items() else None
+    return found if rows_by_file(found).items() >= there.items() else None
 
 
-def _num_rows(places: Sequence[EpisodePlace]) -> dict[Path, int]:
+def rows_by_file(places: Sequence[EpisodePlace]) -> dict[Path, int]:
     """Data file -> number of its episodes' rows."""
     found: dict[Path, int] = {}
     for place in places:

@@ -279,7 +279,9 @@ def _files(plan: Plan, number: int, root: Path, copied: Collection[str]) -> Iter
         path = root / name
         if name in copied or path in used:
             continue
-        if not is_dataset_file(name):
+        if _is_stray_table(name) and not is_dataset_file(name):
+            yield name, "LeRobot gives no table this name"
+        elif not is_dataset_file(name):
             differs = "not the same in all datasets" if len(plan.sources) > 1 else "unknown to demorec"
             yield name, f"{differs}: copy it if it still applies"
         elif name.startswith(("data/", "videos/")):

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import ast
 import operator
-from collections.abc import Callable, Mapping, Sequence
+import pkgutil
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
+from demorec.core.extensions import rows_of
 from demorec.core.registry import check_choice, nearest_match
+from demorec.datasets.lerobot.episode_records import episode_columns
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.extensions.editing.cut import WatchedNumbers
@@ -36,7 +39,20 @@ _Value = Callable[[Mapping[str, Any]], Any]
 """Value of a part of a condition, from an episode's columns."""
 
 Rows = Sequence[Mapping[str, Any]]
-"""Values of each episode in order, from `episode_columns`."""
+"""Values of each episode in order, from `columns_of`."""
+
+
+def columns_of(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:
+    """Read the columns of each episode, including requested columns of extensions that the dataset lacks."""
+    columns = episode_columns(folder)
+    wanted: dict[str, list[str]] = {}
+    for name, target in rows_of("columns"):
+        if name in names and not any(name in row for row in columns):
+            wanted.setdefault(target, []).append(name)
+    for target, added in wanted.items():
+        values = pkgutil.resolve_name(target)(folder, added)
+        columns = [row | more for row, more in zip(columns, values, strict=True)]
+    return columns
 
 
 def chosen(source: LeRobotFolder, rows: Rows, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
 
 from demorec.core.extensions import reader_rows
@@ -19,7 +20,7 @@ BAGS = SourceFormat(
     example="monday.mcap --mapping robot.toml --out runs/robot",
     importer="demorec.extensions.imports.import_run:import_bags",
     suggester="demorec.extensions.imports.suggest:suggested_mapping",
-    reviewer="demorec.extensions.imports.formats:review_bag_mapping",
+    reviewer="demorec.extensions.imports.formats:review_mapping",
     describer="demorec.extensions.imports.describe:describe_bags",
     dropped="demorec.extensions.imports.describe:dropped_rows",
 )
@@ -43,20 +44,14 @@ def formats_by_word() -> Mapping[str, SourceFormat]:
     return {row.word: formats()[kind] for kind, row in reader_rows().items() if row.word}
 
 
-def review_bag_mapping(path: Path) -> str:
-    """Features and cameras of a mapping of bags, in words; errors as in `read_mapping`."""
-    return _reviewed(path, "bag")
-
-
-def review_hdf5_mapping(path: Path) -> str:
-    """Features and cameras of a mapping of HDF5 files, in words."""
-    return _reviewed(path, "hdf5")
-
-
-def _reviewed(path: Path, kind: SourceKind) -> str:
+def review_mapping(path: Path, kind: SourceKind = "bag") -> str:
+    """Features and cameras of a mapping, in words; errors as in `read_mapping`."""
     mapping = read_mapping(path, kind)
     parts = [
         f"{name} from {' and '.join(dict.fromkeys(source.place for source in of))}"
         for name, of in mapping.features.items()
     ]
     return listed([*parts, *(f"camera {name}" for name in mapping.cameras)], _MOST_SHOWN, ", ")
+
+
+review_hdf5_mapping = partial(review_mapping, kind="hdf5")

@@ -158,6 +158,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
         self.config, self.render_mode = config, _checked(render_mode)
+        self.task = config.task
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
@@ -196,11 +197,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     def max_episode_steps(self) -> int:
         """Time limit, frames."""
         return self._max_episode_steps
-
-    @property
-    def task(self) -> str:
-        """Name of the task."""
-        return self.config.task
 
     @property
     def task_description(self) -> str:

@@ -27,8 +27,7 @@ class Chosen(EditOne):
 
     def chosen(self, source: LeRobotFolder) -> list[int]:
         """Numbers of the selected episodes."""
-        from demorec.extensions.editing.columns import columns_of
-        from demorec.extensions.editing.operations import chosen, names_in
+        from demorec.extensions.editing.operations import chosen, columns_of, names_in
 
         rows = columns_of(source, names_in(self.where))
         return chosen(source, rows, self.where, episode_numbers(self.episodes) if self.episodes else None)
@@ -152,8 +151,7 @@ class Split(EditOne):
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """Name of each part -> its plan."""
-        from demorec.extensions.editing.columns import columns_of
-        from demorec.extensions.editing.operations import split
+        from demorec.extensions.editing.operations import columns_of, split
 
         rows = columns_of(sources[0], {self.by})
         return split(sources[0], rows, self._shares(), self.seed, by=self.by)
@@ -262,8 +260,7 @@ class Reorder(EditOne):
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes in the new order."""
-        from demorec.extensions.editing.columns import columns_of
-        from demorec.extensions.editing.operations import reorder
+        from demorec.extensions.editing.operations import columns_of, reorder
 
         rows = columns_of(sources[0], {self.by}) if self.by else ()
         return reorder(sources[0], rows, self.by, episode_numbers(self.order), descending=self.descending)
