@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.progress import duration
 from demorec.core.processes import available_cores
+from demorec.core.replacing import shown
 from demorec.episode.features import ENVIRONMENT_STATE, observation_names
 from demorec.generate.contents import set_aside
 from demorec.generate.executor import Made
@@ -115,10 +116,10 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
     for failure in () if checked is None else checked[1][:10]:
         tell(f"Check failed: {failure}")
     if run.given_up:
-        shown = ", ".join(str(index) for index in run.given_up[:10]) + (", ..." if len(run.given_up) > 10 else "")
         tell(
             f"{len(run.given_up)} of {run.num_episodes} episodes failed at all {run.config.max_attempts} attempts and "
-            f"were given up: {shown}. The attempts are in {folder / 'failed'}; raise --max-attempts in a new --out."
+            f"were given up: {shown(run.given_up, 10)}. The attempts are in {folder / 'failed'}; raise --max-attempts "
+            "in a new --out."
         )
 
 
@@ -138,8 +139,8 @@ def print_comparison(original: Original, result: RunResult) -> bool:
     if not different:
         say(f"The same as {original.source}: {counted(len(same), 'episode')}, bit for bit.")
         return True
-    listed = ", ".join(different[:10]) + (", ..." if len(different) > 10 else "")
-    say(f"Not the same as {original.source}: {len(different)} of {counted(len(same), 'episode')} differ: {listed}.")
+    differ = f"{len(different)} of {counted(len(same), 'episode')} differ: {shown(different, 10)}"
+    say(f"Not the same as {original.source}: {differ}.")
     return False
 
 

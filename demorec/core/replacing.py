@@ -142,9 +142,9 @@ def _is_empty(path: Path) -> bool:
     return path.is_dir() and not any(path.iterdir())
 
 
-def shown(names: Sequence[str]) -> str:
+def shown(names: Sequence[object], most: int = _SHOWN) -> str:
     """The first few names, for a sentence."""
-    return ", ".join(names[:_SHOWN]) + (", ..." if len(names) > _SHOWN else "")
+    return ", ".join(map(str, names[:most])) + (", ..." if len(names) > most else "")
 
 
 def files_below(folder: Path) -> Iterator[str]:

@@ -215,10 +215,7 @@ class Expert:
             self._missing = self.behaviour.misses and not self._has_missed and attempt == 0
             picked = yield from self.pick(goal.object, is_begun=is_begun and attempt == 0)
             self._missing = False
-            if not picked:
-                continue
-            placed = yield from self.place(goal)
-            if placed:
+            if picked and (yield from self.place(goal)):
                 return
         raise ExpertFailure(*self.trouble)
 

@@ -78,6 +78,8 @@ class VideoFile:
         frames: (N,) int64, number of the frame in which each is shown.
         order: (N,) indices that sort `frames`.
         keys: (K,) frame numbers of the keyframes.
+        codec: Codec of its packets by recordings' name; "" if recordings cannot hold it.
+        codec_name: Codec by info.json's name.
         size, pixels: (width, height) and pixel format, as libav describes them.
         parameters: Parameter sets of the codec.
         has_long_lengths: Whether H.264 and HEVC units have four-byte lengths, as from all common writers.
@@ -94,22 +96,13 @@ class VideoFile:
         self.keys = np.flatnonzero(self.is_keyframe)
         with opened_video(path) as (_, stream):
             context = stream.codec_context
-            self._codec = context.name
+            self.codec: PacketCodec | Literal[""] = PACKET_CODECS.get(context.name, "")
+            self.codec_name = _MP4_NAMES.get(self.codec, self.codec) or context.name
             self.size, self.pixels = (context.width, context.height), context.pix_fmt or ""
             self.parameters = extra = context.extradata or b""
-            length_size = extra[4] if self._codec == "h264" else extra[21] if len(extra) > 21 else 3
-            self.has_long_lengths = self._codec not in ("h264", "hevc") or (length_size & 3) == 3
+            length_size = extra[4] if self.codec == "h264" else extra[21] if len(extra) > 21 else 3
+            self.has_long_lengths = self.codec not in ("h264", "h265") or (length_size & 3) == 3
         self._head = b""
-
-    @property
-    def codec(self) -> PacketCodec | Literal[""]:
-        """Codec of its packets by recordings' name; "" if recordings cannot hold it."""
-        return PACKET_CODECS.get(self._codec, "")
-
-    @property
-    def codec_name(self) -> str:
-        """Codec by info.json's name."""
-        return _MP4_NAMES.get(self.codec, self.codec) or self._codec
 
     def samples(self, numbers: Iterable[int]) -> Iterator[bytes]:
         """Yield images in their stored form."""

@@ -14,6 +14,7 @@ import numpy as np
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
 from demorec.core.extensions import rows_of
 from demorec.core.registry import check_choice, nearest_match
+from demorec.core.replacing import shown
 from demorec.datasets.lerobot.episode_records import episode_columns
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
@@ -71,8 +72,7 @@ def _names(rows: Rows) -> list[str]:
 
 
 def _no_column(name: str, names: Sequence[str]) -> ConfigError:
-    listed = ", ".join(names[:_MOST_LISTED]) + (", ..." if len(names) > _MOST_LISTED else "")
-    return ConfigError(f"Unknown column {name!r}.{nearest_match(name, names)} Allowed: {listed}.")
+    return ConfigError(f"Unknown column {name!r}.{nearest_match(name, names)} Allowed: {shown(names, _MOST_LISTED)}.")
 
 
 def select(source: LeRobotFolder, numbers: Sequence[int], *, drop: bool = False) -> Plan:

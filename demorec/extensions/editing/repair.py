@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from demorec.core.errors import ExportError, without_path
+from demorec.core.replacing import shown
 from demorec.datasets.lerobot.episode_table import (
     EpisodePlace,
     are_on_grid,
@@ -38,7 +39,6 @@ from demorec.extensions.editing.repair_features import (
 )
 from demorec.extensions.editing.repair_tables import stated_splits, table_changes
 
-_MAX_NAMED = 5
 _Images = list[tuple[Path, int] | None]
 
 
@@ -203,7 +203,7 @@ class RepairedDataset(LeRobotFolder):
         """Note missing and wrong counters."""
         numbers = [run.episode_index for run in runs]
         if numbers != list(range(len(runs))):
-            self.change(f"The episodes are numbered from 0; they were {_listed(numbers)}.")
+            self.change(f"The episodes are numbered from 0; they were {shown(numbers)}.")
         begin, wrong = 0, 0
         for run in runs:
             rows = np.arange(begin, begin + run.length)
@@ -265,8 +265,3 @@ def _num_images(path: Path) -> int | None:
     with suppress(ExportError):
         return len(mp4_index(path)[0])
     return None
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    shown = ", ".join(map(str, numbers[:_MAX_NAMED]))
-    return f"{shown}, ..." if len(numbers) > _MAX_NAMED else shown

@@ -157,7 +157,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         config.validate()
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
-        self.config, self.render_mode = config, _checked(render_mode)
+        if render_mode is not None:
+            check_choice("render_mode", render_mode, ("rgb_array",))
+        self.config, self.render_mode = config, render_mode
         self.task = config.task
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
@@ -348,12 +350,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 def _key(feature: str) -> str:
     """Key of a dataset feature in the observation; LeRobot's `preprocess_observation` maps it back."""
     return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
-
-
-def _checked(render_mode: str | None) -> str | None:
-    if render_mode not in (None, "rgb_array"):
-        raise ConfigError(f"render_mode must be None or 'rgb_array', not {render_mode!r}.")
-    return render_mode
 
 
 def _on_request(info: EpisodeInfo, names: Collection[str]) -> tuple[Feature, ...]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import CheckResult, Finding
+from demorec.core.replacing import shown
 from demorec.episode.element_names import is_numbered
 from demorec.episode.episode import Outcome
 from demorec.episode.roles import Roles
@@ -221,5 +222,4 @@ def common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) -> 
 
 def few(values: Iterable[str]) -> str:
     """The first three distinct values."""
-    distinct = list(dict.fromkeys(values))
-    return (", ".join(distinct[:3]) + (", ..." if len(distinct) > 3 else "")) or "unknown"
+    return shown(list(dict.fromkeys(values)), 3) or "unknown"
