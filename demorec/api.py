@@ -68,7 +68,6 @@ if TYPE_CHECKING:
     from demorec.robots.robot import RobotSpec as RobotSpec
     from demorec.robots.so101 import SO101 as SO101
     from demorec.robots.so101 import SO101_FOLLOWER as SO101_FOLLOWER
-    from demorec.runs.foreign import SourceFormat as SourceFormat
     from demorec.sim.world import World as World
     from demorec.tasks.base import Task as Task
     from demorec.tasks.furniture import mark as mark
@@ -177,7 +176,6 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
         "Extension": "demorec.core.extension",
         "CommandRow": "demorec.core.extension",
         "ReaderRow": "demorec.core.extension",
-        "SourceFormat": "demorec.runs.foreign",
         "Exporter": "demorec.datasets.options",
         "CommonOptions": "demorec.datasets.options",
         "ExportReport": "demorec.datasets.options",

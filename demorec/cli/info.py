@@ -13,11 +13,12 @@ from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_w
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
 from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
+from demorec.core.extensions import reader_rows
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.simulated import simulation_facts
 from demorec.runs.find import Found, expect, find
-from demorec.runs.foreign import dropped_by_import, formats
+from demorec.runs.foreign import dropped_by_import
 
 if TYPE_CHECKING:
     from demorec.episode.roles import NamedRoles, Roles
@@ -66,7 +67,7 @@ class Info:
 
 def _described(paths: Sequence[Path]) -> dict[Path, tuple[dict[str, Any], list[str]]]:
     """Describe foreign files that need no import for it."""
-    forms = formats()
+    forms = reader_rows()
     kinds = {path: find(path).kind for path in paths}
     hooks = {path: forms[kind].describer for path, kind in kinds.items() if kind in forms}
     return {path: pkgutil.resolve_name(hook)(path) for path, hook in hooks.items() if hook}

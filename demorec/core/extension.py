@@ -44,20 +44,38 @@ class ReaderRow:
     """A kind of foreign files or folders that can be imported.
 
     Attributes:
-        target: "module:name" of a `demorec.runs.foreign.SourceFormat`.
         name: Noun for one in a sentence: "an HDF5 file".
         plural: Plural noun: "HDF5 files".
         advice: Action for the user if a recording was expected: "convert it to a run (demorec import)".
         word: Word after `demorec import` for this kind; "" if none is needed.
         suffixes: File suffixes, for a kind that the core does not know.
+        example: Example of the arguments after `demorec import` and the word.
+        importer: "module:function" of (paths, mapping, out), which creates or continues the run `out`.
+        suggester: "module:function" of (path, tell) that returns the lines of a mapping; it calls `tell` with each open
+        decision. "" for a format that needs no mapping.
+        reviewer: "module:function" of a mapping's path: its features and cameras in words; ConfigError if a decision is
+        open. Needed with a `suggester`.
+        describer: "module:function" of a path: yields (plain data, lines) for `demorec info`, without a mapping; "" if
+        `info` reads it through an import.
+        dropped: "module:function" of an imported run: the data left out, as rows of "bag", "what" and "reason".
     """
 
-    target: str
     name: str
     plural: str
     advice: str = ""
     word: str = ""
     suffixes: tuple[str, ...] = ()
+    example: str
+    importer: str
+    suggester: str = ""
+    reviewer: str = ""
+    describer: str = ""
+    dropped: str = ""
+
+    @property
+    def command(self) -> str:
+        """Its import command, without paths."""
+        return f"demorec import {self.word}".rstrip()
 
 
 @dataclass(frozen=True, kw_only=True)

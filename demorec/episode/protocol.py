@@ -41,13 +41,13 @@ class SceneMotion:
 
 
 class Episode(Protocol):
-    """An open episode of any source; unknown parts are absent, as in the bodies of this class.
+    """An open episode of any source; unknown parts are absent.
 
     Attributes:
         path: File, or folder of the dataset.
         num_frames: T.
 
-    Methods and properties raise DemorecError if the files cannot be read.
+    Methods and properties raise DemorecError if the files cannot be read. Those with a body return what is unknown.
     """
 
     path: Path

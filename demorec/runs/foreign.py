@@ -10,13 +10,13 @@ import pkgutil
 import shlex
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Protocol
 
 from demorec.core.errors import ConfigError, DemorecError
+from demorec.core.extension import ReaderRow
 from demorec.core.extensions import reader_rows
 from demorec.runs.find import PathKind, find
 
@@ -34,56 +34,7 @@ class ImportResult(Protocol):
         """Describe the data left out of the run."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class SourceFormat:
-    """A third-party format of files or folders.
-
-    Attributes:
-        kind: Kind of path in `demorec.runs.find`.
-        example: Example of the arguments after `demorec import` and the format's word.
-        importer: "module:function" of (paths, mapping, out), which creates or continues the run `out`.
-        suggester: "module:function" of (path, tell) that returns the lines of a mapping; it calls `tell` with each open
-        decision. "" for a format that needs no mapping.
-        reviewer: "module:function" of a mapping's path: its features and cameras in words; ConfigError if a decision is
-        open. Needed with a `suggester`.
-        describer: "module:function" of a path: yields (plain data, lines) for `demorec info`, without a mapping; "" if
-        `info` reads it through an import.
-        dropped: "module:function" of an imported run: the data left out, as rows of "bag", "what" and "reason".
-    """
-
-    kind: PathKind
-    example: str
-    importer: str
-    suggester: str = ""
-    reviewer: str = ""
-    describer: str = ""
-    dropped: str = ""
-
-    @property
-    def plural(self) -> str:
-        """Plural noun for a sentence."""
-        return reader_rows()[self.kind].plural
-
-    @property
-    def command(self) -> str:
-        """Its import command, without paths."""
-        return " ".join(filter(None, ("demorec import", reader_rows()[self.kind].word)))
-
-    def read(self, paths: Sequence[Path], mapping: Path | None, out: Path, **options: Any) -> ImportResult:
-        """Create or continue the run `out`; options, result and errors as in the importer."""
-        return cast(ImportResult, pkgutil.resolve_name(self.importer)(paths, mapping, out, **options))
-
-    def suggest(self, path: Path, tell: Tell) -> list[str]:
-        """Return the lines of a mapping."""
-        return cast(list[str], pkgutil.resolve_name(self.suggester)(path, tell))
-
-
 _MB = 1e6
-
-
-def formats() -> Mapping[str, SourceFormat]:
-    """Kind of path -> its format."""
-    return {kind: cast(SourceFormat, pkgutil.resolve_name(row.target)) for kind, row in reader_rows().items()}
 
 
 def imported_kinds() -> tuple[PathKind, ...]:
@@ -93,7 +44,7 @@ def imported_kinds() -> tuple[PathKind, ...]:
 
 def dropped_by_import(run: Path) -> list[dict[str, str]]:
     """Data that an import left out of a run, each as "bag", "what" and "reason"."""
-    hooks = [form.dropped for form in formats().values() if form.dropped]
+    hooks = [row.dropped for row in reader_rows().values() if row.dropped]
     return [row for hook in hooks for row in pkgutil.resolve_name(hook)(run)]
 
 
@@ -113,7 +64,7 @@ def opened(paths: Sequence[Path], mapping: Path | None, *, imports_datasets: boo
         ConfigError: A mapping is missing, impossible or given without need, or the disk is too small.
         DemorecError: As in the importers.
     """
-    by_kind = formats()
+    by_kind = reader_rows()
     kinds = [import_kind(path, imports_datasets) for path in paths]
     forms = {path: by_kind[kind] for path, kind in zip(paths, kinds, strict=True) if kind is not None}
     if mapping is not None and not any(form.suggester for form in forms.values()):
@@ -132,13 +83,13 @@ def opened(paths: Sequence[Path], mapping: Path | None, *, imports_datasets: boo
         yield found
 
 
-def _imported(path: Path, form: SourceFormat, mapping: Path | None, run: Path, tell: Tell) -> Path:
+def _imported(path: Path, form: ReaderRow, mapping: Path | None, run: Path, tell: Tell) -> Path:
     """Import a path and return its run."""
     if not form.suggester:
         mapping = None
     elif mapping is None:
         mapping = _suggested(path, form, run.with_suffix(".toml"), tell)
-    result = form.read([path], mapping, run)
+    result: ImportResult = pkgutil.resolve_name(form.importer)([path], mapping, run)
     for line in result.left_out_lines():
         tell(line)
     if not result.num_episodes:
@@ -163,10 +114,10 @@ def _check_space(paths: Sequence[Path], folder: Path) -> None:
         )
 
 
-def _suggested(path: Path, form: SourceFormat, target: Path, tell: Tell) -> Path:
+def _suggested(path: Path, form: ReaderRow, target: Path, tell: Tell) -> Path:
     """Write the suggested mapping; ConfigError if it leaves a decision to the user."""
     doubts: list[str] = []
-    target.write_text("\n".join(form.suggest(path, doubts.append)) + "\n", encoding="utf-8")
+    target.write_text("\n".join(pkgutil.resolve_name(form.suggester)(path, doubts.append)) + "\n", encoding="utf-8")
     suggest = f"{form.command} {shlex.quote(str(path))} --suggest > mapping.toml"
     try:
         if doubts:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, cast
+from typing import TYPE_CHECKING, Annotated, Any
 
 from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
@@ -14,11 +15,11 @@ from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
+from demorec.core.extension import ReaderRow
+from demorec.core.extensions import reader_rows
 from demorec.core.registry import nearest_match
 from demorec.core.targets import OptionalTarget
-from demorec.extensions.imports.formats import BAGS, formats_by_word
-from demorec.runs.find import find, name_of
-from demorec.runs.foreign import SourceFormat
+from demorec.runs.find import find
 
 if TYPE_CHECKING:
     from demorec.extensions.imports.episode_writer import FramesImport
@@ -26,7 +27,9 @@ if TYPE_CHECKING:
 
 MAX_WORKERS = 1000
 _BAGS = "Bags; each is one episode, or several by the mapping."
-_WORDS = ", ".join(f"{word} ({form.plural})" for word, form in formats_by_word().items())
+BAGS = reader_rows()["rosbag"]
+_FORMATS = {row.word: row for row in reader_rows().values() if row.word}
+_WORDS = ", ".join(f"{word} ({form.plural})" for word, form in _FORMATS.items())
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -83,23 +86,20 @@ class Import:
             refuse_inside([self.out])
         check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
-        form = formats_by_word().get(word, BAGS)
+        form = _FORMATS.get(word, BAGS)
         self._check_flags(form)
         paths = self.bags if form is BAGS else self.bags[1:]
         if not paths:
-            name = name_of(form.kind)
             raise ConfigError(
-                f"Name {name} after the word {word}: {form.command} {form.example}. Give a bag with that name with "
-                "its folder."
+                f"Name {form.name} after the word {word}: {form.command} {form.example}. Give a bag with that name "
+                "with its folder."
             )
-        if form is BAGS and not paths[0].exists() and (near := nearest_match(word, formats_by_word())):
-            raise ConfigError(
-                f"No bag {word!r}.{near} Name bags, or one of {', '.join(formats_by_word())} and its files."
-            )
+        if form is BAGS and not paths[0].exists() and (near := nearest_match(word, _FORMATS)):
+            raise ConfigError(f"No bag {word!r}.{near} Name bags, or one of {', '.join(_FORMATS)} and its files.")
         from demorec.extensions.imports.bag import bags_in, open_bag
 
         if self.suggest:
-            lines = form.suggest(paths[0], tell)
+            lines: list[str] = pkgutil.resolve_name(form.suggester)(paths[0], tell)
             if find(paths[0]).kind == "recording":
                 tell(f"Note: demorec made this recording, and reads it directly, without an import: {paths[0]}")
             say(*lines)
@@ -119,7 +119,7 @@ class Import:
             return self._import_bags(paths, self.mapping, self.out)
         return self._import_frames(form, paths, self.out)
 
-    def _check_flags(self, form: SourceFormat) -> None:
+    def _check_flags(self, form: ReaderRow) -> None:
         """Raise ConfigError for flags of another format."""
         if form.suggester and self.motors.named is not None:
             raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
@@ -137,15 +137,14 @@ class Import:
                 "--episodes belongs to datasets (demorec import lerobot DATASET --out RUN); mappings have [episodes]."
             )
         if not form.suggester and (self.suggest or self.mapping is not None):
-            name = name_of(form.kind)
-            raise ConfigError(f"The import of {name} needs no mapping: leave --mapping and --suggest out.")
+            raise ConfigError(f"The import of {form.name} needs no mapping: leave --mapping and --suggest out.")
 
-    def _import_frames(self, form: SourceFormat, paths: Sequence[Path], out: Path) -> int:
+    def _import_frames(self, form: ReaderRow, paths: Sequence[Path], out: Path) -> int:
         options: dict[str, Any] = {"video": self.video}
         if not form.suggester:
             options |= {"motors": self.motors.named, "named": self.roles.named}
             options |= {"episodes": self.episodes, "skip_bad": self.skip_bad}
-        result = cast("FramesImport", form.read(paths, self.mapping, out, **options))
+        result: FramesImport = pkgutil.resolve_name(form.importer)(paths, self.mapping, out, **options)
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")

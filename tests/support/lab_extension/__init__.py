@@ -9,12 +9,13 @@ EXTENSION = Extension(
     commands={"count-frames": CommandRow(target="lab_extension.commands:CountFrames", group="look", limits="reading")},
     readers={
         "labcsv": ReaderRow(
-            target="lab_extension.csv_files:READER",
             name="a CSV file of our lab",
             plural="CSV files of our lab",
             advice="make a run of it (demorec import labcsv)",
             word="labcsv",
             suffixes=(".labcsv",),
+            example="cup.labcsv --out runs/cup",
+            importer="lab_extension.csv_files:import_files",
         )
     },
     exporters={"labcsv": "lab_extension.csv_files:EXPORTER"},

@@ -17,7 +17,6 @@ from demorec.api import (
     ExportReport,
     ProgressCallback,
     ReplaceableKind,
-    SourceFormat,
     atomic_write,
     find_recordings,
     open_recording,
@@ -38,9 +37,6 @@ class LabOptions(CommonOptions):
 
 EXPORTER = Exporter(
     summary="the state of one episode, one row a frame", options=LabOptions, function="lab_extension.csv_files:export"
-)
-READER = SourceFormat(
-    kind="labcsv", example="cup.labcsv --out runs/cup", importer="lab_extension.csv_files:import_files"
 )
 
 
