@@ -1,4 +1,4 @@
-"""Number types in the data files that differ from info.json."""
+"""Types in the data files, which may differ from info.json."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from demorec.datasets.lerobot.files import open_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, NUMBER_TYPES, FeatureType
 
-_NUMPY_NAMES = {"float": "float32", "double": "float64"}
-"""Arrow's type names -> NumPy's."""
+_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
+"""Arrow's type names -> LeRobot's, if different."""
 
 
 def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
@@ -24,21 +24,20 @@ def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
         schema = open_table(path).schema_arrow
         for name in numeric:
             if name in schema.names:
-                stored.setdefault(name, set()).add(str(_number_type(schema.field(name).type)))
+                stored.setdefault(name, set()).add(stored_dtype(schema.field(name).type))
     found: dict[str, FeatureType] = {}
-    for name, kinds in stored.items():
+    for name, dtypes in stored.items():
         if name in AUTOMATIC_FEATURES and name != "timestamp":
             continue
-        dtypes = {_NUMPY_NAMES.get(kind, kind) for kind in kinds}
         if dtypes <= set(NUMBER_TYPES) and dtypes != {numeric[name].dtype}:
             found[name] = str(np.result_type(*dtypes))  # type: ignore[assignment]
     return found
 
 
-def _number_type(column: pa.DataType) -> pa.DataType:
-    """Number type in a column of numbers, lists or arrays."""
+def stored_dtype(column: pa.DataType) -> str:
+    """Return LeRobot's name of the type in a column of numbers, texts, lists or arrays."""
     if isinstance(column, pa.BaseExtensionType):
         column = column.storage_type
     while pa.types.is_list(column) or pa.types.is_fixed_size_list(column) or pa.types.is_large_list(column):
         column = column.value_type
-    return column
+    return _NAMES.get(str(column), str(column))

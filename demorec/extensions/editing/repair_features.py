@@ -18,6 +18,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.datasets.lerobot.stored_types import stored_dtype
 
 _COUNTS: dict[str, int] = {
     "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1000, "data_files_size_in_mb": 100,
@@ -25,8 +26,6 @@ _COUNTS: dict[str, int] = {
 }  # fmt: skip
 """Counts in info.json, and replacements for impossible values."""
 _MAX_COUNT = 1e9
-_TYPES = {"double": "float64", "float": "float32", "large_string": "string"}
-"""Arrow's type name -> LeRobot's, if different."""
 _DTYPES = frozenset(
     ("float32", "float64", "int8", "int16", "int32", "int64", "uint8", "uint16", "uint32", "bool", "string")
 )
@@ -124,13 +123,7 @@ def _is_precise(name: str, feature: DatasetFeature) -> bool:
 
 def _described(tables: Sequence[Path], schemas: Sequence[pa.Schema], name: str) -> DatasetFeature | None:
     """Describe a column as a feature; None if it has neither numbers nor text."""
-    kinds = set()
-    for schema in schemas:
-        if name in schema.names:
-            kind = schema.field(name).type
-            while pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind) or pa.types.is_large_list(kind):
-                kind = kind.value_type
-            kinds.add(_TYPES.get(str(kind), str(kind)))
+    kinds = {stored_dtype(schema.field(name).type) for schema in schemas if name in schema.names}
     if len(kinds) > 1:
         raise ExportError(
             f"The data files have {name} as {' and as '.join(sorted(kinds))}: leave it out first (demorec dataset "

@@ -16,12 +16,12 @@ from demorec.datasets.lerobot.files import open_table, read_table, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
+from demorec.datasets.lerobot.stored_types import stored_dtype
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.extensions.doctor.evidence import DROP, REPAIR, Evidence
 
-_TYPES = {
-    "float32": pa.float32(), "float64": pa.float64(), "int64": pa.int64(), "bool": pa.bool_(), "string": pa.string(),
-}  # fmt: skip
+_STATED_TYPES = ("float32", "float64", "int64", "bool", "string")
+"""Types of info.json that are compared with the columns."""
 _PRECISE = ("timestamp", "float64")
 """A counter that may be more precise than LeRobot's own."""
 _BY_HAND = "correct it in meta/info.json"
@@ -240,20 +240,17 @@ def _column_faults(
 
 def _fits(found: pa.DataType, feature: DatasetFeature) -> str:
     """Return "equal", "converts" if readers convert it without loss of meaning, or "other"."""
-    if feature.dtype not in _TYPES:
+    if feature.dtype not in _STATED_TYPES:
         return "equal"  # images in tables, as other writers store them
-    size = None
-    while pa.types.is_list(found) or pa.types.is_fixed_size_list(found) or pa.types.is_large_list(found):
-        if pa.types.is_fixed_size_list(found):
-            size = (size or 1) * found.list_size
-        found = found.value_type
-    if size is not None and size != math.prod(feature.shape):
+    column, size = found, 1
+    while pa.types.is_fixed_size_list(column):
+        column, size = column.value_type, size * column.list_size
+    if column != found and size != math.prod(feature.shape):
         return "other"
-    wanted = _TYPES[feature.dtype]
-    if found == wanted or (feature.dtype == "string" and pa.types.is_large_string(found)):
+    stored = stored_dtype(found)
+    if stored == feature.dtype:
         return "equal"
-    both = (found, wanted)
-    are_kin = all(map(pa.types.is_floating, both)) or all(map(pa.types.is_integer, both))
+    are_kin = any(all(kind in name for name in (stored, feature.dtype)) for kind in ("float", "int"))
     return "converts" if are_kin else "other"
 
 
