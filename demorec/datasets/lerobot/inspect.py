@@ -9,7 +9,7 @@ from typing import Any
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
 from demorec.datasets.lerobot.episode_table import EpisodePlace
-from demorec.datasets.lerobot.files import open_table, read_json
+from demorec.datasets.lerobot.files import open_table, read_json, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
 from demorec.datasets.lerobot.mp4_index import check_video
@@ -86,6 +86,25 @@ def dataset_problems(folder: LeRobotFolder) -> list[str]:
         with noted(problems, folder.root):
             check_video(video)
     return list(dict.fromkeys(problems))
+
+
+def range_errors(folder: LeRobotFolder) -> Iterator[tuple[str, int, int, float | None]]:
+    """Yield each range of rows or images in the table of episodes that does not fit the episode's length.
+
+    Yields:
+        Column of the range's end, number and length of the episode, and surplus frames; None for a missing column.
+    """
+    ranges = [("dataset_from_index", "dataset_to_index", 1)]
+    for key in folder.info.video_keys:
+        ranges.append((f"videos/{key}/from_timestamp", f"videos/{key}/to_timestamp", folder.info.fps))
+    for path in folder.episode_tables:
+        columns = open_table(path).schema_arrow.names
+        for begin, end, unit in ranges:
+            names = [begin, end] if end in columns else []
+            for row in read_table(path, ["episode_index", "length", *names]).to_pylist():
+                surplus = None if row.get(end) is None else (row[end] - row[begin]) * unit - row["length"]
+                if surplus is None or not abs(surplus) < 0.5:
+                    yield end, row["episode_index"], row["length"], surplus
 
 
 @contextmanager

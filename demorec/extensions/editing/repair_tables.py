@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -11,6 +12,7 @@ from demorec.datasets.lerobot.episode_records import OLD_STATS
 from demorec.datasets.lerobot.episode_table import EpisodePlace, read_tasks
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import range_errors
 from demorec.datasets.lerobot.layout import STATS_PATH, TASKS_PATH, FilePosition
 from demorec.datasets.lerobot.statistic_errors import statistic_errors
 
@@ -59,23 +61,8 @@ def _places(folder: LeRobotFolder, stored: Mapping[int, EpisodePlace]) -> Iterat
 
 
 def _ends(folder: LeRobotFolder) -> Iterator[str]:
-    """Compare the ends of rows and images in the table of episodes with their starts and the lengths."""
-    wrong: dict[str, int] = {}
-    for path in folder.episode_tables:
-        there = open_table(path).schema_arrow.names
-        ends = ["dataset_to_index", *(f"videos/{key}/to_timestamp" for key in folder.info.video_keys)]
-        for end in ends:
-            if end not in there:
-                wrong[end] = len(folder.listed)
-                continue
-            begin = end.replace("to_", "from_")
-            for row in read_table(path, ["length", begin, end]).to_pylist():
-                unit = 1 if end == "dataset_to_index" else folder.info.fps
-                is_right = row[end] is not None and abs((row[end] - row[begin]) * unit - row["length"]) < 0.5
-                wrong[end] = wrong.get(end, 0) + (not is_right)
-    for name, count in wrong.items():
-        if count:
-            yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
+    for name, count in Counter(name for name, *_ in range_errors(folder)).items():
+        yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
 
 
 def _paths(folder: LeRobotFolder) -> Iterator[str]:

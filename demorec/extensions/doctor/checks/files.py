@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,9 +13,9 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, Severity, check
-from demorec.datasets.lerobot.files import open_table, read_table, tables_in
+from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.inspect import noted, range_errors
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
 from demorec.datasets.lerobot.stored_types import stored_dtype
 from demorec.datasets.lerobot.videos import opened_video
@@ -151,25 +152,16 @@ def _task_names(folder: LeRobotFolder, numbers: NDArray[np.integer[Any]]) -> set
 
 
 def _wrong_ranges(folder: LeRobotFolder) -> Iterator[Fault]:
-    """Check the ranges in the episodes' table: rows of the dataset, and seconds of each video."""
-    ends = [f"videos/{key}/to_timestamp" for key in folder.info.video_keys]
-    last_frames: dict[str, int] = {}
-    for path in tables_in(folder.root, "meta/episodes"):
-        columns = open_table(path).schema_arrow.names
-        names = [name for name in ("dataset_to_index", *ends) if name in columns]
-        begins = [name.replace("to_", "from_") for name in names]
-        for row in read_table(path, ["episode_index", "length", *names, *begins]).to_pylist():
-            for begin, end in zip(begins, names, strict=True):
-                unit = 1 if end == "dataset_to_index" else folder.info.fps
-                surplus = (row[end] - row[begin]) * unit - row["length"]
-                if end in ends and -1.5 < surplus < -0.5:
-                    last_frames[end] = last_frames.get(end, 0) + 1
-                elif not abs(surplus) < 0.5:
-                    yield Fault(
-                        severity="broken",
-                        episode=row["episode_index"],
-                        message=f"{end} of the table of episodes does not fit its {row['length']} frames",
-                    )
+    last_frames = Counter[str]()
+    for end, episode, length, surplus in range_errors(folder):
+        if end != "dataset_to_index" and surplus is not None and -1.5 < surplus < -0.5:
+            last_frames[end] += 1
+        elif surplus is not None:
+            yield Fault(
+                severity="broken",
+                episode=episode,
+                message=f"{end} of the table of episodes does not fit its {length} frames",
+            )
     for end, count in last_frames.items():  # training looks up images from the start of an episode alone
         yield Fault(
             severity="look",
@@ -250,8 +242,8 @@ def _fits(found: pa.DataType, feature: DatasetFeature) -> str:
     stored = stored_dtype(found)
     if stored == feature.dtype:
         return "equal"
-    are_kin = any(all(kind in name for name in (stored, feature.dtype)) for kind in ("float", "int"))
-    return "converts" if are_kin else "other"
+    kinds = {name.lstrip("u").rstrip("0123456789") for name in (stored, feature.dtype)}
+    return "converts" if kinds in ({"float"}, {"int"}) else "other"
 
 
 @check(
