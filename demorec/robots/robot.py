@@ -34,8 +34,6 @@ class ParallelGripper:
     finger_depth: float
     palm_clearance: float
 
-    joint_kind: ClassVar[str] = "prismatic"
-    """Kind of the joints in the URDF."""
     joint_speed: ClassVar[float] = 0.1
     """Motor speed of each joint, m/s."""
     gear_ratios: ClassVar[tuple[float, ...]] = (1.0,)
@@ -115,7 +113,6 @@ class JawGripper:
     play: float = 0.003
     rotor_inertia: float = 0.0
 
-    joint_kind: ClassVar[str] = "revolute"
     joint_speed: ClassVar[float] = 1.0
     """Motor speed of the joint, rad/s."""
     gear_ratios: ClassVar[tuple[float, ...]] = ()

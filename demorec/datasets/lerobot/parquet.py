@@ -40,7 +40,6 @@ class RollingParquet:
     Attributes:
         position: Position of the current file, or of the next one.
         schema: Schema of the tables.
-        num_bytes: Size of the finished files.
 
     Args:
         template: Template of the files' paths in the dataset's folder.
@@ -60,7 +59,6 @@ class RollingParquet:
     ) -> None:
         self._folder = template.partition("/chunk-")[0]
         self.position = next_position(root / self._folder, info.chunks_size)
-        self.num_bytes = 0
         self._root = root
         self._template = template
         self.schema = schema
@@ -134,7 +132,6 @@ class RollingParquet:
         try:
             self._write_group()
             self._writer.close()
-            self.num_bytes += self._sink.tell()
         finally:
             self._writer = None
             self._sink.close()

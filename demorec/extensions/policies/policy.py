@@ -158,7 +158,6 @@ class Policy:
             )
         except Exception as error:  # a foreign format can fail in any way
             raise ConfigError(f"LeRobot cannot load this policy ({describe_error(error)}): {checkpoint}") from error
-        self.inputs = tuple(config.input_features)
         if action_steps is not None:
             chunk = getattr(config, "chunk_size", None)
             if chunk is None or not 1 <= action_steps <= chunk:
