@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 
 from demorec.core.errors import ConfigError, SceneError
+from demorec.core.files import Closing
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Action, JointSample, Observation, frame_time_ns
 from demorec.episode.scene import Body, Physics, Scene
@@ -33,7 +34,7 @@ HULL_MARGIN = 1e-3
 """Margin of Bullet's hull around a mesh, metres; boxes and cylinders have their margin inside."""
 
 
-class World:
+class World(Closing):
     """A PyBullet client with one robot and the bodies of a scene; a context manager, reused across episodes.
 
     Args:
@@ -56,12 +57,6 @@ class World:
         self._shape_rows: ShapeRows = ()
         self._visuals: tuple[VisualBody, ...] = ()
         self.inertial_poses: dict[str, Pose] = {}
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exc: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free the client; safe to call twice."""

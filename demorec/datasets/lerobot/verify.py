@@ -11,7 +11,7 @@ import os
 import signal
 import tempfile
 from collections.abc import Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from itertools import islice
 from multiprocessing.connection import Connection
 from pathlib import Path
@@ -49,7 +49,7 @@ def lerobot_is_installed() -> bool:
     return importlib.util.find_spec("lerobot") is not None
 
 
-class Verifier:
+class Verifier(AbstractContextManager["Verifier"]):
     """Context manager of the verification process, which loads LeRobot while the export runs.
 
     Leaving the context ends the process in any state: with too little memory, loading may never end.
@@ -61,9 +61,6 @@ class Verifier:
         self._process = SPAWN.Process(target=_serve, args=(theirs, self._cache.name), daemon=True)
         self._process.start()
         theirs.close()  # otherwise the pipe would never report that the process has ended
-
-    def __enter__(self) -> Verifier:
-        return self
 
     def __exit__(self, kind: type[BaseException] | None, *exc: object) -> None:
         self._pipe.close()

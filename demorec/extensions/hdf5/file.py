@@ -6,9 +6,9 @@ import errno
 import io
 import json
 import re
+from contextlib import AbstractContextManager
 from pathlib import Path
 from types import TracebackType
-from typing import Self
 
 import h5py
 
@@ -106,7 +106,7 @@ class _Storage(io.FileIO):
         return 0 if size is None else size
 
 
-class NewFile:
+class NewFile(AbstractContextManager["NewFile"]):
     """Context manager for an HDF5 file at a new path.
 
     Attributes:
@@ -119,9 +119,6 @@ class NewFile:
     def __init__(self, path: Path) -> None:
         self._storage = _Storage(path)
         self.root = h5py.File(self._storage, "w")
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None

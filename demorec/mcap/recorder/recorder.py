@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
-from typing import Self, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -45,7 +45,7 @@ FRAMES = "frames"
 _REAL_TIME = VideoConfig(preset="ultrafast")
 
 
-class RecordedEpisode:
+class RecordedEpisode(AbstractContextManager["RecordedEpisode"]):
     """Context manager over one episode, created by `Recorder.episode`.
 
     An exception that ends the `with` block marks the episode as failed, Ctrl-C does not; all received data is kept in
@@ -70,9 +70,6 @@ class RecordedEpisode:
     def is_open(self) -> bool:
         """Whether it accepts more frames."""
         return self._encoder is not None
-
-    def __enter__(self) -> Self:
-        return self
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
