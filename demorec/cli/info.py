@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import pkgutil
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,7 @@ from demorec.runs.find import Found, expect, find
 from demorec.runs.foreign import dropped_by_import
 
 if TYPE_CHECKING:
+    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.episode.roles import NamedRoles, Roles
     from demorec.runs.run_file import RunFile
 
@@ -259,8 +261,10 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
             ("robot", str(info["robot_type"])),
             ("size", size_in_words(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
         ]
-        roles = role_lines.roles_of_dataset(path, named)
-        more, problems = _dataset_content(path)
+        folder, more, problems = _dataset_content(path, named)
+        roles = None
+        with suppress(ExportError):  # one of the problems
+            roles = None if folder is None else folder.roles
         facts += [
             *([] if roles is None else role_lines.role_facts(roles)),
             *more,
@@ -268,7 +272,7 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
         ]
         if len(problems) > _MOST_PROBLEMS:
             facts.append(("problems", f"{len(problems)} in all; demorec check reports more"))
-        rows = role_lines.feature_rows(path, info, roles)
+        rows = role_lines.feature_rows(None if roles is None else folder, info)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
     plain: dict[str, Any] = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
@@ -276,15 +280,17 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
     return plain, [*aligned(facts), "", *aligned(rows)]
 
 
-def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
-    """Table content beyond info.json, if readable, and the problems of the dataset."""
+def _dataset_content(path: Path, named: NamedRoles) -> tuple[LeRobotFolder | None, list[tuple[str, str]], list[str]]:
+    """The open dataset, table content beyond info.json, if readable, and the problems of the dataset."""
     from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_digest, dataset_problems, without_digest
+    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_problems, episode_digests, without_digest
+    from demorec.datasets.lerobot.layout import combined_digest
 
+    folder: LeRobotFolder | None = None
     facts: list[tuple[str, str]] = []
     problems: list[str] = []
     try:
-        folder = LeRobotFolder(path)
+        folder = LeRobotFolder(path, named=named)
         problems += dataset_problems(folder)
         for name, item in folder.info.features.items():
             if item.is_video:
@@ -292,18 +298,18 @@ def _dataset_content(path: Path) -> tuple[list[tuple[str, str]], list[str]]:
                 width, height = item.image_size
                 facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
         if problems:
-            return facts, problems
+            return folder, facts, problems
         if (counts := attempt_counts(folder)) is not None:
             successes, unknown, attempts = counts
             shown = f", {unknown} unknown" if unknown else ""
             facts.insert(0, ("successes", f"{successes}, of {attempts} attempts{shown}"))
         if not without_digest(folder.info):
-            facts.append(("digest", dataset_digest(path)))
+            facts.append(("digest", combined_digest(folder.info, episode_digests(folder))))
     except ExportError as error:
         if (lack := resource_error(error)) is not None:
             raise lack from error
         problems.append(without_path(error, path))
-    return facts, problems
+    return folder, facts, problems
 
 
 def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:

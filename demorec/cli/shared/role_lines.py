@@ -11,6 +11,7 @@ from demorec.core.errors import ExportError, RecordingError
 from demorec.episode.element_names import is_numbered
 
 if TYPE_CHECKING:
+    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.episode.roles import NamedRoles, Role, Roles
     from demorec.runs.run_file import RunFile
 
@@ -49,16 +50,6 @@ def _grippers(roles: Roles) -> list[str]:
     return [name for name, is_gripper in elements if is_gripper]
 
 
-def roles_of_dataset(path: Path, named: NamedRoles) -> Roles | None:
-    """Roles of a dataset's features; None if info.json cannot be interpreted."""
-    from demorec.datasets.lerobot.folder import LeRobotFolder
-
-    try:
-        return LeRobotFolder(path, named=named).roles
-    except ExportError:
-        return None
-
-
 def roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
     """Roles of an external run, whose recordings share their features; None if no recording is readable."""
     from demorec.episode.roles import roles_of_recording
@@ -73,24 +64,23 @@ def roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
     return None
 
 
-def feature_rows(path: Path, info: Mapping[str, Any], roles: Roles | None) -> list[tuple[str, ...]]:
+def feature_rows(folder: LeRobotFolder | None, info: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """A row for each feature of a dataset, after a header: features without a role first, counters last.
 
     Args:
-        path: The dataset's folder.
+        folder: The open dataset; None if info.json cannot be interpreted.
         info: Content of info.json, unchecked.
-        roles: Role of each feature; None if info.json cannot be interpreted.
     """
     types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
-    if roles is None:
+    if folder is None:
         return [("feature", "dtype", "shape"), *((name, *kind) for name, kind in types.items())]
-    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.datasets.lerobot.inspect import known_units
     from demorec.episode.roles import ROLES
 
     units: Mapping[str, tuple[str, ...]] = {}
     with suppress(ExportError):  # demorec check reports it
-        units = known_units(LeRobotFolder(path))
+        units = known_units(folder)
+    roles = folder.roles
     order: list[Role | None] = [None, *(role for role in ROLES if role is not None)]
     rows = [("role", "feature", "dtype", "shape", "elements", "units")]
     for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):
