@@ -216,6 +216,15 @@ def test_names_keep_their_form(
     assert (found["dtype"], found["shape"], found["names"]) == ("float64", [3], names if fits else None)
 
 
+def test_a_camera_may_have_any_name(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The columns of its ranges end in from_timestamp and to_timestamp."""
+    name = "observation.images.photo_to_top"
+    assert exit_code("dataset", "rename", whole, f"{TOP}={name}", "--out", tmp_path / "named") == 0
+    capsys.readouterr()
+    assert repair(tmp_path / "named", "--dry-run") == 0
+    assert capsys.readouterr().out.startswith("Nothing to repair")
+
+
 def test_possible_splits_stay(whole: Path, tmp_path: Path) -> None:
     root = Path(shutil.copytree(whole, tmp_path / "d"))
     splits = {"train": "0:3", "val": "3:4"}
