@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 from collections import defaultdict
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -61,7 +60,7 @@ class CheckedEpisode(ExitStack):
     def __init__(self, path: Path, *, colours: bool = True) -> None:
         super().__init__()
         self.path = path
-        self._colours = colours
+        self.colours = colours
 
     def __exit__(self, *error: Any) -> bool | None:
         """Free everything: parts that refer to the whole would keep its images until the next garbage collection."""
@@ -95,26 +94,6 @@ class CheckedEpisode(ExitStack):
     def container(self) -> Container:
         """Unprocessed messages and metadata of the file."""
         return self.enter_context(closing(Container(self.path)))
-
-    def undecoded(self) -> tuple[int, list[tuple[str, str]]]:
-        """Number of decoded image streams, and (camera, problem) of each that does not decode completely."""
-        recording = self.recording
-        streams: list[tuple[str, Callable[[str], Iterator[Any]]]] = []
-        if self._colours:
-            shown = recording.table().images
-            streams += [(camera, recording.images) for camera in recording.cameras if camera in shown]
-        streams += [(camera, recording.distances) for camera in recording.depth_cameras]
-        streams += [
-            (camera, recording.segmentation) for camera in recording.cameras if recording.has_segmentation(camera)
-        ]
-        wrong: list[tuple[str, str]] = []
-        for camera, read in streams:
-            try:
-                for _ in read(camera):
-                    pass
-            except RecordingError as error:
-                wrong.append((camera, str(error)))
-        return len(streams), wrong
 
 
 def _scan_topics(container: Container) -> dict[str, TopicScan]:

@@ -5,7 +5,8 @@ External recordings have a separate clock for each stream.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
@@ -13,6 +14,7 @@ import numpy as np
 
 from demorec.check.base import Fault, NotApplicableError, check, listed
 from demorec.check.episode import CheckedEpisode
+from demorec.core.errors import RecordingError
 from demorec.episode.episode import NO_IMAGE
 from demorec.mcap import Recording, channels, messages
 
@@ -214,7 +216,19 @@ def missing_images(subject: CheckedEpisode) -> Iterator[Fault]:
 )
 def images_decode(subject: CheckedEpisode) -> Iterator[Fault]:
     """Decode every image: colour, depth and labels."""
-    cameras, wrong = subject.undecoded()
-    if not cameras:
+    recording = subject.recording
+    streams: list[tuple[str, Callable[[str], Iterator[Any]]]] = []
+    if subject.colours:
+        shown = recording.table().images
+        streams += [(camera, recording.images) for camera in recording.cameras if camera in shown]
+    streams += [(camera, recording.distances) for camera in recording.depth_cameras]
+    streams += [(camera, recording.segmentation) for camera in recording.cameras if recording.has_segmentation(camera)]
+    if not streams:
         raise NotApplicableError("the recording has no images")
-    return listed([f"{camera}: {problem}" for camera, problem in wrong])
+    wrong = []
+    for camera, read in streams:
+        try:
+            deque(read(camera), maxlen=0)
+        except RecordingError as error:
+            wrong.append(f"{camera}: {error}")
+    return listed(wrong)
