@@ -304,9 +304,9 @@ def action_vectors(
     return _joined([shifts, turns, gripper], dtype)
 
 
-def command_vectors(trajectory: Trajectory, rows: NDArray[np.intp] | slice = slice(None)) -> Vectors:
+def command_vectors(trajectory: Trajectory) -> Vectors:
     """Compute (T, D) float64 motor commands: joint targets (rad), gripper opening (m)."""
-    return _joined([trajectory.command_joint_target[rows], trajectory.command_gripper[rows]], np.float64)
+    return _joined([trajectory.command_joint_target, trajectory.command_gripper], np.float64)
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:
