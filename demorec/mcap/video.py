@@ -289,7 +289,7 @@ def is_keyframe(codec: str, data: bytes) -> bool:
     if codec in ("h265", "hevc"):
         return any(16 <= kind <= 21 for kind, _ in nal_units(codec, data))
     if codec == "av1":
-        return any(kind == 1 for kind in _obu_types(data))
+        return any(kind == 1 for kind, _, _ in obu_units(data))
     return True
 
 
@@ -310,11 +310,11 @@ def nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
         position = data.find(b"\x00\x00\x01", position + 3)
 
 
-def _obu_types(data: bytes) -> Iterator[int]:
+def obu_units(data: bytes) -> Iterator[tuple[int, int, int]]:
+    """Yield (type, start, end) of the open bitstream units of a temporal unit; the last one may end after the data."""
     position = 0
     while position < len(data):
-        head = data[position]
-        yield (head >> 3) & 15
+        start, head = position, data[position]
         position += 2 if head & 4 else 1
         size = shift = 0
         while position < len(data):
@@ -325,6 +325,7 @@ def _obu_types(data: bytes) -> Iterator[int]:
             if not byte & 128:
                 break
         position += size
+        yield (head >> 3) & 15, start, position
 
 
 @contextmanager

@@ -265,7 +265,13 @@ _PARAMETER_SETS = {"h264": (7, 8), "hevc": (32, 33, 34), "av1": (1,)}
 def _units(codec: str, access_unit: bytes) -> Iterator[tuple[int, bytes]]:
     """Type of each unit, and the unit in mp4's form: only the framing changes."""
     if codec == "av1":
-        for kind, start, end in _open_bitstream_units(access_unit):
+        from demorec.mcap.video import obu_units  # loads all code for reading recordings
+
+        for kind, start, end in obu_units(access_unit):
+            if not access_unit[start] & 2:
+                raise ExportError("An AV1 packet holds a unit without a size field.")
+            if end > len(access_unit):
+                raise ExportError("An AV1 packet is truncated.")
             if kind != _TEMPORAL_DELIMITER:
                 yield kind, access_unit[start:end]
         return
@@ -275,28 +281,3 @@ def _units(codec: str, access_unit: bytes) -> Iterator[tuple[int, bytes]]:
     for nal in (piece.rstrip(b"\x00") for piece in pieces):
         if nal:
             yield nal[0] & 31 if codec == "h264" else (nal[0] >> 1) & 63, len(nal).to_bytes(4, "big") + nal
-
-
-def _open_bitstream_units(access_unit: bytes) -> list[tuple[int, int, int]]:
-    """(type, start, end) of each unit; each must carry its size, which encoders write."""
-    units = []
-    start = 0
-    while start < len(access_unit):
-        header = access_unit[start]
-        if not header & 2:
-            raise ExportError("An AV1 packet holds a unit without a size field.")
-        position = start + 1 + ((header >> 2) & 1)
-        size = shift = 0
-        while True:
-            byte = access_unit[position]
-            position += 1
-            size |= (byte & 127) << shift
-            shift += 7
-            if not byte & 128:
-                break
-        end = position + size
-        if end > len(access_unit):
-            raise ExportError("An AV1 packet is truncated.")
-        units.append(((header >> 3) & 15, start, end))
-        start = end
-    return units
