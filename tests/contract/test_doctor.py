@@ -195,6 +195,76 @@ def test_a_fast_start_of_the_whole_arm_is_not_a_jump(is_whole: bool, sound: Evid
     assert found(diagnose(spoilt(sound, start)), "state_jumps") == (set() if is_whole else {BAD})
 
 
+def with_second_arm(sound: Evidence, change: Callable[[int, Array], tuple[Array, Array]]) -> Evidence:
+    """Add a second arm with the state and action (T, 3) that `change` computes from number and state."""
+    names = (*NAMES, *(f"left.joint_{number}.pos" for number in range(3)))
+    roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", names)}, NO_NAMES)
+    episodes = []
+    for each in sound.episodes:
+        assert each.state is not None
+        assert each.action is not None
+        state, action = change(each.number, each.state)
+        episodes.append(episode(each.number, np.hstack([each.state, state]), np.hstack([each.action, action])))
+    return replace(sound, roles=roles, episodes=episodes, cameras={})
+
+
+def test_a_resting_arm_that_shakes_by_a_few_encoder_steps_is_not_frozen(sound: Evidence) -> None:
+    """It holds its weight while the operator's idle leader shakes, and sways once."""
+    tick = 0.022
+
+    def shaking(number: int, state: Array) -> tuple[Array, Array]:
+        rng = np.random.default_rng(number)
+        held = np.tile(tick * rng.integers(0, 3, (len(state), 1)), 3)
+        held[30:80] = held[30]
+        leader = np.tile(0.2 * (np.arange(len(state))[:, None] // 25 % 2), 3)
+        if number == BAD:
+            held[50] += 30 * tick
+        return held, leader
+
+    diagnosis = diagnose(with_second_arm(sound, shaking))
+    assert [(each.check, each.severity) for each in diagnosis.findings] == [("state_jumps", "look")]
+
+
+def test_a_state_that_is_a_second_late_is_found_beside_a_resting_arm(sound: Evidence) -> None:
+    delayed = [
+        replace(each, state=np.vstack([np.repeat(each.state[:1], FPS, axis=0), each.state[:-FPS]]))
+        for each in sound.episodes
+        if each.state is not None
+    ]
+
+    def resting(number: int, state: Array) -> tuple[Array, Array]:
+        flicker: Array = np.random.default_rng(number).integers(0, 3, (len(state), 3)).astype(np.float64)
+        return 0.1 * flicker, np.zeros((len(state), 3))
+
+    diagnosis = diagnose(with_second_arm(replace(sound, episodes=delayed), resting))
+    messages = [each.message for each in diagnosis.findings if each.check == "action_lag"]
+    assert messages == ["the state follows its action by 0.70 s or more"]
+
+
+def test_a_hand_of_numbered_joints_may_snap(sound: Evidence) -> None:
+    names = (*NAMES[:3], "right_hand.joint_1.pos", "kRightHandIndex")
+    roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", names)}, NO_NAMES)
+
+    def snap(state: Array, action: Array) -> tuple[Array, Array]:
+        state[60:, 3:] += 200
+        return state, action
+
+    assert found(diagnose(replace(spoilt(sound, snap), roles=roles)), "state_jumps") == set()
+
+
+def test_measured_velocities_as_actions_are_worth_a_look(sound: Evidence) -> None:
+    """A controller's feedback at t is centred on t; the motion that an action causes is centred on t + 1/2."""
+    episodes = []
+    for each in sound.episodes:
+        position = motion(each.number, each.length)[1]
+        smooth = np.apply_along_axis(np.convolve, 0, position, np.hanning(9) / np.hanning(9).sum(), "same")[8:-8]
+        episodes.append(episode(each.number, smooth, np.gradient(smooth, axis=0)))
+    severities = {
+        e.severity for e in diagnose(replace(sound, episodes=episodes, cameras={})).findings if e.check == "action_lag"
+    }
+    assert severities == {"look"}
+
+
 @pytest.mark.parametrize("num_resting", [1, EPISODES])
 def test_the_pose_of_an_object_rests_until_it_is_touched(num_resting: int, sound: Evidence) -> None:
     """In simulation an object rests bit-exactly; a sensor that rests in one episode alone is frozen."""

@@ -30,7 +30,9 @@ REPAIR = "demorec dataset repair {path} --out NEW"
 """Advice for tables, counts and statistics that contradict the rows."""
 _INCREMENT = re.compile("^delta_")
 """Prefix of an action's element that is the change of the state's element, as LeRobot names them."""
-_HAND = re.compile("thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm", re.IGNORECASE)
+_HAND = re.compile(
+    "thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm|hand.*(?:joint|index|middle)", re.IGNORECASE
+)
 """Joint names of a hand with fingers."""
 
 

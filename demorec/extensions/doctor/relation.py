@@ -13,6 +13,7 @@ from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
 from demorec.extensions.doctor.robust import finest, lagged_correlations
+from demorec.extensions.doctor.units import moving_elements
 
 MAX_LAG_S = 0.7
 """Range of tried lags, s, in both directions: a hobby servo under teleoperation needs 0.1 to 0.3 s."""
@@ -22,7 +23,6 @@ MAX_UNEXPLAINED = 0.4
 """Maximum ratio of an element's variance left unexplained by its action, for the lag to be judged by it."""
 MIN_MOTION = 0.2
 """Minimum motion of an element in an episode judged by it, as a ratio of its usual range."""
-_SMALL = 1e-6
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -68,10 +68,11 @@ def relation_of(evidence: Evidence) -> ActionRelation:
     episodes = [each for each, _ in evidence.need_state() if each.action is not None]
     if not evidence.roles.action or not episodes:
         raise NotMeasuredError("no column is known to be the action (name it: --action COLUMN)")
+    moves = evidence.once(moving_elements)
     pairs = [
         (element, column)
         for element, column in enumerate(evidence.action_of)
-        if column is not None and not evidence.is_gripper[element] and evidence.ranges[element] > _SMALL
+        if column is not None and not evidence.is_gripper[element] and moves[element]
     ]
     if not pairs:
         raise NotMeasuredError("no element of the action has the name of a moving element of the state")

@@ -8,13 +8,15 @@ from collections.abc import Mapping
 import numpy as np
 
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.evidence import Evidence
+from demorec.extensions.doctor.evidence import Evidence, Flags
 
 MIN_OTHERS = 3
 """Minimum number of episodes to compare one with."""
 MIN_UNIT_RATIO = 7.0
 """Minimum ratio of magnitudes of an episode in another unit: demonstrations of one task differ by a factor of two or
 three, the nearest confusion of units is 11."""
+MIN_MOTION_TICKS = 10.0
+"""Minimum motion in units of the element's smallest difference: a resting encoder flickers by a tick or two."""
 BOUND_QUANTILES = (0.005, 0.995)
 """Quantiles that bound the whole set: a single wrong reading does not widen them."""
 
@@ -38,6 +40,18 @@ def state_bounds(evidence: Evidence) -> tuple[Array, Array]:
         return np.zeros(len(evidence.elements)), np.zeros(len(evidence.elements))
     lowest, highest = np.quantile(np.concatenate(states), BOUND_QUANTILES, axis=0)
     return lowest, highest
+
+
+def element_ticks(evidence: Evidence) -> Array:
+    """Compute the (D,) smallest difference between two frames of each element: at most its encoder's resolution."""
+    steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in evidence.with_state()])
+    smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
+    return np.where(np.isfinite(smallest), smallest, 0.0)
+
+
+def moving_elements(evidence: Evidence) -> Flags:
+    """Flag the (D,) elements that usually move, and do not merely flicker under a load while another arm works."""
+    return np.asarray(evidence.ranges > MIN_MOTION_TICKS * evidence.once(element_ticks))
 
 
 def _other_sizes(values: Mapping[int, Array]) -> dict[int, float]:

@@ -50,11 +50,20 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
     """Compare the delay of the state after the action: over the whole set, and in each episode with the others.
 
     The lag is where the action explains most of the state's motion, as a target or as an increment. The state may
-    follow by up to 0.35 s, but cannot lead. An episode is judged by its difference from the usual lag.
+    follow by up to 0.35 s, but cannot lead; a velocity measured in its frame is half a frame late. An episode is judged
+    by its difference from the usual lag.
     """
     relation = evidence.once(relation_of)
     usual_lag = relation.usual_lag
-    if usual_lag < -MIN_LEAD:
+    is_outside = usual_lag >= relation.lags[-1]  # of the tried lags: those of single episodes mean nothing then
+    if relation.kind == "increment" and abs(usual_lag + 0.5) < MIN_LEAD:
+        yield Fault(
+            severity="look",
+            value=f"{-usual_lag:.1f} frames",
+            message="the action is the velocity measured in its frame, not a command: it is half a frame late",
+            do="record the command, or take the change of the state until the next frame as the action",
+        )
+    elif usual_lag < -MIN_LEAD:
         yield Fault(
             severity="broken",
             value=f"{-usual_lag:.1f} frames",
@@ -65,10 +74,11 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="look",
             value=f"{evidence.seconds(usual_lag):.2f} s",
-            message=f"the state follows its action by {evidence.seconds(usual_lag):.2f} s",
+            message=f"the state follows its action by {evidence.seconds(usual_lag):.2f} s"
+            + (" or more" if is_outside else ""),
             do="compare the clocks of the two in the program that recorded them",
         )
-    if len(relation.episodes) <= MIN_OTHERS:
+    if is_outside or len(relation.episodes) <= MIN_OTHERS:
         return
     _, spread = usual([episode.lag for episode in relation.episodes.values()], floor=0.1)
     for number, episode in relation.episodes.items():

@@ -9,11 +9,10 @@ import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.checks.numbers import MIN_JUMP_TICKS, element_ticks
 from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.scores import score_episodes
-from demorec.extensions.doctor.units import other_units
+from demorec.extensions.doctor.units import moving_elements, other_units
 
 MIN_OTHERS = 7
 """Minimum number of episodes to compare one with: with fewer, "usual" means little."""
@@ -72,7 +71,7 @@ def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
 
 def _arm_speed(evidence: Evidence, state: Array) -> Array:
     """Compute the (T - 1,) speed of the arm in units of the elements' ranges, without those that only flicker."""
-    arm = ~evidence.is_gripper & (evidence.ranges > MIN_JUMP_TICKS * evidence.once(element_ticks))
+    arm = ~evidence.is_gripper & evidence.once(moving_elements)
     return np.asarray(np.linalg.norm(np.diff(state[:, arm], axis=0) / evidence.ranges[arm], axis=1))
 
 

@@ -15,7 +15,7 @@ from demorec.extensions.doctor.checks.numbers import MIN_OTHERS, element_name
 from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import runs
-from demorec.extensions.doctor.units import state_bounds
+from demorec.extensions.doctor.units import moving_elements, state_bounds
 
 MIN_FROZEN_S = 0.4
 MIN_FROZEN_FRAMES = 5
@@ -148,12 +148,12 @@ def _targets(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array
         relation = evidence.once(relation_of)
     except NotMeasuredError:
         return []
-    lag = max(round(relation.usual_lag), 0)
+    lag, moves = max(round(relation.usual_lag), 0), evidence.once(moving_elements)
     lowest, highest = evidence.once(state_bounds)
     margin = MAX_END_STOP_RANGE * (highest - lowest)
     found = []
     for element, column in enumerate(evidence.action_of):
-        if column is None or evidence.is_gripper[element] or not evidence.ranges[element]:
+        if column is None or evidence.is_gripper[element] or not moves[element]:
             continue
         wanted = {each.number: each.action[:, column] for each, _ in episodes if each.action is not None}
         end_stops = (float(lowest[element] + margin[element]), float(highest[element] - margin[element]))

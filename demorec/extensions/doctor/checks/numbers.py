@@ -13,7 +13,14 @@ from demorec.core.geometry import Array
 from demorec.episode.element_names import joint_of
 from demorec.extensions.doctor.evidence import DROP, Evidence, number_in_words
 from demorec.extensions.doctor.relation import relation_of
-from demorec.extensions.doctor.units import MIN_UNIT_RATIO, other_units, state_bounds
+from demorec.extensions.doctor.units import (
+    MIN_MOTION_TICKS,
+    MIN_UNIT_RATIO,
+    element_ticks,
+    moving_elements,
+    other_units,
+    state_bounds,
+)
 
 MIN_OTHERS = 3
 """Minimum number of episodes to compare one with."""
@@ -27,8 +34,6 @@ UNIT_FACTORS: Mapping[str, float] = {
 """Confusion of units -> factor of the values."""
 MIN_JUMP_RANGE = 0.15
 """Minimum size of a jump, as a ratio of an element's range."""
-MIN_JUMP_TICKS = 10.0
-"""Minimum size of a jump in units of the element's smallest difference: a resting encoder flickers by a tick or two."""
 MIN_JUMP_STEPS = 6.0
 """Minimum factor of a jump over the largest usual step and over its neighbours: motors accelerate over frames."""
 MIN_COMPANY = 0.33
@@ -172,12 +177,12 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     other elements also move fast are excluded: a whole arm that starts or stops in a few frames.
     """
     episodes = evidence.need_state(8)
-    arm = ~evidence.is_gripper
+    arm, moves = ~evidence.is_gripper, evidence.once(moving_elements)
     largest = [np.abs(np.diff(state, axis=0)).max(axis=0) for _, state in episodes]
     typical = [np.quantile(np.abs(np.diff(state, axis=0)), 0.98, axis=0) for _, state in episodes]
     lowest, highest = evidence.once(state_bounds)
     limit = np.maximum(MIN_JUMP_STEPS * np.median(typical, axis=0), MIN_JUMP_RANGE * (highest - lowest))
-    limit = np.maximum(limit, MIN_JUMP_TICKS * evidence.once(element_ticks))
+    limit = np.maximum(limit, MIN_MOTION_TICKS * evidence.once(element_ticks))
     if len(episodes) > MIN_OTHERS:
         limit = np.maximum(limit, 2 * np.median(largest, axis=0))
     for episode, state in episodes:
@@ -198,7 +203,7 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
         share = sizes[frame, element] / max(evidence.ranges[element], 1e-12)
         count = f" and {len(frames) - 1} more" if len(frames) > 1 else ""
         yield Fault(
-            severity="broken" if len(frames) > 1 or share > 0.5 else "look",
+            severity="broken" if moves[element] and (len(frames) > 1 or share > 0.5) else "look",
             episode=episode.number,
             frames=(int(frames[0]) + 1, int(frames[-1]) + 1),
             value=f"{share:.0%} of its range",
@@ -217,13 +222,6 @@ def _accompanied(speeds: Array, jumps: NDArray[np.bool_]) -> NDArray[np.bool_]:
     fastest = np.where(jumps.any(axis=0), 0.0, speeds).max(axis=1)
     beside = np.maximum(np.append(fastest[1:], 0.0), np.insert(fastest[:-1], 0, 0.0))
     return np.asarray(beside[:, None] > MIN_COMPANY * speeds)
-
-
-def element_ticks(evidence: Evidence) -> Array:
-    """Compute the (D,) smallest difference between two frames of each element: at most its encoder's resolution."""
-    steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in evidence.with_state()])
-    smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
-    return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
 def element_name(evidence: Evidence, element: int) -> str:
