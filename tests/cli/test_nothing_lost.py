@@ -95,19 +95,17 @@ TARGETS = {
 
 
 @pytest.mark.parametrize("command", ["export lerobot runs/run --no-verify", "dataset select dataset --episodes 0"])
-@pytest.mark.parametrize("target", TARGETS)
-def test_a_dataset_replaces_only_datasets(
-    place: Path, capsys: pytest.CaptureFixture[str], command: str, target: str
-) -> None:
+def test_a_dataset_replaces_only_datasets(place: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     before = files_of(place.parent)
     name, kind, source, *options = command.split()
-    arguments = (name, kind, place / source, *options, "--out", place / target)
-    assert exit_code(*arguments, "--overwrite") == 2
-    said = capsys.readouterr().err
-    assert TARGETS[target] in said or name == "dataset"  # which reads no run
-    assert len(said.splitlines()) == 1
-    assert exit_code(*arguments) == 2  # without the flag the message does not suggest it
-    assert "--overwrite" not in capsys.readouterr().err
+    for target, reason in TARGETS.items():
+        arguments = (name, kind, place / source, *options, "--out", place / target)
+        assert exit_code(*arguments, "--overwrite") == 2, target
+        said = capsys.readouterr().err
+        assert reason in said or name == "dataset"  # which reads no run
+        assert len(said.splitlines()) == 1
+        assert exit_code(*arguments) == 2, target  # without the flag the message does not suggest it
+        assert "--overwrite" not in capsys.readouterr().err
     assert files_of(place.parent) == before
 
 
@@ -437,18 +435,17 @@ def full(place: Path) -> Path:
     return place
 
 
-@pytest.mark.parametrize(("command", "target"), [(row, target) for row in KEPT for target in KEPT[row]])
-def test_a_command_replaces_its_own_files_only(
-    full: Path, capsys: pytest.CaptureFixture[str], command: str, target: str
-) -> None:
+@pytest.mark.parametrize("command", KEPT)
+def test_a_command_replaces_its_own_files_only(full: Path, capsys: pytest.CaptureFixture[str], command: str) -> None:
     before = files_of(full.parent)
     *words, source, flag = command.split()
-    for flags in ((), ("--overwrite",)):
-        assert exit_code(*words, full / source, flag, full / target, *flags) == 2
-        said = capsys.readouterr().err
-        assert len(said.splitlines()) == 1
-        assert "--overwrite" not in said
-    assert KEPT[command][target] in said
+    for target, reason in KEPT[command].items():
+        for flags in ((), ("--overwrite",)):
+            assert exit_code(*words, full / source, flag, full / target, *flags) == 2, target
+            said = capsys.readouterr().err
+            assert len(said.splitlines()) == 1
+            assert "--overwrite" not in said
+        assert reason in said
     assert files_of(full.parent) == before
 
 
@@ -538,9 +535,9 @@ INSIDE: dict[str, Sequence[str]] = {
 }
 
 
-@pytest.mark.parametrize(("command", "target"), [(row, target) for row in INSIDE for target in INSIDE[row]])
+@pytest.mark.parametrize("command", INSIDE)
 def test_nothing_is_written_into_another_run_or_dataset(
-    place: Path, command: str, target: str, capsys: pytest.CaptureFixture[str]
+    place: Path, command: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """The new file would be foreign there, and would keep --overwrite from replacing the folder."""
     for whole, mark in (("runs/other", "run.json"), ("evaluation", "evaluation.json")):
@@ -549,9 +546,10 @@ def test_nothing_is_written_into_another_run_or_dataset(
         (place / whole / mark).write_text("{}")
     before = files_of(place)
     *words, source, flag = command.split()
-    (place / target).parent.mkdir(parents=True, exist_ok=True)
-    assert exit_code(*words, place / source, flag, place / target) == 2
-    assert "would prevent it from being replaced" in capsys.readouterr().err
+    for target in INSIDE[command]:
+        (place / target).parent.mkdir(parents=True, exist_ok=True)
+        assert exit_code(*words, place / source, flag, place / target) == 2, target
+        assert "would prevent it from being replaced" in capsys.readouterr().err
     assert files_of(place) == before
 
 

@@ -170,7 +170,7 @@ def test_simulated_headers_next_to_missing_ones_are_refused(imports: Imports) ->
     assert error.count("\n") == 1
 
 
-@pytest.mark.parametrize("rate", [5, 12, 30, 59.94, 90])
+@pytest.mark.parametrize("rate", [12, 59.94])
 def test_the_suggested_rate(rate: float, imports: Imports, tmp_path: Path) -> None:
     """A camera pauses for two seconds, as between two attempts."""
     moments = [bags.EPOCH_NS + 1000 * round(k * 1e6 / rate + (2e6 if k > rate else 0)) for k in range(round(3 * rate))]
@@ -217,7 +217,7 @@ def test_simulated_time_that_jumps_is_found(imports: Imports) -> None:
     assert np.all([FRONT not in line for line in told.splitlines() if line.startswith("  clock_")])
 
 
-@pytest.mark.parametrize(("rate", "factor"), [(25, 0.4), (25, 2.0), (50, 0.25), (200, 0.25)])
+@pytest.mark.parametrize(("rate", "factor"), [(25, 2.0), (200, 0.25)])
 def test_simulated_time_without_a_camera(rate: int, factor: float, imports: Imports, tmp_path: Path) -> None:
     """Rows follow the headers' rate, independent of the recorder's clock: no message is lost."""
     notes = bags.joints(STATE, ("a", "b"), bags.times(rate, 6.0, jitter=0, seed=1))

@@ -43,8 +43,7 @@ def info(run: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
     return plain
 
 
-@pytest.mark.parametrize("kind", ["lerobot", "hdf5", "bags"])
-@pytest.mark.parametrize("num_done", [0, 1, 2])
+@pytest.mark.parametrize(("kind", "num_done"), [("lerobot", 1), ("hdf5", 2), ("bags", 0), ("bags", 1)])
 def test_an_interrupted_import_lists_missing_episodes(
     kind: str,
     num_done: int,

@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 from support.check import Message, Spoilt, checked, flip_bits, rewrite_messages, simulate, verdict_of
 from support.commands import exit_code
-from support.tasks import QUICK_TASKS
 
 from demorec.core.config import VideoConfig
-from demorec.core.tables import FILE_CHECKS, ROBOTS
+from demorec.core.tables import FILE_CHECKS
 from demorec.mcap import channels, recover
 
 Fault = Callable[[Spoilt], None]
@@ -50,27 +49,12 @@ def test_the_good_ones_pass(good: Path, filmed: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("task", QUICK_TASKS)
-def test_every_task_passes(task: str, tmp_path: Path) -> None:
-    assert findings(simulate(tmp_path / "e.mcap", task=task, seed=22)) == []
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("robot", ROBOTS.names())
-@pytest.mark.parametrize("variation", ["none", "full"])
-def test_every_robot_and_variation_passes(robot: str, variation: str, tmp_path: Path) -> None:
-    assert findings(simulate(tmp_path / "e.mcap", robot=robot, variation=variation, seed=23)) == []
-
-
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "config",
     [
-        {"variation": "full", "depth": True, "segmentation": True},
-        {"task": "tutorial", "video": VideoConfig(codec="av1", crf=35)},
-        {"task": "unstack", "video": VideoConfig(codec="jpeg", jpeg_quality=60), "width": 64, "height": 48},
-        {"task": "line_up", "robot": "so101", "variation": "full", "fps": 60},
-        {"task": "line_up", "robot": "iiwa", "variation": "full", "fps": 10},
+        {"task": "tutorial", "depth": True, "segmentation": True, "video": VideoConfig(codec="av1", crf=35)},
+        {"robot": "so101", "variation": "full", "fps": 60, "video": VideoConfig(codec="jpeg", jpeg_quality=60)},
+        {"task": "line_up", "robot": "iiwa", "variation": "full", "fps": 10, "width": 64, "height": 48},
     ],
     ids=str,
 )
@@ -248,13 +232,6 @@ def test_a_frozen_camera(filmed: Path, tmp_path: Path) -> None:
     front = [images["front"].color for images in spoilt.images]
     spoilt.image("front", lambda t, p: front[40] if 40 < t < 90 else p)
     assert findings(spoilt.write(tmp_path / "spoilt.mcap")) == [("frozen_images", "broken")]
-
-
-@pytest.mark.slow
-def test_a_black_camera(filmed: Path, tmp_path: Path) -> None:
-    spoilt = Spoilt(filmed)
-    spoilt.image("front", lambda t, p: p * 0)
-    assert verdict_of(spoilt.write(tmp_path / "spoilt.mcap"), "blank_images") == "broken"
 
 
 def test_a_lost_packet(filmed: Path, tmp_path: Path) -> None:

@@ -58,11 +58,14 @@ ROWS = {
     "lerobot v3.0": (2, 16),
 }
 """Kind -> episodes and frames, as written."""
+LIKE_OTHERS = ("imported run", "mcap with --mapping", "rosbag2", "aloha", "lerobot v2.0")
+"""Kinds that `info`, `check` and `import` read; what they give to other commands is as of a kind that is tried."""
 CASES = [
     (command, kind)
     for command in COMMANDS
     for kind in ROWS
-    if command != "import" or kind not in ("simulation", "run of simulations", "imported run")  # which need none
+    if (command != "import" or kind not in ("simulation", "run of simulations", "imported run"))  # which need none
+    and (command in ("info", "check", "import") or kind not in LIKE_OTHERS)
 ]
 FORMATS = {"robomimic": "hdf5", "aloha": "hdf5"} | dict.fromkeys(
     ("dataset of simulations", "imported dataset", "lerobot v2.0", "lerobot v2.1", "lerobot v3.0"), "lerobot"

@@ -40,18 +40,6 @@ def test_other_rates_replay_to_the_bit(fps: int, tmp_path: Path) -> None:
     assert _replay(simulate(tmp_path / "e.mcap", fps=fps, seed=5)).is_identical
 
 
-@pytest.mark.slow
-def test_the_first_different_step_is_found(recorded: Path, tmp_path: Path) -> None:
-    spoilt = Spoilt(recorded)
-    targets = spoilt.columns.command_joint_target.copy()
-    targets[70, 2] += 1e-12
-    spoilt.set(command_joint_target=targets)
-    report = _replay(spoilt.write(tmp_path / "s.mcap"))
-    assert report.first_difference == (71, "joint positions")  # state 71 is the first to show command 70
-    assert 0 < report.joint_error < 1e-6
-    assert report.success
-
-
 def test_a_state_that_was_changed_is_found(recorded: Path, tmp_path: Path) -> None:
     spoilt = Spoilt(recorded)
     poses = spoilt.columns.object_poses["red_cube"].copy()
@@ -88,12 +76,10 @@ def test_a_sensed_value_that_was_changed_is_found(recorded: Path, tmp_path: Path
     changed = table.copy()
     changed[40:50] += 1e-6
     spoilt.set(**{name: {**spoilt.columns.sensed, "wrench": changed} if name == "sensed" else changed})
-    path = spoilt.write(tmp_path / "s.mcap")
-    report = _replay(path)
+    report = _replay(spoilt.write(tmp_path / "s.mcap"))
     assert report.first_difference is not None
     assert report.first_difference[1] == what
     assert 40 <= report.first_difference[0] < 50
-    assert exit_code("replay", path) == 1
 
 
 @pytest.mark.slow
@@ -190,7 +176,7 @@ def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixtu
     spoilt.set(command_joint_target=targets)
     path = spoilt.write(tmp_path / "s.mcap")
     assert exit_code("replay", path) == 1
-    assert "differs from step 71" in capsys.readouterr().out
+    assert "differs from step 71" in capsys.readouterr().out  # state 71 is the first to show command 70
     assert exit_code("replay", path, "--tolerance", "0.001") == 0
 
 

@@ -88,8 +88,7 @@ def test_a_small_recording_never_becomes_large(
     assert told.code == 1 or command == "recover" or bomb is many_large_chunks
 
 
-@pytest.mark.parametrize("opening", ["[", '{"a":'])
-@pytest.mark.parametrize("depth", [200, 5000, 100_000])
+@pytest.mark.parametrize(("opening", "depth"), [("[", 200), ("[", 100_000), ('{"a":', 5000)])
 def test_metadata_nested_without_end(opening: str, depth: int, good: Path, tmp_path: Path) -> None:
     closing = {"[": "]", '{"a":': "1}"}[opening] if depth < 1000 else ""
     text = '{"config": ' + opening * depth + closing * (depth if closing == "]" else 0) + "}"

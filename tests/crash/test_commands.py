@@ -28,7 +28,7 @@ from demorec.core.extensions import reader_rows
 from demorec.core.limited import VARIABLE
 from demorec.core.tables import EXPORTERS
 
-KILLS = 8
+KILLS = 6
 PROGRAM = """
 from demorec.core.streams import open_closed_streams
 
@@ -165,12 +165,12 @@ def killed(case: Case) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", KILLED)
-def test_killed_at_eight_moments(name: str, sources: Path, tmp_path: Path) -> None:
+def test_killed_at_six_moments(name: str, sources: Path, tmp_path: Path) -> None:
     killed(Case(name, sources, tmp_path, replaces=False))
 
 
 @pytest.mark.parametrize("name", REPLACING)
-def test_killed_at_eight_moments_of_replacing(name: str, sources: Path, tmp_path: Path) -> None:
+def test_killed_at_six_moments_of_replacing(name: str, sources: Path, tmp_path: Path) -> None:
     killed(Case(name, sources, tmp_path, replaces=True))
 
 
@@ -191,7 +191,7 @@ def check_full(case: Case, ended: Ended) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [pytest.param(name, marks=SLOW if name == "split" else LONG) for name in ROWS])
 def test_a_full_disk(name: str, sources: Path, tmp_path: Path) -> None:
     """A limit on the size of a file fails the write that crosses it, as a full disk does."""
     for replaces in {False, bool(ROWS[name].old)}:

@@ -140,16 +140,16 @@ class Fuzz:
 @pytest.mark.slow
 def test_damaged_files(tmp_path: Path) -> None:
     fuzz = Fuzz(tmp_path)
-    for seed in range(360):
+    for seed in range(180):
         fuzz.try_one(DAMAGES[seed % len(DAMAGES)], seed)
-    assert fuzz.results["damaged"] >= 250
-    assert fuzz.results["refused in one sentence"] > 100
+    assert fuzz.results["damaged"] >= 125
+    assert fuzz.results["refused in one sentence"] > 50
 
 
 @pytest.mark.slow
 def test_recovering_damaged_files(tmp_path: Path) -> None:
     fuzz = Fuzz(tmp_path)
-    for seed in range(120):
+    for seed in range(72):
         fuzz.try_recover(DAMAGES[seed % len(DAMAGES)], seed)
     assert fuzz.results["recovered"] > 10
     assert fuzz.results["nothing to recover"] > 10

@@ -6,24 +6,19 @@ import io
 import json
 import tempfile
 import tomllib
-from collections.abc import Mapping
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import av
-import h5py
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 from support import bag_mappings, bags
 from support.commands import exit_code
 from support.drawn_datasets import ACTION, DRAWN, HEIGHT, REFERENCE, STATE, TOP, WIDTH, DrawnDataset, write_drawn
 from support.export import recordings
-from support.hdf5 import write_groups_at_root, write_isaac
 from support.stored_episodes import seconds, stored_episodes
 
 from demorec.mcap import Recording
@@ -157,75 +152,6 @@ def test_a_bag_with_simulated_time_loses_no_message_in_silence(
             if len(inside) - len(used) > 0.05 * len(inside):
                 assert f"{topic}: {100 * (1 - len(used) / len(inside)):.3g} % of its messages are in no row" in told
                 assert f'# "{topic}" comes' in suggestion
-
-
-def imported_hdf5(path: Path, rate: int) -> list[tuple[dict[str, tuple[str, ...]], Mapping[str, NDArray[Any]]]]:
-    """Import a file by its suggested mapping with a rate; names and numbers of the features of each episode."""
-    suggestion = command("import", "hdf5", path, "--suggest")[1]
-    assert "# fps = 20 " in suggestion
-    mapping = bag_mappings.write_mapping(suggestion.replace("# fps = 20 ", f"fps = {rate} "), path.with_suffix(".toml"))
-    code, _, error = command("import", "hdf5", path, "--mapping", mapping, "--out", path.with_name("run"))
-    assert code == 0, error
-    found = []
-    for file in recordings(path.with_name("run")):
-        with Recording(file) as recording:
-            assert recording.info.fps == rate
-            names = {feature.name: feature.names for feature in recording.info.features}
-            found.append((names, recording.table().features))
-    return found
-
-
-WORDS = st.sampled_from(["robot", "franka", "left_arm", "Robot 2", "so101", "g1.hand"])
-
-
-@pytest.mark.slow
-@settings(max_examples=12, **FEW)  # type: ignore[arg-type]
-@given(
-    robot=WORDS, joints=st.integers(1, 12), count=st.integers(2, 9), num_demos=st.integers(1, 3),
-    first=st.sampled_from([0, 8, 99]), rate=st.sampled_from([1, 20, 50, 200]),
-)  # fmt: skip
-def test_isaac_lab_gives_absolute_joints_and_quaternions_with_w_first(
-    robot: str, joints: int, count: int, num_demos: int, first: int, rate: int
-) -> None:
-    demos = tuple(f"demo_{number}" for number in range(first, first + num_demos))
-    with tempfile.TemporaryDirectory() as folder:
-        path = write_isaac(Path(folder) / "demo.hdf5", robot=robot, count=count, joints=joints, demos=demos)
-        episodes = imported_hdf5(path, rate)
-        assert len(episodes) == num_demos
-        with h5py.File(path) as file:
-            for demo, (names, features) in zip(demos, episodes, strict=True):
-                source = file[f"data/{demo}"]
-                absolute = source[f"states/articulation/{robot}/joint_position"][:]
-                assert not np.array_equal(absolute, source["obs/joint_pos"][:])
-                np.testing.assert_array_equal(features["observation.state"], absolute)
-                np.testing.assert_array_equal(features["observation.joint_pos"], source["obs/joint_pos"][:])
-                np.testing.assert_array_equal(features["action"], source["actions"][:])
-                pose = np.hstack([source[f"obs/{name}"][:] for name in ("eef_pos", "eef_quat")])
-                np.testing.assert_array_equal(features["observation.ee_pose"], pose)
-                assert names["observation.ee_pose"][3:] == ("qw", "qx", "qy", "qz")
-
-
-@pytest.mark.slow
-@settings(max_examples=12, **FEW)  # type: ignore[arg-type]
-@given(
-    demos=st.lists(st.sampled_from(["demo_1", "demo_2", "demo_10", "0", "7", "ep-3", "Trial 4", "x"]), min_size=1,
-                   max_size=4, unique=True),
-    action=st.sampled_from(["action", "actions"]), state=st.sampled_from(["observation", "obs", "state", "qpos"]),
-    others=st.lists(st.sampled_from(["force", "tip/pose", "contact 2"]), max_size=2, unique=True),
-    count=st.integers(2, 9),
-)  # fmt: skip
-def test_groups_at_the_root_are_episodes(
-    demos: list[str], action: str, state: str, others: list[str], count: int
-) -> None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "demo.hdf5"
-        write_groups_at_root(path, action=action, state=state, others=tuple(others), count=count, demos=tuple(demos))
-        episodes = imported_hdf5(path, 20)
-        with h5py.File(path) as file:
-            expected = [{name: file[demo][name][:].tobytes() for name in (action, state, *others)} for demo in demos]
-        held = [{values.astype(np.float32).tobytes() for values in features.values()} for _, features in episodes]
-        assert len(held) == len(expected)
-        assert all(set(one.values()) in held for one in expected)
 
 
 @pytest.mark.slow

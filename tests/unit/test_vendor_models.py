@@ -53,20 +53,20 @@ def urdf_text(mesh: str) -> str:
     </robot>"""
 
 
-@pytest.fixture(params=["part.stl", "part.dae", "part.obj"])
+@pytest.fixture
 def package(request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A ROS package, `vendor_description`, with urdf/ and meshes/ in it."""
     for name in ("ROS_PACKAGE_PATH", "AMENT_PREFIX_PATH"):
         monkeypatch.delenv(name, raising=False)
     folder = tmp_path / "src" / "vendor_description"
-    mesh = folder / "meshes" / "visual" / request.param
+    mesh = folder / "meshes" / "visual" / getattr(request, "param", "part.dae")
     for parent in (folder / "urdf", mesh.parent):
         parent.mkdir(parents=True)
     if mesh.suffix == ".dae":
         mesh.write_text(COLLADA)
     else:
         trimesh.Trimesh(CORNERS, FACES).export(mesh)
-    text = urdf_text(f"package://vendor_description/meshes/visual/{request.param}")
+    text = urdf_text(f"package://vendor_description/meshes/visual/{mesh.name}")
     (folder / "urdf" / "vendor.urdf").write_text(text)
     return folder
 
@@ -124,6 +124,7 @@ def test_a_text_of_unknown_origin_leads_to_no_other_file(
             mesh_path(None, name)
 
 
+@pytest.mark.parametrize("package", ["part.stl", "part.dae", "part.obj"], indirect=True)
 def test_it_is_drawn_in_its_materials(package: Path) -> None:
     text = (package / "urdf" / "vendor.urdf").read_text()
     links = urdf_meshes(text, package / "urdf")
