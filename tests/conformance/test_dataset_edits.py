@@ -122,6 +122,7 @@ def test_kept_data_is_bit_exact(dataset: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("dataset", ["reordered", "small files", "all types"], indirect=True)
 def test_in_another_order_and_in_parts(dataset: Path, tmp_path: Path) -> None:
     before = items(dataset)
     assert edit("reorder", dataset, "--order", "5,0,3,1,4,2", "--out", tmp_path / "r") == 0

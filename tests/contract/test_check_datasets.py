@@ -133,6 +133,7 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "a wrong quantile": (of_stats("action", "q10", lambda v: [0.5 * number for number in v]), "wrong_statistics"),
     "a wrong count": (of_stats("action", "count", lambda v: [v[0] - 1]), "wrong_statistics"),
     "numbers that are text": (of_stats("action", "mean", lambda v: [str(n) for n in v]), "wrong_statistics"),
+    "numbers that are null": (of_stats("action", "mean", lambda v: None), "wrong_statistics"),
     "colours that are text": (of_stats(CAMERA, "mean", lambda v: "grey"), "wrong_statistics"),
     "colours that are not numbers": (of_stats(CAMERA, "std", lambda v: [[[float("nan")]]] * 3), "wrong_statistics"),
     "an episode's mean": (value_of("stats/action/mean", 1, 0.7, "meta/episodes"), "wrong_statistics"),

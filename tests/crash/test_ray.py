@@ -14,13 +14,13 @@ from typing import Any
 
 import psutil
 import pytest
-from support.generate import Remembers, expected_attempts, inspect, num_finished, run_fake
+from support.generate import inspect, num_finished, run_fake
 from support.kills import generation, made_of, run_killed
 
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, GenerationError
 from demorec.generate import on_ray
-from demorec.generate.options import RunObserver, RunOptions, RunResult
+from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
 from demorec.runs.run_file import load_run_file
 
@@ -30,11 +30,10 @@ REAL = GenerateConfig(seed=5, cameras=("wrist",), width=32, height=32)
 NUM_REAL = 12
 
 
-def run_on_ray(out: Path, *, maker: str, progress: RunObserver | None = None, **options: Any) -> RunResult:
+def run_on_ray(out: Path, *, maker: str, **options: Any) -> RunResult:
     return generate(
         GenerateConfig(cameras=()),
         RunOptions(out=out, num_episodes=NUM_EPISODES, executor="ray", **options),
-        progress=progress,
         maker=f"support.makers:{maker}",
         inspect=inspect,
     )
@@ -153,26 +152,6 @@ def test_two_nodes_make_the_same_run(tmp_path: Path, cluster: object, reference:
     seen = [p.name for p in (tmp_path / "run/unfinished").glob("pid-*")]
     assert len(seen) >= 2, "both nodes must have worked"
     assert {name.split("-")[2] for name in seen} == {"1"}
-
-
-@pytest.mark.long
-def test_a_node_that_is_killed_changes_nothing(tmp_path: Path, cluster: object, reference: str) -> None:
-    heard, killer = Remembers(), Killer(tmp_path / "run")
-    killer.node_at(10, cluster, add_node(cluster))
-    result = run_on_ray(tmp_path / "run", maker="make_quickly", progress=heard)
-    killer.join()
-    assert killer.nodes == 1
-    assert result.run.digest == reference
-    assert {(a.episode_index, a.attempt): a.success for a in result.run.attempts} == expected_attempts(NUM_EPISODES)
-
-
-def test_killed_workers_are_replaced(tmp_path: Path, cluster: object, reference: str) -> None:
-    killer = Killer(tmp_path / "run")
-    killer.worker_at(5, 15, 25, 35)
-    result = run_on_ray(tmp_path / "run", maker="make_quickly")
-    killer.join()
-    assert len(killer.workers) >= 3
-    assert result.run.digest == reference
 
 
 def test_a_complete_run_is_the_same_for_every_executor(tmp_path: Path, cluster: object) -> None:

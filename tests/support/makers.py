@@ -54,12 +54,6 @@ def make_slowly(plan: EpisodePlan, folder: Path) -> Attempt:
     return make(plan, folder)
 
 
-def make_quickly(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Take long enough to be killed during the work."""
-    time.sleep(0.03)
-    return make(plan, folder)
-
-
 def make_for_ever(plan: EpisodePlan, folder: Path) -> Attempt:
     """Never end; a file named after the process marks the beginning."""
     (folder / "unfinished" / f"busy-{os.getpid()}").touch()
