@@ -6,6 +6,7 @@ import math
 from typing import get_args
 
 import numpy as np
+from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose
 from demorec.episode import features
@@ -20,21 +21,19 @@ NULL_GAIN = 0.05
 """Gain that pulls the elbow towards the expert's posture while a policy commands poses."""
 
 
-def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[Array, Array]:
+def action_bounds(robot: RobotSpec, kind: ActionKind, *, fps: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Lower and upper bound (D,) of each component of an action; units as in `features.action_vectors`."""
     if kind == "joint":
-        low, high = np.array(robot.position_lower), np.array(robot.position_upper)
+        high = np.array(robot.position_upper)
     elif kind == "joint_increment":
         high = np.array(robot.velocity_limit) / fps
-        low = -high
     elif kind == "ee":
         high = np.array([2.0] * 3 + [1.0] * 4)
-        low = -high
     else:
         # The arm cannot follow 2 m/s or pi rad/s.
         high = np.array([2.0] * 3 + [math.pi] * 3) / fps
-        low = -high
-    return np.append(low, 0.0), np.append(high, robot.gripper.max_width)
+    low = np.array(robot.position_lower) if kind == "joint" else -high
+    return np.append(low, 0.0).astype(np.float32), np.append(high, robot.gripper.max_width).astype(np.float32)
 
 
 class ActionDecoder:

@@ -157,10 +157,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         config.validate()
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)
-        if render_mode is not None:
-            check_choice("render_mode", render_mode, ("rgb_array",))
-        self.config, self.render_mode = config, render_mode
-        self.task = config.task
+        self.render_mode = None if render_mode is None else check_choice("render_mode", render_mode, ("rgb_array",))
+        self.config, self.task = config, config.task
         self.metadata = {**type(self).metadata, "render_fps": config.fps}
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
@@ -171,8 +169,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self.privileged = self._is_privileged() if privileged is None else privileged
         self._vector_lengths = self._lengths(info)
         self.observation_space = _observation_space(info, self._vector_lengths)
-        low, high = (bound.astype(np.float32) for bound in action_bounds(info.simulated.robot, action, fps=config.fps))
-        self.action_space = spaces.Box(low, high)
+        self.action_space = spaces.Box(*action_bounds(info.simulated.robot, action, fps=config.fps))
         self._simulators, self._viewers = SimulatorCache(), WarmRenderer()
 
     @property
