@@ -14,6 +14,7 @@ from demorec.episode.roles import NO_NAMES, Column, find_roles
 from demorec.extensions.doctor.checks import all_checks
 from demorec.extensions.doctor.diagnosis import Diagnosis, diagnose
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence
+from demorec.extensions.doctor.robust import held_period
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 
 NAMES = ("pan.pos", "lift.pos", "elbow.pos", "wrist.pos", "gripper.pos")
@@ -111,6 +112,7 @@ NUMBERS: dict[str, tuple[Change, str]] = {
     "a frozen elbow": (frozen_elbow, "frozen_state"),
     "a jump": (jumping, "state_jumps"),
     "half a minute's rest": (resting, "idle_ends"),
+    "samples held for four frames": (lambda s, a: (s[np.arange(len(s)) // 4 * 4], a), "held_samples"),
     "the end cut off": (lambda s, a: (s[: len(s) // 2], a[: len(a) // 2]), "cut_off_episodes"),
 }
 
@@ -313,6 +315,14 @@ def test_a_fault_of_images_is_found_in_its_episode(name: str, sound: Evidence) -
     diagnosis = diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)}))
     assert found(diagnosis, check) == {BAD}
     assert {each.episode for each in diagnosis.findings} == {BAD}
+
+
+def test_keyframes_do_not_hide_a_camera_at_a_third_of_the_rate() -> None:
+    """Every second image is a keyframe, which differs from an image that was new before it."""
+    frames, moving = np.arange(60), np.ones(60, dtype=np.bool_)
+    is_new = (frames % 3 == 0) | ((frames % 2 == 0) & (frames % 3 == 1))
+    assert held_period(~is_new, moving) == 3
+    assert held_period(np.random.default_rng(0).random(60) < 0.6, moving) == 1
 
 
 def test_images_of_another_take_follow_the_state_of_another_episode(sound: Evidence) -> None:

@@ -357,8 +357,8 @@ class EpisodeVideo:
     ) -> Iterator[av.VideoFrame]:
         """Implement `decoded` for an opened video. Raises ValueError if an image is missing or has another size."""
         assert stream.time_base is not None
-        rate, number = self._fps * stream.time_base, begin
-        container.seek(round((self.first + begin) / rate), stream=stream)
+        rate, number = float(self._fps * stream.time_base), begin
+        container.seek(round((self.first + begin) / (self._fps * stream.time_base)), stream=stream)
         size = (stream.codec_context.width, stream.codec_context.height)
         for image in container.decode(stream):
             frame = begin - 1 if image.pts is None else round(image.pts * rate) - self.first

@@ -12,6 +12,12 @@ from demorec.core.geometry import Array
 
 NORMAL = 1.4826
 """Standard deviation of a normal distribution in units of its median absolute deviation."""
+MAX_PERIOD = 6
+"""Longest period of samples that are searched for repeats, frames."""
+MIN_IN_PHASE = 4
+"""Minimum number of frames in each phase of such a period."""
+MIN_REGULAR = 0.95
+"""Minimum ratio of frames in a phase that repeat, or do not: the clocks of sensor and recorder slip at times."""
 _RESTING = 1e-9
 """Maximum variance of a column at rest, relative to its variance in the whole episode."""
 
@@ -45,6 +51,23 @@ def runs(flags: NDArray[np.bool_]) -> list[tuple[int, int]]:
     padded = np.concatenate([[False], flags, [False]])
     edges = np.flatnonzero(padded[1:] != padded[:-1]).reshape(-1, 2)
     return [(first, end) for first, end in edges.tolist()]
+
+
+def held_period(repeats: NDArray[np.bool_], moving: NDArray[np.bool_]) -> int:
+    """Find the period, frames, of samples that are held: new in one phase of it, repeated in another; 1 if none.
+
+    Args:
+        repeats: (N,) whether each sample equals the previous one.
+        moving: (N,) frames in which a new sample would differ.
+    """
+    for period in range(2, MAX_PERIOD + 1):
+        phases = [repeats[phase::period][moving[phase::period]] for phase in range(period)]
+        if min(map(len, phases)) < MIN_IN_PHASE:
+            return 1
+        shares = [float(phase.mean()) for phase in phases]
+        if min(shares) <= 1 - MIN_REGULAR and max(shares) >= MIN_REGULAR:
+            return period
+    return 1
 
 
 def finest(lags: Sequence[int], errors: NDArray[np.floating]) -> float:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import DROP, Evidence
-from demorec.extensions.doctor.robust import runs
+from demorec.extensions.doctor.robust import held_period, runs
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.extensions.doctor.visible_motion import visible_motion
 
@@ -232,7 +232,8 @@ def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_
 def repeated_images(evidence: Evidence) -> Iterator[Fault]:
     """Find cameras with regularly repeated images: short repeats in at least a third of the moving frames.
 
-    In a single episode, or a set of up to three, it must be half of them.
+    In a single episode, or a set of up to three, it must be half of them. A keyframe changes a repeated image, so that
+    for a camera at a third of the rate or less the repeats between keyframes count.
     """
     evidence.need_state()
     for camera, images in evidence.need_images().items():
@@ -243,10 +244,12 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
             if visible is None or episode is None or episode.state is None or len(each.frames) < 2:
                 continue
             visibly = visible.expected(evidence, episode, each) > MIN_VISIBLE * visible.usual_change
-            changed = np.flatnonzero(~_repeats(each, visible.usual_change) & visibly)
+            repeats = _repeats(each, visible.usual_change)
+            changed = np.flatnonzero(~repeats & visibly)
             gaps = np.diff(changed)[visibly[changed[1:] - 1]] if len(changed) > 1 else np.zeros(0, dtype=np.intp)
             if len(gaps) >= MIN_GAPS and visible.usual_change >= MIN_RATE_CHANGE:
-                shares[number] = _share_repeated(gaps)
+                period = held_period(repeats, visibly)
+                shares[number] = 1 - 1 / period if period > 2 else _share_repeated(gaps)
         if not shares:
             continue
         least = MIN_REPEATED if len(shares) > MIN_OTHERS else MIN_REPEATED_OF_FEW

@@ -9,12 +9,16 @@ import numpy as np
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
+from demorec.extensions.doctor.robust import MAX_PERIOD, held_period
+from demorec.extensions.doctor.units import MIN_MOTION_TICKS, element_ticks
 
 MAX_GAP_PERIODS = 2.5
 """Maximum periods between two frames without missing ones; one late frame takes two."""
 MAX_RATE_ERROR = 0.1
 """Maximum relative error of the measured rate; above it motion has a wrong speed."""
 MIN_FRAMES = 5
+MIN_MOTION = 0.05
+"""Minimum motion of an element within six frames, as a ratio of its range in the episode: each new sample shows it."""
 MAX_AGE_S = 0.2
 """Maximum age of a sample or an image, in seconds; above it a policy sees the past: people react in that time."""
 
@@ -178,6 +182,42 @@ def sample_age(evidence: Evidence) -> Iterator[Fault]:
                     value=f"{worst:.2f} s",
                     message=f"{name} is up to {worst:.2f} s away from its frame, in {len(frames)} frames",
                 )
+
+
+@check(
+    family="time",
+    needs="state",
+    measures="states slower than the frames",
+    unit="frames",
+    why="The policy sees a state of several frames ago, and no speed.",
+    do="read the robot at the rate of the frames, or record at the rate of the robot",
+)
+def held_samples(evidence: Evidence) -> Iterator[Fault]:
+    """Find states that change in every n-th frame only while the arm moves by ten encoder steps and more."""
+    periods: dict[int, int] = {}
+    ticks = evidence.once(element_ticks)
+    for episode, state in evidence.need_state(3 * MAX_PERIOD):
+        least = np.maximum(MIN_MOTION_TICKS * ticks, MIN_MOTION * np.ptp(state, axis=0))
+        moves = (np.abs(state[MAX_PERIOD:] - state[:-MAX_PERIOD]) > least)[:, ~evidence.is_gripper].any(axis=1)
+        repeats = (state[1:] == state[:-1]).all(axis=1)[MAX_PERIOD : len(moves)]
+        periods[episode.number] = held_period(repeats, moves[:-MAX_PERIOD] & moves[MAX_PERIOD:])
+    held = {number: period for number, period in periods.items() if period > 1}
+    if len(held) > len(periods) / 2:
+        period = int(np.median(list(held.values())))
+        yield Fault(
+            severity="look",
+            value=f"{period} frames",
+            message=f"the state changes in every {period} frames only: it is read at {evidence.fps / period:.3g} Hz",
+        )
+        return
+    for number, period in held.items():
+        yield Fault(
+            severity="look",
+            episode=number,
+            value=f"{period} frames",
+            message=f"its state changes in every {period} frames only",
+            do=DROP,
+        )
 
 
 @check(
