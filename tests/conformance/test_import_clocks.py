@@ -217,22 +217,6 @@ def test_simulated_time_that_jumps_is_found(imports: Imports) -> None:
     assert np.all([FRONT not in line for line in told.splitlines() if line.startswith("  clock_")])
 
 
-@pytest.mark.parametrize(("rate", "factor"), [(25, 2.0), (200, 0.25)])
-def test_simulated_time_without_a_camera(rate: int, factor: float, imports: Imports, tmp_path: Path) -> None:
-    """Rows follow the headers' rate, independent of the recorder's clock: no message is lost."""
-    notes = bags.joints(STATE, ("a", "b"), bags.times(rate, 6.0, jitter=0, seed=1))
-    simulated = [
-        replace(note, log_ns=WALL_NS + round((note.log_ns - bags.EPOCH_NS) / factor), header_ns=note.header_ns)
-        for note in notes
-    ]
-    code, told, _ = imports(bags.in_order(simulated), "suggested")
-    assert code == 0
-    assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == rate
-    assert "are in no row" not in told
-    with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
-        assert recording.num_frames >= len(notes) - 2
-
-
 def test_numbers_in_no_row_are_reported(imports: Imports) -> None:
     notes = bags.in_order(bags.joints(STATE, ("a", "b"), bags.times(25, 6.0, jitter=0, seed=1)))
     mapping = MAPPING.partition("[[features.action]]")[0].replace("fps = 30", "fps = 10")

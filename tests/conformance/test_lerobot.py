@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -239,22 +238,6 @@ def lerobot_command(name: str, *arguments: str, timeout: float = 280) -> str:
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     return done.stdout + done.stderr
-
-
-@pytest.mark.slow
-@pytest.mark.long
-def test_lerobots_editing_command_deletes_and_splits(dataset: Path, tmp_path: Path) -> None:
-    root = tmp_path / "d"
-    shutil.copytree(dataset, root)
-    common = ["--repo_id=local/test", f"--root={root}"]
-    lerobot_command("lerobot-edit-dataset", *common, f"--new_root={tmp_path / 'less'}", "--new_repo_id=local/less",
-                    "--operation.type=delete_episodes", "--operation.episode_indices=[1,4]")  # fmt: skip
-    assert_readable(tmp_path / "less", (20, 17, 9, 12))
-    from lerobot.datasets.dataset_tools import split_dataset
-
-    parts = split_dataset(open_dataset(root), {"train": [0, 1, 2, 3], "test": [4, 5]}, tmp_path / "split")
-    assert [parts["train"].num_frames, parts["test"].num_frames] == [61, 43]
-    assert not any((part / "demorec").exists() for part in (tmp_path / "less", *(tmp_path / "split").iterdir()))
 
 
 @pytest.mark.slow

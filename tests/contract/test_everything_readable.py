@@ -59,7 +59,7 @@ ROWS = {
 }
 """Kind -> episodes and frames, as written."""
 LIKE_OTHERS = ("imported run", "mcap with --mapping", "rosbag2", "aloha", "lerobot v2.0")
-"""Kinds that `info`, `check` and `import` read; what they give to other commands is as of a kind that is tried."""
+"""Kinds that only `info`, `check` and `import` are tried with; for other commands they equal a kind in the list."""
 CASES = [
     (command, kind)
     for command in COMMANDS

@@ -111,6 +111,13 @@ def test_a_link_without_a_mass_is_refused_before_anything_is_made(
     assert not (tmp_path / "run").exists()
 
 
+def fixed_to_the_tool(origin: str) -> list[tuple[str, str]]:
+    """Changes that move or turn the tcp relative to the example's."""
+    joint = f'<parent link="true"/><child link="tcp"/><origin {origin}/>'
+    link = f'<link name="true"/><joint name="t" type="fixed">{joint}</joint>'
+    return [('<child link="tcp"/>', '<child link="true"/>'), ("</robot>", f"{link}</robot>")]
+
+
 def edited(path: Path, *changes: tuple[str, str]) -> None:
     text = path.read_text()
     for old, new in changes:
@@ -159,6 +166,21 @@ def edited(path: Path, *changes: tuple[str, str]) -> None:
             [('type="revolute">', 'type="revolute"><dynamics damping="-1"/>')],
             "'joint1' is -1; set it to 0",
         ),
+        (
+            "xarm6.urdf",
+            fixed_to_the_tool('xyz="0 0 -0.06"'),
+            r"the finger tips are 0\.0\d\d m beyond tcp_link 'tcp'; finger_depth is 0.01; move tcp_link by",
+        ),
+        (
+            "xarm6.urdf",
+            fixed_to_the_tool('xyz="0 0 0.1"'),
+            r"the fingers end 0\.0\d\d m before tcp_link 'tcp'; place it between the finger tips",
+        ),
+        (
+            "xarm6.urdf",
+            fixed_to_the_tool('rpy="0 0 1.5708"'),
+            "the fingers move along x of tcp_link 'tcp'; turn it about its z by 90 degrees",
+        ),
     ],
 )
 def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
@@ -176,40 +198,6 @@ def test_a_robot_that_does_not_fit_is_refused_before_anything_is_made(
     assert told.out == ""
     assert re.fullmatch(rf"generate-dataset: The .*{words}.*: my_robots:xarm6.urdf\n", told.err)
     assert not (tmp_path / "run").exists()
-
-
-def fixed_to_the_tool(origin: str) -> str:
-    """Attach a tcp that is moved or turned relative to the example's."""
-    joint = f'<parent link="true"/><child link="tcp"/><origin {origin}/>'
-    return f'<link name="true"/><joint name="t" type="fixed">{joint}</joint>'
-
-
-@pytest.mark.parametrize(
-    ("origin", "words"),
-    [
-        ("0 0 -0.06", r"the finger tips are 0\.0\d\d m beyond tcp_link 'tcp'; finger_depth is 0.01; move tcp_link by"),
-        ("0 0 0.1", r"the fingers end 0\.0\d\d m before tcp_link 'tcp'; place it between the finger tips"),
-    ],
-)
-def test_a_tcp_that_is_not_between_the_finger_tips_is_refused(
-    origin: str, words: str, folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    moved = fixed_to_the_tool(f'xyz="{origin}"')
-    edited(folder / "xarm6.urdf", ('<child link="tcp"/>', '<child link="true"/>'), ("</robot>", f"{moved}</robot>"))
-    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
-    assert exit_code(*flags, program=generate_dataset_main) == 2
-    assert re.search(words, capfd.readouterr().err)
-    assert not (tmp_path / "run").exists()
-
-
-def test_fingers_that_move_along_x_of_the_tcp_are_refused(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    turn = fixed_to_the_tool('rpy="0 0 1.5708"')
-    edited(folder / "xarm6.urdf", ('<child link="tcp"/>', '<child link="true"/>'), ("</robot>", f"{turn}</robot>"))
-    flags = ["--robot", XARM6, "--cameras", "none", "--num-episodes", "1", "--out", tmp_path / "run"]
-    assert exit_code(*flags, program=generate_dataset_main) == 2
-    assert "the fingers move along x of tcp_link 'tcp'; turn it about its z by 90 degrees" in capfd.readouterr().err
 
 
 @pytest.mark.slow

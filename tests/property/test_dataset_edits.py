@@ -6,7 +6,6 @@ import json
 import tempfile
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from support.check import edit_json
 from support.commands import exit_code
 from support.drawn_datasets import ACTION, DRAWN, ENCODERS, REFERENCE, STATE, DrawnDataset, like, write_drawn
+from support.export import files_of
 from support.stored_episodes import StoredEpisode, is_counted, same_values, seconds, stored_episodes, task_texts
 
 NEW_TASK = "sweep the table"
@@ -202,8 +202,3 @@ def test_appending_changes_no_episode_and_no_file_of_rows_or_images(drawn: Drawn
             assert same_values(replace(old, packets={}), new) == []
         kept = {name: data for name, data in files.items() if name.startswith(("data/", "videos/", "extra/"))}
         assert {name: data for name, data in files_of(base).items() if name in kept} == kept
-
-
-def files_of(root: Path) -> dict[str, Any]:
-    """Path -> content of all files."""
-    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}

@@ -118,7 +118,6 @@ ROWS = {
         targets=("new-0000.rrd", "new-0001.rrd"),
         old="view SOURCES/reversed --episodes 0:2 --save new.rrd",
         surprise="new-0001.rrd",
-        runs=SLOW,
     ),
     "export lerobot": Row(
         call="export lerobot SOURCES/run --no-verify --out new",

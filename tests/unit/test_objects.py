@@ -44,7 +44,7 @@ def block(x: float, y: float, z: float) -> SolidMesh:
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
 def test_each_shape_is_a_closed_solid_that_physics_has_as_it_is_drawn(kind: Kind) -> None:
-    for number in range(0, kind.count, 6):
+    for number in range(0, kind.count, 10):
         mesh = kind.shape(number)
         assert mesh.is_closed()
         surface = as_trimesh(mesh)
@@ -136,7 +136,7 @@ def test_an_overhang_in_the_path_of_a_finger_prevents_the_grasp() -> None:
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=KINDS.keys())
 def test_each_kind_has_grasps_for_the_usual_hand(kind: Kind) -> None:
-    for number in range(0, kind.count, 8):
+    for number in range(0, kind.count, 15):
         text, _ = at_rest(encode_mesh(kind.shape(number)))
         assert antipodal_grasps(text, PANDA_HAND, up=UP), f"{kind.noun} {number}"
 
@@ -304,14 +304,14 @@ def test_a_glb_file_is_turned_upright_and_a_broken_one_is_refused(tmp_path: Path
     assert float(np.ptp(top[:, 0])) == pytest.approx(0.02, abs=1e-5)  # the lid is on top
     rng = np.random.default_rng(0)
     refused = 0
-    for row in rng.integers(20, len(data), 200).tolist():
+    for row in rng.integers(20, len(data), 60).tolist():
         (tmp_path / "tin.glb").write_bytes(data[:row] + bytes([data[row] ^ 0xFF]) + data[row + 1 :])
         read_solid.cache_clear()
         try:
             read_solid(tmp_path / "tin.glb")
         except ConfigError:
             refused += 1
-    assert refused > 50
+    assert refused > 15
 
 
 def test_random_shapes_are_closed_and_lie_flat() -> None:
