@@ -26,7 +26,7 @@ from support.export import without_verification
 from demorec.mcap.video import ordinary_scheduling
 
 sys.dont_write_bytecode = False
-hypothesis.settings.register_profile("untimed", deadline=None)  # machines are busy at times
+hypothesis.settings.register_profile("untimed", deadline=None, max_examples=50)  # machines are busy at times
 hypothesis.settings.load_profile("untimed")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -53,13 +52,8 @@ def said(capsys: pytest.CaptureFixture[str]) -> str:
     return lines[0]
 
 
-PLACES = {
-    "below a file": Path("file/x"),
-    "in /proc": Path("/proc/x"),
-    "a long name": Path("x" * 300),
-    "bytes": Path(os.fsdecode(b"\xff")),
-    "below a link to nothing": Path("link/x"),
-}
+PLACES = {"in /proc": Path("/proc/x"), "below a link to nothing": Path("link/x")}
+"""Tests of options have names that are too long, not UTF-8 or below a file."""
 
 
 @pytest.mark.parametrize("place", PLACES)
@@ -67,13 +61,11 @@ PLACES = {
 def test_an_unwritable_target_is_exit_code_2(
     name: str, place: str, sources: dict[str, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "file").write_text("mine")
     (tmp_path / "link").symlink_to("nothing")
     new = tmp_path / PLACES[place]
     assert exit_code(*call(name, sources, new)) == 2
-    assert "/".join(new.parts[-2:])[:-1].encode("ascii", "backslashreplace").decode()[1:] in said(capsys)
-    assert (tmp_path / "file").read_text() == "mine"
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["file", "link"]
+    assert "/".join(new.parts[-2:])[1:] in said(capsys)
+    assert [path.name for path in tmp_path.iterdir()] == ["link"]
 
 
 @pytest.mark.parametrize("name", CALLS)

@@ -60,9 +60,10 @@ def test_mcap_with_chunks_compressed_by_the_storage(notes: bags.Notes, tmp_path:
     _assert_same(notes, _read(open_bag(path))[0])
 
 
-@pytest.mark.parametrize("is_ros1", [False, True])
-@pytest.mark.parametrize("compression", ["", "zstd", "lz4"])
-@pytest.mark.parametrize("is_bare", [False, True])
+@pytest.mark.parametrize(
+    ("is_ros1", "compression", "is_bare"),
+    [(False, "", True), (False, "zstd", False), (False, "lz4", True), (True, "", False), (True, "zstd", True)],
+)
 def test_mcap_files(notes: bags.Notes, is_ros1: bool, compression: str, is_bare: bool, tmp_path: Path) -> None:
     bare: dict[str, Any] = {
         "index_types": IndexType.NONE, "use_statistics": False, "use_summary_offsets": False, "repeat_channels": False,
@@ -159,8 +160,9 @@ def test_json(tmp_path: Path) -> None:
     assert not problems
 
 
-@pytest.mark.parametrize("part", [0.05, 0.3, 0.7, 0.98])
-@pytest.mark.parametrize("use_chunking", [True, False])
+@pytest.mark.parametrize(
+    ("part", "use_chunking"), [(0.05, True), (0.3, False), (0.7, True), (0.98, True), (0.98, False)]
+)
 def test_a_truncated_bag_is_read_up_to_its_end(
     notes: bags.Notes, part: float, use_chunking: bool, tmp_path: Path
 ) -> None:

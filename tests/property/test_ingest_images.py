@@ -91,7 +91,7 @@ roundings = st.sampled_from(sorted(ROUNDINGS))
 
 
 @pytest.mark.slow
-@settings(max_examples=80, **PATIENT)
+@settings(max_examples=40, **PATIENT)
 @given(rates, phases, jitters, seeds, roundings)
 def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """Any rate works; the suggested fps is the rounded rate."""
@@ -104,7 +104,7 @@ def test_a_camera_of_any_rate(rate: Fraction, phase: Fraction, jitter: float, se
 
 
 @pytest.mark.slow
-@settings(max_examples=80, **PATIENT)
+@settings(max_examples=40, **PATIENT)
 @given(st.integers(5, 200), phases, jitters, seeds, roundings)
 def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, rounding: str) -> None:
     times = _moments(Fraction(rate), phase, jitter, seed, rounding)
@@ -122,7 +122,7 @@ def test_an_even_grid(rate: int, phase: Fraction, jitter: float, seed: int, roun
 
 
 @pytest.mark.slow
-@settings(max_examples=80, **PATIENT)
+@settings(max_examples=40, **PATIENT)
 @given(st.integers(5, 200), phases, phases, st.floats(0.0, 0.24), seeds, roundings)
 def test_two_cameras(rate: int, phase: Fraction, other: Fraction, jitter: float, seed: int, rounding: str) -> None:
     """With an offset of up to a quarter period all images are used: those of a pair are closer together than

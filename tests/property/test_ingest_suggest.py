@@ -47,7 +47,7 @@ def _suggestion(bag: Path) -> str:
 
 
 @pytest.mark.slow
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(TEXTS, st.lists(TEXTS, min_size=2, max_size=4, unique=True), TEXTS)
 @example("odd" + "".join(ODD), ODD, "".join(ODD))
 def test_a_suggestion_is_toml_and_names_existing_topics(topic: str, joints: list[str], frame: str) -> None:
@@ -84,7 +84,7 @@ JSON = st.recursive(
 
 
 @pytest.mark.slow
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.lists(st.dictionaries(WORDS, JSON, max_size=5), min_size=1, max_size=4), st.sampled_from(["/state", "/cmd"]))
 @example([{"name": ["a"], "position": [1.0]}, {"name": [[1], {}], "position": [[1.0], [2.0, 3.0]]}], "/state")
 @example([{"position": [[1.0], [2.0, 3.0]], "points": [{"positions": [[1], []]}, 3]}], "/cmd")

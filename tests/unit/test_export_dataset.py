@@ -79,7 +79,7 @@ def test_transcoded_jpeg_recordings_are_reported(tmp_path: Path) -> None:
             assert np.abs(found.astype(int) - expected).mean() < 5
 
 
-@pytest.mark.parametrize(("fps", "stride", "transcoded"), [(15, 2, False), (10, 3, True), (5, 6, False)])
+@pytest.mark.parametrize(("fps", "stride", "transcoded"), [(15, 2, False), (10, 3, True)])
 def test_fewer_frames_a_second(run: Path, tmp_path: Path, fps: int, stride: int, transcoded: bool) -> None:
     out = tmp_path / "d"
     report = export(run, out, fps=fps)

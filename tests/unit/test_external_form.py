@@ -25,8 +25,7 @@ from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import Recording, SampledWriter
 
 
-@pytest.mark.parametrize("num_frames", [0, 1, 45, 100])
-@pytest.mark.parametrize("cameras", [(), (TOP, WRIST)])
+@pytest.mark.parametrize(("num_frames", "cameras"), [(0, ()), (1, (TOP, WRIST)), (45, ()), (100, (TOP, WRIST))])
 def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
     tmp_path: Path, num_frames: int, cameras: tuple[Camera, ...]
 ) -> None:
