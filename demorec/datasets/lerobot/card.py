@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -128,27 +129,15 @@ _RECORDED = _Provenance(
 )
 
 
-@dataclass(frozen=True, kw_only=True)
-class CardContent:
-    """Content of a card beyond the dataset's tables.
-
-    Attributes:
-        options: Options of the export.
-        meanings: Feature -> its description in the recordings.
-        is_transcoded: Whether any images were transcoded.
-    """
-
-    options: ExportOptions
-    meanings: Mapping[str, str]
-    is_transcoded: bool
-
-
-def write_card(root: Path, info: DatasetInfo, content: CardContent) -> None:
-    """Write the card of a finished dataset folder."""
+def write_card(
+    root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
+) -> None:
+    """Write the card of a finished dataset folder; `meanings` has the features' descriptions in the recordings."""
     there = root / CARD_PATH
     path = root / SECOND_CARD_PATH if has_own_card(root) else there
     path.unlink(missing_ok=True)
-    write_text(path, _marked("\n".join(_card(root, info, content)) + "\n"))
+    lines = _card(root, info, options, meanings, is_transcoded=is_transcoded)
+    write_text(path, _marked("\n".join(lines) + "\n"))
 
 
 def has_own_card(root: Path) -> bool:
@@ -166,11 +155,13 @@ def _marked(text: str) -> str:
     return text + _MARK.format(digest=hashlib.sha256(text.encode()).hexdigest()[:16])
 
 
-def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
+def _card(
+    root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
+) -> Iterable[str]:
     configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
-    options = content.options
-    provenance = _SIMULATED if configs and _all_simulated(root) else _RECORDED
-    sensed = {name: markdown(source) for name, source in content.meanings.items() if source}
+    seeds = rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"])  # null in recordings of other robots
+    provenance = _SIMULATED if configs and all(row["root_seed"] is not None for row in seeds) else _RECORDED
+    sensed = {name: markdown(source) for name, source in meanings.items() if source}
     meaning = {**_MEANING, **sensed, **(_simulated_meaning(options) if provenance is _SIMULATED else {})}
     tasks = read_tasks(root)
     licence = options.license or provenance.licence
@@ -180,7 +171,7 @@ def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
     yield from ("task_categories:", "- robotics")
     yield from ("tags:", "- LeRobot", "- demorec", *(f"- {tag}" for tag in provenance.tags))
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
-    yield from (f"# {options.repo_id}", "", _summary(info, content, provenance))
+    yield from (f"# {options.repo_id}", "", _summary(info, provenance, is_transcoded=is_transcoded))
     yield from ("", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:20]))
     if len(tasks) > 20:
         yield f"- and {len(tasks) - 20} more"
@@ -201,17 +192,12 @@ def _card(root: Path, info: DatasetInfo, content: CardContent) -> Iterable[str]:
         yield from _origin_section(root, configs, options)
 
 
-def _all_simulated(root: Path) -> bool:
-    """Return whether the sidecar has a seed for every episode; recordings of other robots have none."""
-    return all(row["root_seed"] is not None for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"]))
-
-
-def _summary(info: DatasetInfo, content: CardContent, provenance: _Provenance) -> str:
+def _summary(info: DatasetInfo, provenance: _Provenance, *, is_transcoded: bool) -> str:
     """Describe the dataset's content and origin in one paragraph."""
     robot, plural = markdown(str(info.robot_type)), "" if info.total_episodes == 1 else "s"
     minutes = info.total_frames / info.fps / 60
     demonstrations = provenance.demonstration.format(plural=plural, robot=robot)
-    images = "some images were encoded again" if content.is_transcoded else provenance.packets
+    images = "some images were encoded again" if is_transcoded else provenance.packets
     return (
         f"{info.total_episodes} {demonstrations}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
         f"in the LeRobot v3.0 format. {provenance.origin}; {images}."
@@ -273,11 +259,10 @@ def _success_section(root: Path) -> Iterable[str]:
     if not total:
         return
     yield f"{good} of {total} attempts that were made for this dataset succeeded ({100 * good / total:.1f} %)."
-    counts: dict[str, int] = {}
+    counts = Counter[str]()
     for row in failed:
         phase, reason = row["failure_phase"], str(row["failure_reason"])
-        reason = f"{reason} in phase {phase}" if phase else reason
-        counts[reason] = counts.get(reason, 0) + 1
+        counts[f"{reason} in phase {phase}" if phase else reason] += 1
     for reason, count in sorted(counts.items(), key=lambda item: (-item[1], item[0])):
         yield f"- {count} failed: {markdown(reason) or 'no reason recorded'}"
     yield ""

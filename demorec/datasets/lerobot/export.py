@@ -18,7 +18,7 @@ from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, ExportError, MissingDependencyError, describe_error
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.card import CardContent, has_own_card, write_card
+from demorec.datasets.lerobot.card import has_own_card, write_card
 from demorec.datasets.lerobot.existing import features_to_append, link_files, start_after
 from demorec.datasets.lerobot.facts import STAGE_COLUMNS, fact_types, write_progress
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -123,8 +123,7 @@ class _Export:
             finished = writer.finish(self._about_this_export())
         if self._options.progress:
             write_progress(folder)
-        content = CardContent(options=self._options, meanings=first.meanings, is_transcoded=bool(self._transcoded))
-        write_card(folder, finished, content)
+        write_card(folder, finished, self._options, first.meanings, is_transcoded=bool(self._transcoded))
         return ExportReport(
             path=folder,
             num_episodes=finished.total_episodes,

@@ -68,9 +68,9 @@ def import_hdf5(
         expect(path, "hdf5")
     if len({path.resolve() for path in paths}) < len(paths):
         raise ConfigError("A file is given twice: name each once.")
-    plan = _planned(paths, mapping, urdf)
+    episodes, cameras, left_out = _planned(paths, mapping, urdf)
     with open_external_run(out, recovers=False) as folder:
-        missing = [episode for episode in plan.episodes if not folder.has(episode.info)]
+        missing = [episode for episode in episodes if not folder.has(episode.info)]
         folder.planned = [planned_episode(episode.info.episode_index) for episode in missing]
         for episode in missing:
             with ForeignFile(episode.path) as file, _named(episode.path):
@@ -80,11 +80,11 @@ def import_hdf5(
                 settings = video or VideoConfig()
                 add_episode(folder, episode.info, table, images, outcome=episode.outcome, video=settings, subtasks={})
     return FramesImport(
-        num_episodes=len(plan.episodes),
-        num_frames=sum(episode.outcome.num_frames for episode in plan.episodes),
+        num_episodes=len(episodes),
+        num_frames=sum(episode.outcome.num_frames for episode in episodes),
         num_new=len(missing),
-        cameras=plan.cameras,
-        left_out=plan.left_out,
+        cameras=cameras,
+        left_out=left_out,
     )
 
 
@@ -97,16 +97,10 @@ class _PlannedDemo(NamedTuple):
     outcome: Outcome
 
 
-class _Plan(NamedTuple):
-    """Episodes of all files; `cameras` and `left_out` as in `FramesImport`."""
-
-    episodes: list[_PlannedDemo]
-    cameras: dict[str, str]
-    left_out: dict[str, str]
-
-
-def _planned(paths: Sequence[Path], mapping: SourceMapping, urdf: str | None) -> _Plan:
-    """Check all files; errors as in `import_hdf5`."""
+def _planned(
+    paths: Sequence[Path], mapping: SourceMapping, urdf: str | None
+) -> tuple[list[_PlannedDemo], dict[str, str], dict[str, str]]:
+    """Check all files; return their episodes, and `cameras` and `left_out` of `FramesImport`."""
     episodes: list[_PlannedDemo] = []
     cameras: dict[str, str] = {}
     left_out: dict[str, str] = {}
@@ -123,7 +117,7 @@ def _planned(paths: Sequence[Path], mapping: SourceMapping, urdf: str | None) ->
                 if stored.has_last:
                     left_out["the last observation of each episode"] = "no action follows it"
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
-    return _Plan(episodes, cameras, left_out)
+    return episodes, cameras, left_out
 
 
 class _Stored:
