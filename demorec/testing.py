@@ -75,8 +75,7 @@ class TaskContract:
 
     def test_scenes_come_back_from_their_description(self) -> None:
         """Rebuild the scene from a recording's metadata; it has an instruction, and goals for movable bodies only."""
-        for index in range(self.num_layouts):
-            info = self._episode(index).info
+        for index, info in enumerate(self._layouts()):
             assert read_episode_info(to_json(info)) == info, f"episode {index} differs when it is read back"
             assert info.simulated.scene.goals, f"episode {index} has no goal"
             assert info.instruction.strip(), f"episode {index} has no instruction"
@@ -84,8 +83,8 @@ class TaskContract:
 
     def test_objects_stand_apart(self) -> None:
         """Check that no two movable bodies on the table overlap."""
-        for index in range(self.num_layouts):
-            movable = self._episode(index).info.simulated.scene.movable
+        for index, info in enumerate(self._layouts()):
+            movable = info.simulated.scene.movable
             standing = [body for body in movable if body.world_from_body.position[2] < 0.05]
             for a, b in itertools.combinations(standing, 2):
                 gap = math.dist(a.world_from_body.position[:2], b.world_from_body.position[:2])
@@ -94,8 +93,7 @@ class TaskContract:
 
     def test_objects_and_goals_are_within_reach(self) -> None:
         """Check that the hand, pointing down, reaches each object and its target at one yaw at least."""
-        for index in range(self.num_layouts):
-            info = self._episode(index).info
+        for index, info in enumerate(self._layouts()):
             for goal in info.simulated.scene.goals:
                 start = info.simulated.scene.body(goal.object).world_from_body
                 for what, pose in (("start", start), ("goal", info.simulated.scene.world_from_goal(goal))):
@@ -167,6 +165,9 @@ class TaskContract:
         assert not failed, "; ".join(failed)
         for proof in prove([path], modules_of([self.task, self.robot])):
             assert proof.level == "pass", proof.problem or "this machine cannot make the episode again"
+
+    def _layouts(self) -> tuple[EpisodeInfo, ...]:
+        return layouts_of(self.task, self.robot, self.seed, self.num_layouts)
 
     def _episode(self, index: int, *, attempt: int = 0) -> PreparedEpisode:
         return prepare(replace(plan_of(self.task, self.robot, self.seed, index), attempt=attempt))
@@ -242,7 +243,13 @@ def plan_of(task: str, robot: str, seed: int, index: int) -> EpisodePlan:
     return EpisodePlan(config=config, episode_index=index)
 
 
-# The tests of a class run in sequence and share simulated episodes.
+# The tests of a class run in sequence and share layouts and simulated episodes.
+@lru_cache(maxsize=1)
+def layouts_of(task: str, robot: str, seed: int, count: int) -> tuple[EpisodeInfo, ...]:
+    """Draw the first episodes' descriptions."""
+    return tuple(prepare(plan_of(task, robot, seed, index)).info for index in range(count))
+
+
 @lru_cache(maxsize=16)
 def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Frame, ...], Outcome]:
     """Simulate an episode; returns all frames and the outcome."""

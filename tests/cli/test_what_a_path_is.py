@@ -100,8 +100,9 @@ def test_every_command_describes_a_path_in_the_same_words(
     assert sorted(tmp_path.iterdir()) == before
 
 
-@pytest.mark.parametrize("command", ON_A_PATH)
-@pytest.mark.parametrize("place", ["the path itself", "in a folder"])
+@pytest.mark.parametrize(
+    ("command", "place"), [(command, "the path itself") for command in ON_A_PATH] + [("info", "in a folder")]
+)
 def test_names_that_are_not_utf8(tmp_path: Path, capsys: pytest.CaptureFixture[str], command: str, place: str) -> None:
     """Neither PyArrow nor Rerun can open such names."""
     path = tmp_path / os.fsdecode(b"\xff.mcap")

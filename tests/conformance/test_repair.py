@@ -200,9 +200,9 @@ def test_float64_rows_stay_float64(whole: Path, tmp_path: Path, capsys: pytest.C
 
 
 @pytest.mark.parametrize(
-    "names", [[["x", "y", "z"]], {"motors": ["x", "y", "z"]}, {"axes": ["x", "y", "z"]}, ["x", "y"]]
+    ("names", "shape"),
+    [([["x", "y", "z"]], [3]), ({"motors": ["x", "y", "z"]}, [5]), ({"axes": ["x", "y", "z"]}, [3]), (["x", "y"], [5])],
 )
-@pytest.mark.parametrize("shape", [[3], [5]])
 def test_names_keep_their_form(
     names: Any, shape: list[int], whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -85,9 +85,9 @@ def longer_episode(root: Path) -> None:
 
 
 def exchanged_rows(root: Path) -> None:
-    """Swap one row of episode 1 with one of episode 2."""
+    """Swap a row of episode 1 with the same one of episode 2."""
     order = np.arange(NUM_EPISODES * LENGTH)
-    order[[LENGTH + 2, 2 * LENGTH + 3]] = order[[2 * LENGTH + 3, LENGTH + 2]]
+    order[[LENGTH + 2, 2 * LENGTH + 2]] = order[[2 * LENGTH + 2, LENGTH + 2]]
     change_table(root, "data", lambda table: table.take(pa.array(order)))
 
 

@@ -7,6 +7,7 @@ from support.sim import episode, run
 from support.tasks import PAIRS
 
 from demorec.core.plain import from_json, to_json
+from demorec.core.tables import ROBOTS
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.variation import PRESET_NAMES
 from demorec.loop import make_world
@@ -14,8 +15,12 @@ from demorec.loop import make_world
 CASES = [(*pair, "full") for pair in PAIRS] + [
     ("pick_place", "panda", preset) for preset in PRESET_NAMES if preset != "full"
 ]
-SAMPLED = [("pick_anything", "panda", "full"), ("tutorial", "panda", "full")]
-FAST = [case for case in CASES if case[0] == "pick_place" and case[2] == "full"]
+SAMPLED = [
+    ("pick_anything", "panda", "full"),
+    ("tutorial", "panda", "full"),
+    *(("pick_place", robot, "full") for robot in ROBOTS.names()),
+]
+FAST = [("pick_place", "panda", "full")]
 
 
 def check(task: str, robot: str, variation: str) -> None:

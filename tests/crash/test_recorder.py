@@ -100,8 +100,8 @@ def check_again(folder: Path, told: object) -> None:
     assert not left, told
 
 
-def test_killed_at_eight_moments(tmp_path: Path, num_changes: int) -> None:
-    for moment in sorted({int(each) for each in np.linspace(1, num_changes, 8)}):
+def test_killed_at_six_moments(tmp_path: Path, num_changes: int) -> None:
+    for moment in sorted({int(each) for each in np.linspace(1, num_changes, 6)}):
         folder = tmp_path / f"at_{moment}"
         folder.mkdir()
         ended = run(folder, at=moment, act=lambda number: os.kill(os.getpid(), signal.SIGKILL))

@@ -65,7 +65,7 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("codec", "kills"), [("h264", 8), pytest.param("av1", 20, marks=LONG)])
+@pytest.mark.parametrize(("codec", "kills"), [("h264", 5), pytest.param("av1", 20, marks=LONG)])
 def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
     rng = random.Random(5)
     info, frames, _ = make_episode(num_frames=2 * MOST_FRAMES, fps=FPS)

@@ -126,7 +126,7 @@ def found_slice(after: StoredEpisode, before: list[StoredEpisode], parts: list[S
 
 @pytest.mark.slow
 @pytest.mark.parametrize("operation", OPERATIONS)
-@settings(max_examples=3, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(max_examples=2, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 @given(drawn=DRAWN)
 def test_no_edit_changes_what_was_not_asked_for(operation: str, drawn: DrawnDataset) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -154,7 +154,7 @@ def test_no_edit_changes_what_was_not_asked_for(operation: str, drawn: DrawnData
 
 
 @pytest.mark.slow
-@settings(max_examples=6, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(max_examples=4, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 @given(drawn=DRAWN)
 def test_a_merge_changes_nothing_of_its_sources(drawn: DrawnDataset) -> None:
     with tempfile.TemporaryDirectory() as folder:
@@ -176,7 +176,7 @@ def test_a_merge_changes_nothing_of_its_sources(drawn: DrawnDataset) -> None:
 
 
 @pytest.mark.slow
-@settings(max_examples=6, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
+@settings(max_examples=4, deadline=None, phases=[Phase.generate], suppress_health_check=list(HealthCheck))
 @given(drawn=DRAWN)
 def test_appending_changes_no_episode_and_no_file_of_rows_or_images(drawn: DrawnDataset) -> None:
     """To a dataset of format v3.0 whose features a run of another one has."""

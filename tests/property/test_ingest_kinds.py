@@ -51,7 +51,7 @@ def command(*words: object) -> tuple[int, str, str]:
 
 
 @pytest.mark.slow
-@settings(max_examples=14, **FEW)  # type: ignore[arg-type]
+@settings(max_examples=8, **FEW)  # type: ignore[arg-type]
 @given(kind=KINDS, version=st.sampled_from(["v2.1", "v3.0"]), gop=st.sampled_from([1, 3]), is_fragmented=st.booleans())
 def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
     kind: tuple[str, str], version: str, gop: int, is_fragmented: bool
@@ -81,7 +81,7 @@ def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
 
 
 @pytest.mark.slow
-@settings(max_examples=10, **FEW)  # type: ignore[arg-type]
+@settings(max_examples=6, **FEW)  # type: ignore[arg-type]
 @given(kind=KINDS.filter(lambda kind: kind[0] != "png"), gop=st.sampled_from([1, 5]))
 def test_the_pixel_format_decides_what_a_video_of_a_bag_holds(kind: tuple[str, str], gop: int) -> None:
     codec, pixels = kind
@@ -109,7 +109,7 @@ def test_the_pixel_format_decides_what_a_video_of_a_bag_holds(kind: tuple[str, s
 
 
 @pytest.mark.slow
-@settings(max_examples=14, **FEW)  # type: ignore[arg-type]
+@settings(max_examples=8, **FEW)  # type: ignore[arg-type]
 @given(
     rate=st.floats(10, 50),
     factor=st.floats(0.25, 4),
@@ -155,7 +155,7 @@ def test_a_bag_with_simulated_time_loses_no_message_in_silence(
 
 
 @pytest.mark.slow
-@settings(max_examples=20, **FEW)  # type: ignore[arg-type]
+@settings(max_examples=12, **FEW)  # type: ignore[arg-type]
 @given(drawn=DRAWN)
 def test_an_import_keeps_numbers_times_names_and_images_of_a_dataset(drawn: DrawnDataset) -> None:
     """Columns that refer to tasks are left out by name, all other numbers stay bit by bit."""
