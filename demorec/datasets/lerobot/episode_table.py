@@ -106,7 +106,8 @@ def read_episode_table(root: Path, info: DatasetInfo) -> Iterator[EpisodePlace]:
 
 def elsewhere(root: Path, path: Path, key: str) -> Path | None:
     """Find the only file with this name (for a camera, in a folder named after it) where info.json is wrong."""
-    found = [other for other in root.rglob(path.name) if not key or key in other.relative_to(root).parts]
+    others = [(other, other.relative_to(root).parts) for other in root.rglob(path.name)]
+    found = [other for other, parts in others if (key in parts if key else parts[0] != "meta")]
     if len(found) > 1:
         found = [other for other in found if other.parent.name == path.parent.name]
     return found[0] if len(found) == 1 else None

@@ -53,8 +53,9 @@ def examine(
     try:
         evidence = _evidence(path, options)
     except ExportError as error:
-        failed = Diagnosis(path=path, taken={}, findings=(_unopened(error, path), *extra), episodes=(), not_measured={})
-        return failed, None
+        unopened = _unopened(error, path)
+        others = [finding for finding in extra if unopened.message not in finding.message]
+        return Diagnosis(path=path, taken={}, findings=(unopened, *others), episodes=(), not_measured={}), None
     evidence.earlier = earlier
     found = find(path)
     diagnosis = diagnose(evidence, chosen, extra)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -90,7 +90,7 @@ def evidence_of_dataset(root: Path, options: ReadOptions) -> Evidence:
         episodes=readable,
         unreadable=unreadable,
         folder=folder,
-        cameras=_cameras(folder) if options.images else {},
+        cameras=_cameras(folder, unreadable) if options.images else {},
         images_missing=_why_no_images(folder) if options.images else "images are not decoded (--no-images)",
         urdf=options.urdf or ("" if robot is None else robot.urdf),
         robot_problem="; ".join(robot_problems),
@@ -155,7 +155,7 @@ def _why_no_images(folder: LeRobotFolder) -> str:
     return ""
 
 
-def _cameras(folder: LeRobotFolder) -> dict[str, CameraThumbnails]:
+def _cameras(folder: LeRobotFolder, unreadable: Collection[int]) -> dict[str, CameraThumbnails]:
     found = {}
     for key, feature in folder.info.features.items():
         if feature.is_depth or not feature.is_camera or (feature.is_video and _is_absent(folder, key)):
@@ -165,8 +165,9 @@ def _cameras(folder: LeRobotFolder) -> dict[str, CameraThumbnails]:
         if feature.is_video:
             _read_videos(folder, key, episodes, errors)
         else:
-            _read_stored(folder, key, episodes, errors)
-        found[key] = CameraThumbnails(episodes=episodes, errors=errors)
+            _read_stored(folder, key, unreadable, episodes, errors)
+        if episodes or errors:
+            found[key] = CameraThumbnails(episodes=episodes, errors=errors)
     return found
 
 
@@ -190,10 +191,14 @@ def _read_videos(
 
 
 def _read_stored(
-    folder: LeRobotFolder, key: str, episodes: dict[int, EpisodeThumbnails], errors: dict[int, str]
+    folder: LeRobotFolder,
+    key: str,
+    unreadable: Collection[int],
+    episodes: dict[int, EpisodeThumbnails],
+    errors: dict[int, str],
 ) -> None:
     shrinker = Shrinker()
-    for place in folder.listed:
+    for place in (place for place in folder.listed if place.episode_index not in unreadable):
         problems: list[str] = []
         with noted(problems, folder.root):
             episodes[place.episode_index] = shrinker.shrink(frames_of(folder.stored_images[key].read(place)))

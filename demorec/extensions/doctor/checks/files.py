@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -16,7 +17,7 @@ from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, Seve
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted, range_errors
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, DatasetFeature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, VIDEO_PATH, DatasetFeature
 from demorec.datasets.lerobot.stored_types import stored_dtype
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.extensions.doctor.evidence import DROP, REPAIR, Evidence
@@ -49,12 +50,13 @@ def folder_of(evidence: Evidence) -> LeRobotFolder:
 def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
     """Read every row of every episode, and verify by its own numbers that it belongs there."""
     folder = folder_of(evidence)
+    remedy = "" if evidence.episodes else "download the tables again"  # nothing would be left
     reasons: dict[str, list[int]] = {}
     for number, reason in evidence.unreadable.items():
         reasons.setdefault(reason, []).append(number)
     for reason, numbers in reasons.items():
         for number in numbers:
-            yield Fault(severity="broken", episode=number, message=reason, value="1 episode")
+            yield Fault(severity="broken", episode=number, message=reason, value="1 episode", do=remedy)
     if evidence.robot_problem:
         yield Fault(severity="broken", message=evidence.robot_problem, do="restore the folder demorec/robots")
     for number, note in enumerate(folder.notes):
@@ -116,6 +118,23 @@ def contradicting_counts(evidence: Evidence) -> Iterator[Fault]:
             yield Fault(severity="broken", message="the tasks' numbers do not count up in meta/tasks.parquet")
         yield from _wrong_ranges(folder)
         yield from _surplus_rows(folder)
+    yield from _other_paths(folder)
+
+
+def _other_paths(folder: LeRobotFolder) -> Iterator[Fault]:
+    """Find files that demorec finds by their names, but not where info.json states them."""
+    info = folder.info
+    stated = dict.fromkeys(info.video_keys, info.video_path or VIDEO_PATH) | {"": info.data_path}
+    for key, template in stated.items():
+        expected = re.compile(re.sub(r"\\{.*?\\}", ".+", re.escape(template)))
+        paths = [place.videos[key][0] if key else place.data for place in folder.listed]
+        names = [path.relative_to(folder.root).as_posix() for path in dict.fromkeys(paths) if path.exists()]
+        if other := [name for name in names if not expected.fullmatch(name)]:
+            yield Fault(
+                severity="broken",
+                value=f"{len(other)} files",
+                message=f"info.json has {key or 'the rows'} in {template}, found {other[0]}",
+            )
 
 
 def _wrong_indices(columns: Mapping[str, Any], number: int, start: int) -> list[str]:
@@ -215,11 +234,11 @@ def _column_faults(
 ) -> Iterator[tuple[str, str]]:
     schema = open_table(path).schema_arrow
     columns = set(schema.names)
-    for name in sorted(features.keys() - columns):
-        if name != "frame_index" or name not in unlisted:  # LeRobot never reads it
-            yield "broken", f"the column {name} is missing"
-    for name in sorted(columns - features.keys()):
-        yield "look", f"the column {name} is not in info.json"
+    may_lack = {"frame_index"} & set(unlisted)  # LeRobot never reads it
+    if missing := sorted(features.keys() - columns - may_lack):
+        yield "broken", f"info.json has {', '.join(missing)}, the table does not"
+    if surplus := sorted(columns - features.keys()):
+        yield "look", f"the table has {', '.join(surplus)}, info.json does not"
     for name in sorted(columns & features.keys()):
         kind, feature = schema.field(name).type, features[name]
         fit = _fits(kind, feature)
@@ -262,20 +281,24 @@ def video_format(evidence: Evidence) -> Iterator[Fault]:
     for key in folder.info.video_keys:
         feature = folder.info.features[key]
         stated = _stated_format(feature)
+        found: dict[tuple[str, Any], list[str]] = {}
         for path in dict.fromkeys(place.videos[key][0] for place in folder.listed):
             for quantity, value in _found_format(path, folder).items():
-                if quantity == "fps" and abs(value - folder.info.fps) > _RATE_TOLERANCE * folder.info.fps:
-                    yield Fault(
-                        severity="broken",
-                        message=f"{key}: {path.name} has {value:.4g} fps, info.json {folder.info.fps}",
-                        do="set fps of meta/info.json to the recorded rate, or encode the video again",
-                    )
-                elif quantity in stated and stated[quantity] != value:
-                    yield Fault(
-                        severity="broken" if quantity in ("height", "width") else "look",
-                        message=f"{key}: {quantity} of {path.name} is {value}, info.json states {stated[quantity]}",
-                        do=_BY_HAND if quantity == "sound" else "",
-                    )
+                found.setdefault((quantity, value), []).append(path.name)
+        for (quantity, value), names in found.items():
+            files = names[0] + (f" and {len(names) - 1} more" if len(names) > 1 else "")
+            if quantity == "fps" and abs(value - folder.info.fps) > _RATE_TOLERANCE * folder.info.fps:
+                yield Fault(
+                    severity="broken",
+                    message=f"{key}: the rate of {files} is {value:.4g} fps, info.json states {folder.info.fps}",
+                    do="set fps of meta/info.json to the recorded rate, or encode the video again",
+                )
+            elif quantity in stated and stated[quantity] != value:
+                yield Fault(
+                    severity="broken" if quantity in ("height", "width") else "look",
+                    message=f"{key}: {quantity} of {files} is {value}, info.json states {stated[quantity]}",
+                    do=_BY_HAND if quantity == "sound" else "",
+                )
         yield from _info_against_itself(key, feature, folder)
 
 
