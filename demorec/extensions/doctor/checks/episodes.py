@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 
@@ -9,7 +10,8 @@ import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.evidence import DROP, Evidence
+from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
+from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.scores import score_episodes
 from demorec.extensions.doctor.units import moving_elements, other_units
@@ -48,14 +50,17 @@ MIN_LENGTH_TIMES = 3.0
     do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
 )
 def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes that end during a motion, where nearly all others end at rest."""
+    """Find episodes that end during a motion, where nearly all others end at rest.
+
+    The target must move, too: an arm reaches it tenths of a second later.
+    """
     speeds: dict[int, float] = {}
     count = max(2, round(END_S * evidence.fps))
     for episode, state in evidence.need_state(3 * count):
-        speed = _arm_speed(evidence, state)
-        size = float(np.sqrt((speed**2).mean()))
-        if size > 0:
-            speeds[episode.number] = float(speed[-count:].mean()) / size
+        speed = _end_speed(evidence, state, count)
+        if speed < math.inf:
+            target = _target(evidence, episode, state)
+            speeds[episode.number] = min(speed, _end_speed(evidence, target, count))
     if len(speeds) <= MIN_OTHERS:
         raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
     at_rest = sum(each < MAX_REST_SPEED for each in speeds.values()) / (len(speeds) - 1)  # of the others
@@ -67,6 +72,26 @@ def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
                 value=f"{end_speed:.0%}",
                 message=f"it ends while the arm moves at {end_speed:.0%} of its speed; {at_rest:.0%} end at rest",
             )
+
+
+def _end_speed(evidence: Evidence, values: Array, count: int) -> float:
+    """Compute the speed in the last frames, relative to the root mean square; infinite without any motion."""
+    speed = _arm_speed(evidence, values)
+    size = float(np.sqrt((speed**2).mean()))
+    return float(speed[-count:].mean()) / size if size > 0 else math.inf
+
+
+def _target(evidence: Evidence, episode: EpisodeEvidence, state: Array) -> Array:
+    """Return the (T, D) targets of the state's elements; the state itself where there are none."""
+    try:
+        if episode.action is None or evidence.once(relation_of).kind != "target":
+            return state
+    except NotMeasuredError:
+        return state
+    pairs = [(element, column) for element, column in enumerate(evidence.action_of) if column is not None]
+    found = state.copy()
+    found[:, [element for element, _ in pairs]] = episode.action[:, [column for _, column in pairs]]
+    return found
 
 
 def _arm_speed(evidence: Evidence, state: Array) -> Array:
