@@ -15,7 +15,7 @@ STAMP := .venv/.stamp-$(PYBULLET)
 # Containers often set this; every process would then compile LeRobot's and PyTorch's modules again, for 10 s each.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo sample test test-slow test-ci test-long setup lint docs constraints clean
+.PHONY: demo sample test test-slow test-long setup lint docs constraints clean
 
 demo: $(STAMP)
 	@echo "Generating five episodes into $(DEMO)"
@@ -35,11 +35,6 @@ test: $(STAMP)
 test-slow: $(STAMP)
 	$(BIN)/pytest -m "slow and not long" $(IN_PARALLEL) --ignore tests/crash/test_ray.py
 	$(BIN)/pytest -m "slow and not long" $(ALONE)
-
-# Both at once, as .ci/run does: quick and slow tests of a file share what they are made from.
-test-ci: $(STAMP)
-	$(BIN)/pytest -m "not long" $(IN_PARALLEL) --ignore tests/crash/test_ray.py
-	$(BIN)/pytest -m "not long" $(ALONE)
 
 # Before a release: what takes longest, or is more of what test-slow does.
 test-long: $(STAMP)
