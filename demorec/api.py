@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from demorec.core.errors import RecordingError as RecordingError
     from demorec.core.errors import SceneError as SceneError
     from demorec.core.extension import CommandRow as CommandRow
+    from demorec.core.extension import ExporterRow as ExporterRow
     from demorec.core.extension import Extension as Extension
     from demorec.core.extension import ReaderRow as ReaderRow
     from demorec.core.geometry import Pose as Pose
@@ -175,6 +176,7 @@ GROUPS: Mapping[str, Mapping[str, str]] = {
     "Write an extension": {
         "Extension": "demorec.core.extension",
         "CommandRow": "demorec.core.extension",
+        "ExporterRow": "demorec.core.extension",
         "ReaderRow": "demorec.core.extension",
         "Exporter": "demorec.datasets.options",
         "CommonOptions": "demorec.datasets.options",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from demorec.core.extension import CommandRow, Extension
+from demorec.core.extension import CommandRow, ExporterRow, Extension
 
 
 def _checks(module: str, *names: str) -> dict[str, str]:
@@ -55,7 +55,7 @@ EXTENSION = Extension(
         "tiny": "demorec.sim.renderers:TinyRenderer",
         "egl": "demorec.sim.renderers:EglRenderer",
     },
-    exporters={"lerobot": "demorec.datasets.lerobot.options:LEROBOT"},
+    exporters={"lerobot": ExporterRow(target="demorec.datasets.lerobot.options:LEROBOT")},
     file_checks={
         **_checks("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps"),
         **_checks("file", "video_frames", "missing_images", "images_decode"),

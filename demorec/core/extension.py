@@ -79,6 +79,23 @@ class ReaderRow:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ExporterRow:
+    """A format for exporting recordings.
+
+    Attributes:
+        target: "module:name" of a `demorec.datasets.options.Exporter`.
+        name: Noun for a result, "a folder of tables", for a kind that neither the core nor a reader knows.
+        suffixes: File suffixes of such a kind.
+        mark: File in a folder of such a kind.
+    """
+
+    target: str
+    name: str = ""
+    suffixes: tuple[str, ...] = ()
+    mark: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
 class Extension:
     """Everything an extension adds.
 
@@ -93,7 +110,7 @@ class Extension:
         cameras: Name -> `demorec.render.cameras.CameraPreset`.
         objects: Name -> `demorec.objects.shelf.Shelf`.
         renderers: Name -> class with the methods of `demorec.render.Renderer`.
-        exporters: Name -> `demorec.datasets.options.Exporter`.
+        exporters: Name -> format for exporting recordings.
         file_checks: Name -> `demorec.check.base.Check` of the integrity of recordings, runs and their datasets.
         checks: Name -> check of any dataset, for the extension that judges datasets.
         operations: Name -> command of `demorec dataset`, for the extension that edits datasets.
@@ -115,7 +132,7 @@ class Extension:
     cameras: Rows = field(default_factory=_no_rows)
     objects: Rows = field(default_factory=_no_rows)
     renderers: Rows = field(default_factory=_no_rows)
-    exporters: Rows = field(default_factory=_no_rows)
+    exporters: Mapping[str, ExporterRow] = field(default_factory=dict)
     file_checks: Rows = field(default_factory=_no_rows)
     checks: Rows = field(default_factory=_no_rows)
     operations: Rows = field(default_factory=_no_rows)

@@ -14,7 +14,7 @@ from functools import cache
 from importlib.metadata import entry_points
 from typing import Any
 
-from demorec.core.extension import CommandRow, Extension, ReaderRow
+from demorec.core.extension import CommandRow, ExporterRow, Extension, ReaderRow
 
 ENTRY_POINTS = "demorec.extensions"
 """Entry point group of other packages, and package of demorec's own extensions."""
@@ -111,6 +111,11 @@ def command_rows() -> dict[str, CommandRow]:
 def reader_rows() -> dict[str, ReaderRow]:
     """Kind of path -> its reader."""
     return dict(rows_of("readers"))
+
+
+def exporter_rows() -> dict[str, ExporterRow]:
+    """Name -> format for exporting recordings."""
+    return dict(rows_of("exporters"))
 
 
 @cache

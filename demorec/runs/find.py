@@ -9,14 +9,15 @@ from __future__ import annotations
 import os
 import shlex
 import stat
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import BinaryIO
 
 from demorec.core.errors import ConfigError, resource_error
-from demorec.core.extensions import reader_rows
+from demorec.core.extension import ExporterRow, ReaderRow
+from demorec.core.extensions import exporter_rows, reader_rows
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
 from demorec.core.replacing import shown
 from demorec.core.targets import is_utf8
@@ -25,7 +26,7 @@ from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHE
 
 PathKind = str
 """Kind of a path: "recording", "unfinished", "rrd", "run", "evaluation", "dataset", "recordings" (a folder of them that
-is not a run), "hdf5", "rosbag", the kind of an extension's reader, "nothing" or "unreadable"."""
+is not a run), "hdf5", "rosbag", the kind of an extension's reader or exporter, "nothing" or "unreadable"."""
 
 EPISODE_FOLDERS: tuple[PathKind, ...] = ("run", "recordings", "evaluation")
 """Kinds that hold recordings, directly or in episodes/ and failed/."""
@@ -148,6 +149,8 @@ def import_word(kind: PathKind) -> str:
 def _words(kind: PathKind) -> tuple[str, str]:
     """Noun for a kind in a sentence, and advice if the kind was not expected."""
     row = reader_rows().get(kind)
+    if row is None and kind not in _WORDS:
+        return exporter_rows()[kind].name, "; name the run that it was made from"
     if row is None or (kind in _WORDS and not row.advice):
         return _WORDS[kind]
     return row.name, f"; {row.advice}" if row.advice else ""
@@ -189,7 +192,8 @@ def _file(path: Path) -> Found:
         head = file.read(max(len(magic) for magic, _ in _MAGICS))
         kind: PathKind | None = "rosbag" if path.name.endswith(BAG_SUFFIXES) else _SUFFIXES.get(path.suffix)
         if kind is None:
-            kind = next((kind for kind, row in reader_rows().items() if path.name.endswith(row.suffixes)), None)
+            rows: Mapping[PathKind, ExporterRow | ReaderRow] = {**exporter_rows(), **reader_rows()}
+            kind = next((kind for kind, row in rows.items() if path.name.endswith(row.suffixes)), None)
         if kind != "unfinished":
             kind = next((kind for magic, kind in _MAGICS if head.startswith(magic)), kind)
         if kind == "recording" and _is_foreign(file):
@@ -217,8 +221,8 @@ def _is_foreign(file: BinaryIO) -> bool:
 
 def _folder(path: Path) -> Found:
     entries = [entry.name for entry in path.iterdir()]
-    kind = next((kind for name, kind in _MARKS if _is_there(path / name)), None)
-    if kind in ("dataset", "rosbag"):
+    kind = next((kind for name, kind in _MARKS if _is_there(path / name)), exported_kind(path))
+    if kind in ("dataset", "rosbag") or kind in exporter_rows():
         return Found(path=path, kind=kind)
     here = _recordings_in(path) if kind is None else ()
     if kind is None and _holds_bags(path, here):
@@ -237,6 +241,11 @@ def _folder(path: Path) -> Found:
     if kind is None and not recordings and not failed:
         return replace(found, kind="nothing", reason=_nothing_in(found, entries))
     return found
+
+
+def exported_kind(folder: Path) -> PathKind | None:
+    """Return the format of which a folder is an export, by its mark; None if it has none."""
+    return next((name for name, row in exporter_rows().items() if row.mark and _is_there(folder / row.mark)), None)
 
 
 def _holds_bags(path: Path, recordings: Sequence[Path]) -> bool:

@@ -14,6 +14,7 @@ from support.recording import write_episode
 
 from demorec.cli import COMMANDS
 from demorec.core.errors import ConfigError
+from demorec.core.extension import ExporterRow
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.find import PathKind, expect, find
 
@@ -67,6 +68,18 @@ ODD: tuple[tuple[Callable[[Path], None], str], ...] = (
     (make_nothing, "No such file or folder"),
     (make_hdf5, "Expected a r"),
 )
+
+
+@pytest.mark.parametrize("name", ["a/tables.json", "a.tab"])
+def test_an_export_is_known_by_its_mark_or_suffix(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    row = ExporterRow(target="tables:TABLES", name="tables", suffixes=(".tab",), mark="tables.json")
+    monkeypatch.setattr("demorec.runs.find.exporter_rows", lambda: {"tab": row})
+    (tmp_path / "a").mkdir()
+    (tmp_path / name).write_text("1")
+    path = tmp_path / name.partition("/")[0]
+    assert find(path).kind == "tab"
+    with pytest.raises(ConfigError, match="found tables; name the run that it was made from"):
+        expect(path, "run")
 
 
 def test_every_command_is_tried() -> None:

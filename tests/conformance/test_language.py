@@ -313,8 +313,9 @@ def test_episodes_are_filtered_by_facts(runs: list[Path], dataset: Path) -> None
     from lerobot.datasets import LeRobotDataset
 
     meta = LeRobotDataset("local/all", root=dataset).meta
-    several = meta.filter_episodes(lambda e: e["num_goals"] > 1 and e["success"])
-    assert [TASKS.names()[index] for index in several] == ["stack_three", "sort_by_color", "line_up"]
+    several = {TASKS.names()[i] for i in meta.filter_episodes(lambda e: e["num_goals"] > 1 and e["success"])}
+    assert several >= {"stack_three", "sort_by_color", "line_up"}
+    assert several.isdisjoint({"pick_place", "place_in_tray", "stack", "unstack"})
     missed = meta.filter_episodes(lambda e: e["has_deliberate_miss"] and e["num_retries"] == 1)
     assert {TASKS.names()[index] for index in missed} == set(MISSING)
     for run, row in zip(runs, episode_rows(dataset), strict=True):

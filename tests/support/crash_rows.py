@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from demorec.cli import main
+from demorec.core.tables import EXPORTERS
 from support.export import export, make_run
 
 SLOW = (pytest.mark.slow,)
@@ -119,18 +120,16 @@ ROWS = {
         old="view SOURCES/reversed --episodes 0:2 --save new.rrd",
         surprise="new-0001.rrd",
     ),
-    "export lerobot": Row(
-        call="export lerobot SOURCES/run --no-verify --out new",
-        targets=("new",),
-        old="export lerobot SOURCES/run --episodes 1 --no-verify --out new",
-        runs=SLOW,
-    ),
-    "export hdf5": Row(
-        call="export hdf5 SOURCES/run --out new.hdf5",
-        targets=("new.hdf5",),
-        old="export hdf5 SOURCES/run --episodes 1 --out new.hdf5",
-        runs=SLOW,
-    ),
+    **{
+        f"export {name}": Row(
+            call=f"export {name} SOURCES/run --out new",
+            targets=("new",),
+            old=f"export {name} SOURCES/run --episodes 1 --out new",
+            program=without_lerobot,
+            runs=SLOW,
+        )
+        for name in EXPORTERS.names()
+    },
     "recover": Row(
         call="recover SOURCES/cut.mcap --out new.mcap",
         targets=("new.mcap",),

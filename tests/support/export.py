@@ -59,6 +59,7 @@ def feature_of(dataset: Path, name: str, exporter: str) -> tuple[NDArray[Any], l
     if exporter == "lerobot":
         rows = np.array(data_table(dataset).column(name).to_pylist(), dtype=np.float32)
         return rows.reshape(len(rows), -1), info(dataset)["features"][name]["names"]
+    assert exporter == "hdf5", f"feature_of in tests/support/export.py needs lines that read the format {exporter}"
     with h5py.File(dataset) as file:
         stored = file["data/demo_0/obs"][name.removeprefix("observation.")]
         return stored[()], json.loads(stored.attrs["names"])

@@ -15,7 +15,7 @@ from demorec.core.extensions import reader_rows
 from demorec.core.processes import terminate_as_interrupt
 from demorec.core.replacing import json_object, use_as_source
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
-from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, find
+from demorec.runs.find import EPISODE_FOLDERS, EVALUATION_NAME, exported_kind, find
 from demorec.runs.foreign import import_kind, opened
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED, load_any_run_file
 
@@ -93,7 +93,8 @@ def refuse_inside(targets: Iterable[Path]) -> None:
         for place in (resolved, *resolved.parents):
             whole = place.parent
             is_part = place.name in _PARTS and any((whole / name).is_file() for name in (RUN_NAME, EVALUATION_NAME))
-            if is_part or (place != resolved and DATASET_KIND.recognises(place)):
+            is_dataset = DATASET_KIND.recognises(place) or exported_kind(place) is not None
+            if is_part or (place != resolved and is_dataset):
                 raise ConfigError(
                     f"A new file inside {'a run' if is_part else 'a dataset'} would prevent it from being "
                     f"replaced: choose a path outside {place}: {target}"

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from demorec.core.extension import Extension
+from demorec.core.extension import ExporterRow, Extension
 
 EXTENSION = Extension(
     name="hdf5",
     summary="export HDF5 files in robomimic's layout",
-    exporters={"hdf5": "demorec.extensions.hdf5.options:HDF5"},
+    exporters={"hdf5": ExporterRow(target="demorec.extensions.hdf5.options:HDF5")},
 )

@@ -1,6 +1,6 @@
 """A third-party package that adds one item of every kind to demorec."""
 
-from demorec.api import CommandRow, Extension, ReaderRow
+from demorec.api import CommandRow, ExporterRow, Extension, ReaderRow
 
 EXTENSION = Extension(
     name="lab",
@@ -18,7 +18,7 @@ EXTENSION = Extension(
             importer="lab_extension.csv_files:import_files",
         )
     },
-    exporters={"labcsv": "lab_extension.csv_files:EXPORTER"},
+    exporters={"labcsv": ExporterRow(target="lab_extension.csv_files:EXPORTER")},
     tasks={"lab_pick": "lab_extension.scenes:LabPick"},
     robots={"lab_panda": "lab_extension.scenes:LAB_PANDA"},
     cameras={"corner": "lab_extension.scenes:CORNER"},
