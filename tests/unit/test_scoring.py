@@ -156,17 +156,6 @@ def test_sound_episodes_are_sound(scored: Any) -> None:
     assert all(episode["score"] > 0.8 and not episode["reasons"] for episode in found)
 
 
-def test_a_gripper_that_opens_less_far_is_switched_as_often(scored: Any) -> None:
-    def opens_halfway(rows: Rows) -> Rows:
-        """The command spans 0 to 0.6 instead of 0 to 1."""
-        action = rows["action"].copy()
-        action[:, -1] = np.interp(action[:, -1], [0, 1], [0.0, 0.6])
-        return {**rows, "action": action}
-
-    found = scored(opens_halfway)
-    assert not any("switched" in reason for reason in found[BAD]["reasons"])
-
-
 @pytest.fixture
 def late(tmp_path: Path) -> Path:
     """A dataset in which the actions of one episode are late."""

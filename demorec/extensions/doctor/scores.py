@@ -43,10 +43,10 @@ _QUANTITIES: Mapping[str, tuple[float, str]] = {
 _TWO_SIDED = ("duration", "lag", "switches")
 """Quantities for which less than usual is unusual as well."""
 _MIN_FRAMES = 8
-_MIN_TURN = 0.4
-"""Minimum change of a gripper's command that counts as a switch, as a ratio of its range in the episode."""
-_MIN_OPENING = 0.5
-"""Minimum of this range, as a ratio of that in the set: less is noise, or a hand that stays as it is."""
+_HIGH = 0.65
+"""Minimum of a gripper's high command, as a ratio of its range."""
+_LOW = 0.35
+"""Maximum of a gripper's low command, as a ratio of its range."""
 _STILL_RATIO = 0.08
 """Maximum speed of an arm at rest, relative to the episode's fast speed (its 90 % quantile)."""
 _STEADY = 0.02
@@ -222,20 +222,9 @@ def _roughness(values: Array) -> QuantityReading:
 
 
 def _switches(command: Array) -> list[int]:
-    """Return the frames at which a gripper's command (T,) has turned round by a large part of its own range.
-
-    How far a hand is opened or closed depends on the object and the operator.
-    """
-    least = _MIN_TURN * max(float(np.ptp(command)), _MIN_OPENING)
-    found: list[int] = []
-    low = high = float(command[0])
-    direction = 0
-    for frame, value in enumerate(command.tolist()):
-        low, high = min(low, value), max(high, value)
-        if direction <= 0 and value - low >= least:
-            direction, high = 1, value
-            found.append(frame)
-        elif direction >= 0 and high - value >= least:
-            direction, low = -1, value
-            found.append(frame)
-    return found
+    """Return the frames from which a gripper's command (T,) is at the other of two levels, low and high."""
+    level = np.where(command > _HIGH, 1, np.where(command < _LOW, 0, -1))
+    if level[0] < 0:
+        level[0] = int(command[0] > 0.5)
+    latest = np.maximum.accumulate(np.where(level >= 0, np.arange(len(level)), 0))  # between the levels it stays
+    return [int(frame) + 1 for frame in np.flatnonzero(np.diff(level[latest]))]
