@@ -61,8 +61,9 @@ def write(root: Path, episodes: list[Rows]) -> Path:
         "task_index": np.repeat([tasks.index(str(rows["task"])) for rows in episodes], lengths),
     }
     for name in ("state", "action"):
-        numbers = pa.array(np.concatenate([rows[name] for rows in episodes]).astype(np.float32).ravel())
-        columns["observation.state" if name == "state" else name] = pa.FixedSizeListArray.from_arrays(numbers, 3)
+        values = np.concatenate([rows[name] for rows in episodes]).astype(np.float32)
+        stored_rows = pa.FixedSizeListArray.from_arrays(pa.array(values.ravel()), values.shape[1])
+        columns["observation.state" if name == "state" else name] = stored_rows
     columns["index"] = np.arange(sum(lengths))
     pq.write_table(pa.table({name: columns[name] for name in kinds}), root / DATA)
     ends = np.cumsum(lengths)
@@ -73,7 +74,8 @@ def write(root: Path, episodes: list[Rows]) -> Path:
     pq.write_table(pa.table({"task": tasks, "task_index": np.arange(len(tasks))}), root / TASKS)
     info = json.loads((root / "meta/info.json").read_text())
     for name in ("observation.state", "action"):
-        info["features"][name]["names"] = ["shoulder.pos", "elbow.pos", "gripper.pos"]
+        names = ["shoulder.pos", "elbow.pos", "gripper.pos", *(f"left_joint{j}.pos" for j in range(values.shape[1] - 3))]
+        info["features"][name] |= {"names": names, "shape": [len(names)]}
     info |= {"total_frames": sum(lengths), "total_tasks": len(tasks)}
     (root / "meta/info.json").write_text(json.dumps(info))
     return root
@@ -106,6 +108,13 @@ def is_late(rows: Rows) -> Rows:
 
 def ends_early(rows: Rows) -> Rows:
     return _each(rows, lambda values: values[:38])
+
+
+def beside_a_resting_arm(rows: Rows, number: int) -> Rows:
+    """Add four joints at rest, of follower and leader, whose encoders flicker by a step."""
+    rng = np.random.default_rng((number, 1))
+    flicker = 0.001 * rng.integers(0, 2, (2, LENGTH, 4))
+    return {**rows, **{name: np.hstack([rows[name], more]) for name, more in zip(("state", "action"), flicker, strict=True)}}
 
 
 def lacks_numbers(rows: Rows) -> Rows:
@@ -154,6 +163,17 @@ def test_sound_episodes_are_sound(scored: Any) -> None:
     found = scored(None)
     assert [episode["episode"] for episode in found] == list(range(EPISODES_IN_ALL))
     assert all(episode["score"] > 0.8 and not episode["reasons"] for episode in found)
+
+
+def test_a_resting_arm_hides_no_damage(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    episodes = [demonstration(number) for number in range(EPISODES_IN_ALL)]
+    episodes[BAD] = shakes(episodes[BAD])
+    root = write(tmp_path / "d", [beside_a_resting_arm(rows, number) for number, rows in enumerate(episodes)])
+    exit_code("check", str(root), "--no-images", "--json")
+    found = {each["episode"]: each for each in json.loads(capsys.readouterr().out)["episodes"]}
+    assert found[BAD]["score"] < 0.5
+    assert any("the action shakes" in reason for reason in found[BAD]["reasons"])
+    assert all(each["score"] > 0.8 for number, each in found.items() if number != BAD)
 
 
 @pytest.fixture

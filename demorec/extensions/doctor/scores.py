@@ -22,6 +22,7 @@ from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import NORMAL
+from demorec.extensions.doctor.units import moving_elements
 
 MIN_EPISODES = 12
 """Minimum number of episodes with one instruction to compare them with each other; fewer are compared with the whole
@@ -144,7 +145,8 @@ def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
         motions[episode.number] = ArmMotion(state, acted)
     known = list(motions.values())
     ranges = ArmMotion(_range([motion.state for motion in known]), _range([motion.action for motion in known]))
-    found = {n: _readings(motion, ranges, evidence.is_gripper, evidence.fps) for n, motion in motions.items()}
+    arm = ~evidence.is_gripper & evidence.once(moving_elements) if known else ~evidence.is_gripper
+    found = {n: _readings(motion, ranges, arm, evidence.is_gripper, evidence.fps) for n, motion in motions.items()}
     for number, lag in _lags(evidence).items():
         found[number]["lag"] = QuantityReading(lag, 0, len(motions[number].state) - 1)
     return found
@@ -175,10 +177,10 @@ def _shares(values: Array, ranges: Array) -> Array:
 
 
 def _readings(
-    motion: ArmMotion, ranges: ArmMotion, is_gripper: NDArray[np.bool_], fps: float
+    motion: ArmMotion, ranges: ArmMotion, arm: NDArray[np.bool_], is_gripper: NDArray[np.bool_], fps: float
 ) -> dict[str, QuantityReading]:
-    state = _shares(motion.state[:, ~is_gripper], ranges.state[:, ~is_gripper])
-    action = _shares(motion.action[:, ~is_gripper], ranges.action[:, ~is_gripper])
+    state = _shares(motion.state[:, arm], ranges.state[:, arm])
+    action = _shares(motion.action[:, arm], ranges.action[:, arm])
     openings = _shares(motion.state[:, is_gripper], ranges.state[:, is_gripper])
     commands = _shares(motion.action[:, is_gripper], ranges.action[:, is_gripper])
     switches = sorted({frame for command in commands.T for frame in _switches(command)})
