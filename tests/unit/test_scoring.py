@@ -74,7 +74,8 @@ def write(root: Path, episodes: list[Rows]) -> Path:
     pq.write_table(pa.table({"task": tasks, "task_index": np.arange(len(tasks))}), root / TASKS)
     info = json.loads((root / "meta/info.json").read_text())
     for name in ("observation.state", "action"):
-        names = ["shoulder.pos", "elbow.pos", "gripper.pos", *(f"left_joint{j}.pos" for j in range(values.shape[1] - 3))]
+        more = [f"left_joint{joint}.pos" for joint in range(values.shape[1] - 3)]
+        names = ["shoulder.pos", "elbow.pos", "gripper.pos", *more]
         info["features"][name] |= {"names": names, "shape": [len(names)]}
     info |= {"total_frames": sum(lengths), "total_tasks": len(tasks)}
     (root / "meta/info.json").write_text(json.dumps(info))
@@ -113,8 +114,8 @@ def ends_early(rows: Rows) -> Rows:
 def beside_a_resting_arm(rows: Rows, number: int) -> Rows:
     """Add four joints at rest, of follower and leader, whose encoders flicker by a step."""
     rng = np.random.default_rng((number, 1))
-    flicker = 0.001 * rng.integers(0, 2, (2, LENGTH, 4))
-    return {**rows, **{name: np.hstack([rows[name], more]) for name, more in zip(("state", "action"), flicker, strict=True)}}
+    both = {name: np.hstack([rows[name], 0.001 * rng.integers(0, 2, (LENGTH, 4))]) for name in ("state", "action")}
+    return {**rows, **both}
 
 
 def lacks_numbers(rows: Rows) -> Rows:
