@@ -82,7 +82,8 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
 
     Images that no state explains are not evidence: the robot may be where no other episode was. The gain must be an
     outlier among those of usual episodes, since the states of similar episodes explain each other's images. All cameras
-    are of one take: an episode is not reported if its state explains the images of another camera as usual.
+    are of one take: an episode is not reported if its state explains the images of another camera as usual. A fit on a
+    few episodes is no proof, so a person should look.
     """
     judged = dict(_judged(evidence, MIN_TAKES))
     usual_bests = {camera: float(np.median([fit.best for fit in fits.values()])) for camera, fits in judged.items()}
@@ -102,7 +103,7 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
             is_other = explained > MIN_OTHER_RATIO * usual_best and gain > MIN_OTHER_GAIN * max(usual_gain, 1.0)
             if is_other and number not in confirmed:
                 yield Fault(
-                    severity="broken",
+                    severity="look",
                     episode=number,
                     value=f"{max(fit.best, 0):.0%}",
                     message=f"{camera} does not show the motion of this episode: its state explains "
