@@ -193,7 +193,7 @@ def sample_age(evidence: Evidence) -> Iterator[Fault]:
     do="read the robot at the rate of the frames, or record at the rate of the robot",
 )
 def held_samples(evidence: Evidence) -> Iterator[Fault]:
-    """Find states that change in every n-th frame only while the arm moves by ten encoder steps and more."""
+    """Find states that change only in every n-th frame while the arm moves by ten encoder steps and more."""
     periods: dict[int, int] = {}
     ticks = evidence.once(element_ticks)
     for episode, state in evidence.need_state(3 * MAX_PERIOD):
@@ -207,7 +207,7 @@ def held_samples(evidence: Evidence) -> Iterator[Fault]:
         yield Fault(
             severity="look",
             value=f"{period} frames",
-            message=f"the state changes in every {period} frames only: it is read at {evidence.fps / period:.3g} Hz",
+            message=f"the state changes only once in {period} frames: it is read at {evidence.fps / period:.3g} Hz",
         )
         return
     for number, period in held.items():
@@ -215,7 +215,7 @@ def held_samples(evidence: Evidence) -> Iterator[Fault]:
             severity="look",
             episode=number,
             value=f"{period} frames",
-            message=f"its state changes in every {period} frames only",
+            message=f"its state changes only once in {period} frames",
             do=DROP,
         )
 
