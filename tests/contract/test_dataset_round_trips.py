@@ -1,12 +1,9 @@
-"""An edit of a dataset and its inverse: `diff` finds no difference, sidecar files included."""
+"""An edit of a dataset and its inverse: `diff` finds no difference."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import pytest
 from support.export import export, make_run
 
@@ -21,7 +18,6 @@ from demorec.extensions.editing.write import write_plan
 pytestmark = pytest.mark.slow
 
 LENGTHS = (9, 7, 8, 6, 10)
-BOXES = "demorec/boxes/observation.images.front.json"
 
 
 @pytest.fixture(scope="module")
@@ -57,8 +53,10 @@ def round_trips(dataset: Path, at: Path, order: list[int], seed: int, share: flo
     assert not diff(dataset, back.root).is_reordered
     assert diff(dataset, moved.root).is_reordered == (order != sorted(order))
     named = written(rename(moved, {"action": "a", "observation.images.wrist": "w"}), at / "named")
-    lines = [(item.level, item.name, item.details.get("b")) for item in diff(dataset, named.root).differences]
-    assert sorted(lines) == [("features", "action", "a"), ("features", "observation.images.wrist", "w")]
+    names = {"action", "a", "observation.images.wrist", "w"}
+    assert {(item.level, item.name) for item in diff(dataset, named.root).differences} >= {
+        ("features", n) for n in names
+    }
     again = written(rename(named, {"a": "action", "w": "observation.images.wrist"}), at / "again")
     assert found(dataset, again.root) == []
     try:
@@ -73,23 +71,3 @@ def round_trips(dataset: Path, at: Path, order: list[int], seed: int, share: flo
 
 def test_one_round_trip(dataset: Path, tmp_path: Path) -> None:
     round_trips(dataset, tmp_path, [3, 0, 4, 2, 1], seed=1, share=0.4)
-
-
-def test_differences_of_boxes_are_named(dataset: Path, tmp_path: Path) -> None:
-    other = written(reorder(LeRobotFolder(dataset), order=[1, 0, 2, 3, 4]), tmp_path / "d").root
-    told: dict[str, Any] = json.loads((other / BOXES).read_text())
-    # Episode 1 of the other dataset is its episode 0; frame 4 follows the 7 frames of the first.
-    index = LENGTHS[1] + 4
-    shown = next(item for item in told["annotations"] if item["image_id"] == index)
-    lines = (other / BOXES).read_text().splitlines(keepends=True)
-    number = next(n for n, line in enumerate(lines) if line.startswith(f'{{"id": {shown["id"]}, "image_id"'))
-    before = json.dumps(shown["bbox"])
-    assert before in lines[number]
-    lines[number] = lines[number].replace(before, json.dumps([*np.array(shown["bbox"][:3]).tolist(), 1]))
-    (other / BOXES).write_text("".join(lines))
-    (one,) = diff(dataset, other).differences
-    assert (one.level, one.name, one.episodes, one.details["frames"]) == (
-        "rows", "boxes of observation.images.front", (0, 1), [4],
-    )  # fmt: skip
-    (other / BOXES).unlink()
-    assert found(dataset, other) == ["features: boxes of observation.images.front are not in B"]

@@ -1,29 +1,82 @@
-"""Differences between two LeRobot datasets: info, features, tasks, episodes, rows, images, statistics.
+"""Differences between two LeRobot datasets, level by level.
 
 The position of episodes does not count: their order, files, format version and task numbers. Episodes are matched by
-content (`content.py`), and those that are not bit-exact are compared (`compare.py`).
+content (`episode_content.py`), and those that are not bit-exact are compared row by row and image by image.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from demorec.datasets.lerobot.boxes import SeenByCamera
-from demorec.datasets.lerobot.episode_records import episode_columns, episode_facts
+import numpy as np
+from numpy.typing import NDArray
+
+from demorec.core.plain import listed
+from demorec.datasets.lerobot.depth import LARGEST_CODE
+from demorec.datasets.lerobot.episode_records import episode_columns
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.options import ProgressCallback
-from demorec.extensions.editing.compare import LEVELS, DiffEntry, EpisodeComparer, Folders
-from demorec.extensions.editing.content import TASK, ContentReader, EpisodeContent, Shared, matched
-from demorec.extensions.editing.statistics import episode_statistics_differences, renamed, statistics_differences
+from demorec.extensions.editing.episode_content import (
+    TASK,
+    ContentReader,
+    EpisodeContent,
+    matched,
+    numbers_in,
+    shared_features,
+)
 
+Level = Literal["info", "features", "tasks", "episodes", "rows", "images", "statistics"]
+LEVELS: tuple[Level, ...] = ("info", "features", "tasks", "episodes", "rows", "images", "statistics")
+_OF_CONTENT = ("episodes", "rows", "images")
+"""Levels on which a difference makes two episodes different."""
 _STORAGE = ("version", "chunks_size", "data_files_size_in_mb", "video_files_size_in_mb", "data_path", "video_path")
 _OLD_TOTALS = ("total_chunks", "total_videos")
-_FOLLOWS = frozenset(("episode_index", "num_frames", "length", "task", "tasks"))
-"""Columns of episodes that are compared elsewhere."""
+_COMPARED_ELSEWHERE = frozenset(("episode_index", "num_frames", "length", "duration_s", "task"))
+"""Columns of episodes that follow from their rows."""
+_OTHER_ROWS = ("missing", "extra", "length")
+"""Names of differences between episodes that change the rows of the whole dataset."""
+_POSITIONS = frozenset(("index", "episode_index", "task_index"))
+_TOLERANCE = 1e-6
+"""Of statistics, relative to the larger value or the feature's range: some writers sum in float32, by episode."""
+_MAX_TEXT = 120
+
+Pair = tuple[int | None, int | None]
+"""Numbers of an episode in A and in B; None if it is missing there."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiffEntry:
+    """A difference between datasets A and B.
+
+    Attributes:
+        level: Level of the difference.
+        name: Name of the field, feature or task.
+        text: Description of the difference.
+        episodes: The episodes that have it; empty if it concerns the whole dataset.
+    """
+
+    level: Level
+    name: str
+    text: str
+    episodes: tuple[Pair, ...] = ()
+
+    @property
+    def line(self) -> str:
+        """The difference as a line of text."""
+        if not self.episodes or None in self.episodes[0]:
+            return f"{self.level}: {self.text}"
+        numbers = [f"{a}{'' if a == b else f' (in B {b})'}" for a, b in self.episodes]
+        return f"{self.level}: episode{'s' * (len(numbers) > 1)} {listed(numbers, 8, ', ')}: {self.text}"
+
+    def to_json(self) -> dict[str, Any]:
+        """The difference as plain data."""
+        episodes = [list(pair) for pair in self.episodes]
+        return {"level": self.level, "name": self.name, "text": self.text, "episodes": episodes}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -33,14 +86,12 @@ class DatasetDiff:
     Attributes:
         pairs: Number of an episode in A -> its number in B.
         num_episodes: Number of episodes in A and in B.
-        num_same: Number of pairs with equal rows and images.
         differences: Differences sorted by level.
         notes: Differences that do not count: order, and storage.
     """
 
     pairs: Mapping[int, int]
     num_episodes: tuple[int, int]
-    num_same: int
     differences: tuple[DiffEntry, ...]
     notes: tuple[str, ...]
 
@@ -54,6 +105,12 @@ class DatasetDiff:
         """Whether episodes in both datasets have another order."""
         others = list(self.pairs.values())
         return others != sorted(others)
+
+    @property
+    def num_same(self) -> int:
+        """Number of pairs with equal rows and images."""
+        different = {pair for item in self.differences if item.level in _OF_CONTENT for pair in item.episodes}
+        return len(set(self.pairs.items()) - different)
 
     def to_json(self) -> dict[str, Any]:
         """The result as plain data."""
@@ -70,210 +127,254 @@ class DatasetDiff:
 
 
 def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetDiff:
-    """Compare two datasets of v3.0 or v2.1; holds one episode in memory, and some numbers for each.
+    """Compare two datasets of v2.0 to v3.0; holds one episode in memory, and some numbers for each.
 
     Raises:
         ExportError: A dataset is damaged.
     """
     sources = (LeRobotFolder(a), LeRobotFolder(b))
-    shared = Shared.of(*sources, renamed(*sources))
-    readers = (ContentReader(sources[0], shared, side=0), ContentReader(sources[1], shared, side=1))
-    contents = _contents(readers, progress)
-    pairs = matched(*contents)
-    changed = {n: m for n, m in pairs.items() if not contents[0][n].equals(contents[1][m])}
-    found: list[DiffEntry] = []
-    comparer = EpisodeComparer(sources, readers, shared)
-    for n, m in changed.items():
-        one, other = contents[0][n].images, contents[1][m].images
-        equal = {name: digest is not None and digest == other[name] for name, digest in one.items()}
-        found += comparer.differences(n, m, equal)
-    unmatched = [(n, None) for n in range(len(contents[0])) if n not in pairs]
-    others = set(pairs.values())
-    extra = [(None, m) for m in range(len(contents[1])) if m not in others]
-    found += [_one_sided(sources, episode) for episode in (*unmatched, *extra)]
-    found = [*_tasks(sources, found, [*unmatched, *extra]), *_info(sources), *_features(sources, shared),
-             *_facts(sources, pairs, contents), *_boxes(sources, shared, pairs)]  # fmt: skip
-    result = DatasetDiff(
-        pairs=pairs,
-        num_episodes=(len(contents[0]), len(contents[1])),
-        num_same=len(pairs) - len({item.episodes for item in found if item.level in ("episodes", "rows", "images")
-                                   and item.episodes is not None and None not in item.episodes}),
-        differences=(),
-        notes=(),
-    )  # fmt: skip
-    found += [*statistics_differences(sources, shared, found, is_reordered=result.is_reordered),
-              *episode_statistics_differences(sources, shared, found, pairs)]  # fmt: skip
-    found.sort(key=lambda item: LEVELS.index(item.level))
-    read = [f"{side}: {note}" for side, source in zip("AB", sources, strict=True) for note in source.notes]
-    return replace(result, differences=tuple(found), notes=(*read, *_notes(sources, result, found)))
-
-
-def _contents(
-    readers: tuple[ContentReader, ContentReader], progress: ProgressCallback | None
-) -> list[list[EpisodeContent]]:
-    total, done = sum(map(len, readers)), 0
-    found: list[list[EpisodeContent]] = []
-    for reader in readers:
-        found.append([])
-        for number in range(len(reader)):
-            found[-1].append(reader.read(number))
-            done += 1
+    readers = [ContentReader(source, shared_features(*sources)) for source in sources]
+    contents: list[list[EpisodeContent]] = [[], []]
+    total = sum(len(source.places) for source in sources)
+    for found, reader in zip(contents, readers, strict=True):
+        for number in range(len(reader.source.places)):
+            found.append(reader.content(number))
             if progress is not None:
-                progress(done, total)
-    return found
+                progress(sum(map(len, contents)), total)
+    pairs = matched(contents, readers)
+    entries = [*_info(*sources), *_features(*sources), *_unmatched(contents, pairs), *_unused_tasks(*sources)]
+    for n, m in pairs.items():
+        one, other = contents[0][n], contents[1][m]
+        if one != other or not one.is_known:
+            entries += _episode(readers, (n, m), (one, other))
+    entries += _episode_columns(sources, pairs, contents)
+    entries += _statistics(sources, entries)
+    entries.sort(key=lambda item: LEVELS.index(item.level))
+    result = DatasetDiff(
+        pairs=pairs, num_episodes=(len(contents[0]), len(contents[1])), differences=tuple(_joined(entries)), notes=()
+    )
+    return replace(result, notes=tuple(_notes(sources, result)))
 
 
-def _one_sided(sources: Folders, episode: tuple[int | None, int | None]) -> DiffEntry:
-    side = 0 if episode[1] is None else 1
-    number = episode[side]
-    assert number is not None
-    length = sources[side].places[number].length
-    name = "missing" if side == 0 else "extra"
-    return DiffEntry(level="episodes", name=name, episodes=episode, details={"frames": length},
-                      text=f"episode {number} of {'AB'[side]}, {length} frames, is not in {'BA'[side]}")  # fmt: skip
+def _joined(entries: Sequence[DiffEntry]) -> Iterator[DiffEntry]:
+    """Join the entries about several episodes with the same text."""
+    groups: dict[tuple[str, str, str], list[DiffEntry]] = {}
+    for item in entries:
+        groups.setdefault((item.level, item.name, item.text), []).append(item)
+    for group in groups.values():
+        yield replace(group[0], episodes=tuple(pair for item in group for pair in item.episodes))
 
 
-def _tasks(
-    sources: Folders,
-    found: Sequence[DiffEntry],
-    unmatched: Sequence[tuple[int | None, int | None]],
-) -> list[DiffEntry]:
-    """Differences so far, except those explained by a reworded task, plus differences in the tables of tasks."""
-    tables = tuple(set(source.tasks) for source in sources)
-    only = (tables[0] - tables[1], tables[1] - tables[0])
-    kept: list[DiffEntry] = []
-    reworded: dict[tuple[str, str], list[int]] = {}
-    for item in found:
-        pairs = item.details.get("texts", ()) if item.name == TASK and item.level == "rows" else ()
-        if pairs and all(x in only[0] and y in only[1] for x, y in pairs) and item.episodes is not None:
-            for pair in pairs:
-                reworded.setdefault(pair, []).append(item.episodes[0] or 0)
-        else:
-            kept.append(item)
-    for (x, y), episodes in sorted(reworded.items()):
-        kept.append(DiffEntry(level="tasks", name=x, text=f"{x!r} is {y!r} in B", details={"b": y, "of": episodes}))
-    for side in (0, 1):
-        explained = {pair[side] for pair in reworded}
-        for item in kept:
-            explained |= {texts[side] for texts in item.details.get("texts", ())}
-        for episode in unmatched:
-            if (number := episode[side]) is not None:
-                explained |= set(sources[side].places[number].tasks)
-        for task in sorted(only[side] - explained):
-            kept.append(DiffEntry(level="tasks", name=task, text=f"{task!r} is not in {'BA'[side]}"))
-    return kept
-
-
-def _info(sources: Folders) -> Iterator[DiffEntry]:
-    a, b = (source.info for source in sources)
-    others = [{name: value for name, value in info.other.items() if name not in _OLD_TOTALS} for info in (a, b)]
-    values = [{"fps": info.fps, "robot_type": info.robot_type, **other}
-              for info, other in zip((a, b), others, strict=True)]  # fmt: skip
-    yield from _fields("info", "", values)
-    claims = [info.total_tasks for info in (a, b)]
-    counts = [len(source.tasks) for source in sources]
-    if claims[0] - counts[0] != claims[1] - counts[1]:
-        text = f"total_tasks is {claims[0]} for {counts[0]} existing ones, in B {claims[1]} for {counts[1]}"
-        yield DiffEntry(level="info", name="total_tasks", text=text, details={"a": claims[0], "b": claims[1]})
-
-
-def _fields(level: Any, of: str, values: Sequence[Mapping[str, Any]]) -> Iterator[DiffEntry]:
-    """Differences between objects with the same names."""
-    a, b = values
+def _fields(level: Level, begin: str, a: Mapping[str, Any], b: Mapping[str, Any]) -> Iterator[DiffEntry]:
+    """Yield the differences between objects with the same names."""
     for name in dict.fromkeys((*a, *b)):
-        if name in a and name in b and _is_equal(a[name], b[name]):
-            continue
-        shown = [repr(side[name]) if name in side else "not there" for side in (a, b)]
-        shown = [text if len(text) <= 120 else f"{text[:120]}..." for text in shown]
-        text = f"{of}{name} is {shown[0]}, in B {shown[1]}"
-        yield DiffEntry(level=level, name=f"{of}{name}", text=text)
+        if name not in a or name not in b or not _is_equal(a[name], b[name]):
+            shown = [repr(side[name])[:_MAX_TEXT] if name in side else "missing" for side in (a, b)]
+            yield DiffEntry(level=level, name=f"{begin}{name}", text=f"{begin}{name} is {shown[0]}, in B {shown[1]}")
 
 
 def _is_equal(a: Any, b: Any) -> bool:
     return bool(a == b) or (a != a and b != b)
 
 
-def _features(sources: Folders, shared: Shared) -> Iterator[DiffEntry]:
-    a, b = (source.info.features for source in sources)
-    for name, other in shared.names.items():
-        yield DiffEntry(level="features", name=name, text=f"{name} is called {other} in B", details={"b": other})
-    for name in dict.fromkeys((*a, *(other for other in b if other not in shared.names.values()))):
-        own = shared.own(1, name)
-        if name not in a or own not in b:
-            yield DiffEntry(level="features", name=name, text=f"{name} is not in {'A' if name not in a else 'B'}")
-            continue
-        is_same_type = a[name].dtype == b[own].dtype
-        yield from _fields("features", f"{name}: ", [_described(item, is_same_type) for item in (a[name], b[own])])
-
-
-def _described(feature: DatasetFeature, with_encoding: bool) -> dict[str, Any]:
-    encoding = feature.info or {} if with_encoding else {}
-    return {"dtype": feature.dtype, "shape": feature.shape, "names": feature.names, **encoding}
-
-
-def _facts(
-    sources: Folders, pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
-) -> Iterator[DiffEntry]:
-    """Differences between the same episode's entries in the tables of episodes and demorec's sidecar."""
-    rows = [
-        [{**row, **facts} for row, facts in zip(episode_columns(source), episode_facts(source), strict=True)]
-        for source in sources
+def _info(a: LeRobotFolder, b: LeRobotFolder) -> Iterator[DiffEntry]:
+    fields = [
+        {"fps": info.fps, "robot_type": info.robot_type}
+        | {name: value for name, value in info.other.items() if name not in _OLD_TOTALS}
+        for info in (a.info, b.info)
     ]
-    names = [{name for row in side for name in row} - _FOLLOWS for side in rows]
+    yield from _fields("info", "", *fields)
+
+
+def _features(a: LeRobotFolder, b: LeRobotFolder) -> Iterator[DiffEntry]:
+    for name in dict.fromkeys((*a.info.features, *b.info.features)):
+        one, other = a.info.features.get(name), b.info.features.get(name)
+        if one is None or other is None:
+            yield DiffEntry(level="features", name=name, text=f"{name} is not in {'A' if one is None else 'B'}")
+            continue
+        described = [{"dtype": item.dtype, "shape": item.shape, "names": item.names} for item in (one, other)]
+        if one.dtype == other.dtype:
+            described = [entry | (item.info or {}) for entry, item in zip(described, (one, other), strict=True)]
+        yield from _fields("features", f"{name}: ", *described)
+
+
+def _unmatched(contents: Sequence[Sequence[EpisodeContent]], pairs: Mapping[int, int]) -> Iterator[DiffEntry]:
+    for side, known in enumerate((set(pairs), set(pairs.values()))):
+        for number, content in enumerate(contents[side]):
+            if number not in known:
+                pair = (number, None) if side == 0 else (None, number)
+                text = f"episode {number} of {'AB'[side]}, {content.length} frames, is not in {'BA'[side]}"
+                yield DiffEntry(level="episodes", name=("missing", "extra")[side], text=text, episodes=(pair,))
+
+
+def _unused_tasks(a: LeRobotFolder, b: LeRobotFolder) -> Iterator[DiffEntry]:
+    """Yield the tasks of one dataset that none of its episodes has; the others are compared by episode."""
+    for side, (source, other) in enumerate(((a, b), (b, a))):
+        used = {task for place in source.places for task in place.tasks}
+        for task in sorted(set(source.tasks) - set(other.tasks) - used):
+            yield DiffEntry(level="tasks", name=task, text=f"{task!r} is not in {'BA'[side]}")
+
+
+def _episode(
+    readers: Sequence[ContentReader], pair: tuple[int, int], contents: tuple[EpisodeContent, EpisodeContent]
+) -> Iterator[DiffEntry]:
+    """Yield the differences of rows and images; ExportError if data cannot be read."""
+    a, b = (reader.columns(number) for reader, number in zip(readers, pair, strict=True))
+    lengths, begins, count = [content.length for content in contents], (0, 0), contents[0].length
+    cameras = readers[0].cameras
+    if lengths[0] != lengths[1]:
+        where, begins, count = _common_part(a, b)
+        text = f"{lengths[0]} frames, {lengths[1]} in B: {where}"
+        yield DiffEntry(level="episodes", name="length", text=text, episodes=(pair,))
+    for name in a if lengths[0] == lengths[1] else ():
+        if name not in cameras and (found := _row_entry(name, a[name], b[name], pair, readers[0].source)):
+            yield found
+    one, other = (content.parts for content in contents)
+    for name in cameras if count else ():
+        if one[name] is None or one[name] != other[name]:
+            yield from _images(readers, name, pair, begins, count)
+
+
+def _common_part(a: Mapping[str, NDArray[Any]], b: Mapping[str, NDArray[Any]]) -> tuple[str, tuple[int, int], int]:
+    """Find the rows of the shorter episode in the longer one: a sentence, their first frames in A and B, and count."""
+    rows = [np.hstack([np.zeros((len(c[TASK]), 0)), *numbers_in(c).values()]) for c in (a, b)]
+    is_cut = len(rows[1]) < len(rows[0])
+    long, short = rows if is_cut else rows[::-1]
+    if not short.size:
+        return "they have no rows to compare", (0, 0), 0
+    for start in np.flatnonzero((long[: len(long) - len(short) + 1] == short[0]).all(axis=1)).tolist():
+        if np.array_equal(long[start : start + len(short)], short):
+            names = "BA" if is_cut else "AB"
+            where = f"{names[0]} has frames {start} to {start + len(short) - 1} of {names[1]}"
+            return where, (start, 0) if is_cut else (0, start), len(short)
+    return "their rows differ", (0, 0), 0
+
+
+def _row_entry(name: str, a: NDArray[Any], b: NDArray[Any], pair: Pair, source: LeRobotFolder) -> DiffEntry | None:
+    """Describe the difference between the values of a column, None if they are equal."""
+    is_number = a.dtype.kind in "fiub" and b.dtype.kind in "fiub"
+    unequal = a != b
+    if is_number:
+        unequal &= ~(np.isnan(a.astype(np.float64)) & np.isnan(b.astype(np.float64)))
+    frames = np.flatnonzero(unequal.any(axis=1))
+    if not len(frames):
+        return None
+    if name == TASK and len(np.unique(a)) == len(np.unique(b)) == 1:
+        text = f"{str(a[0, 0])!r} is {str(b[0, 0])!r} in B"
+        return DiffEntry(level="tasks", name=str(a[0, 0]), text=text, episodes=(pair,))
+    first = int(frames[0])
+    text = f"{name} differs in {len(frames)} of {len(a)} frames, first in frame {first}"
+    if name == TASK:
+        text += f": {str(a[first, 0])!r} and {str(b[first, 0])!r}"
+    elif is_number:
+        error = np.abs(a.astype(np.float64) - b.astype(np.float64))
+        error = np.where(unequal, np.nan_to_num(error, nan=np.inf, posinf=np.inf), -1.0)
+        frame, element = (int(place) for place in np.unravel_index(error.argmax(), error.shape))
+        names = source.info.features[name].names or ()
+        called = f" ({names[element] if len(names) == a.shape[1] else element})" if a.shape[1] > 1 else ""
+        text += f", most in frame {frame}{called}: {a[frame, element].item()!r} and {b[frame, element].item()!r}"
+    return DiffEntry(level="rows", name=name, text=text, episodes=(pair,))
+
+
+def _images(
+    readers: Sequence[ContentReader], name: str, pair: tuple[int, int], begins: tuple[int, int], count: int
+) -> Iterator[DiffEntry]:
+    """Yield the difference between the decoded images of a camera, from the frames `begins` on."""
+    is_depth = [reader.source.info.features[name].is_depth for reader in readers]
+    if is_depth[0] != is_depth[1]:
+        return  # reported on the level of features
+    decoded = [reader.images(name, *place) for reader, *place in zip(readers, pair, begins, strict=True)]
+    found: list[tuple[float, int]] = []
+    for frame, (a, b) in enumerate(islice(zip(*decoded, strict=False), count), start=begins[0]):
+        if a.shape != b.shape:
+            text = f"{name} has {a.shape[1]}x{a.shape[0]} pixels, {b.shape[1]}x{b.shape[0]} in B"
+            yield DiffEntry(level="images", name=name, text=text, episodes=(pair,))
+            return
+        if not np.array_equal(a, b):
+            found.append((_psnr_db(a, b, LARGEST_CODE if is_depth[0] else 255), frame))
+    if found:
+        (psnr_db, worst), first = min(found), found[0][1]
+        text = f"{name} differs in {len(found)} of {count} images, first in frame {first}"
+        text += f", most in frame {worst} (PSNR {psnr_db:.1f} dB)"
+        yield DiffEntry(level="images", name=name, text=text, episodes=(pair,))
+
+
+def _psnr_db(a: NDArray[Any], b: NDArray[Any], peak: int) -> float:
+    """PSNR of two images that differ."""
+    error = a.astype(np.float64) - b.astype(np.float64)
+    return float(10 * np.log10(peak**2 / np.mean(error * error)))
+
+
+def _episode_columns(
+    sources: Sequence[LeRobotFolder], pairs: Mapping[int, int], contents: Sequence[Sequence[EpisodeContent]]
+) -> Iterator[DiffEntry]:
+    """Yield the differences between the entries of the same episode in the table of episodes and the sidecar."""
+    a, b = (episode_columns(source) for source in sources)
+    names = [{name for row in rows for name in row} - _COMPARED_ELSEWHERE for rows in (a, b)]
     for name in sorted(names[0] ^ names[1]):
         side = 0 if name in names[0] else 1
-        if any(row.get(name) is not None for row in rows[side]):
+        if any(row.get(name) is not None for row in (a, b)[side]):
             yield DiffEntry(level="episodes", name=name, text=f"the column {name} is not in {'BA'[side]}")
-    is_same_rate = sources[0].info.fps == sources[1].info.fps
     for n, m in pairs.items():
-        one, other = rows[0][n], rows[1][m]
-        if one["tasks"] != other["tasks"] and contents[0][n].rows[TASK] == contents[1][m].rows[TASK]:
-            text = f"its tasks are {one['tasks']} in the table of episodes, {other['tasks']} in B"
-            yield DiffEntry(level="episodes", name="tasks", text=text, episodes=(n, m))
-        is_same_length = one["length"] == other["length"] and is_same_rate
-        for name in sorted(names[0] & names[1] - (set() if is_same_length else {"duration_s"})):
-            if not _is_equal(one.get(name), other.get(name)):
-                text = f"{name} is {one.get(name)!r}, in B {other.get(name)!r}"
-                yield DiffEntry(level="episodes", name=name, text=text, episodes=(n, m))
+        shared = names[0] & names[1]
+        if contents[0][n].parts.get(TASK) != contents[1][m].parts.get(TASK):
+            shared -= {"tasks"}
+        one, other = ({name: row.get(name) for name in sorted(shared)} for row in (a[n], b[m]))
+        for item in _fields("episodes", "", one, other):
+            yield DiffEntry(level="episodes", name=item.name, text=item.text, episodes=((n, m),))
 
 
-def _boxes(sources: Folders, shared: Shared, pairs: Mapping[int, int]) -> Iterator[DiffEntry]:
-    """Differences between boxes of episodes with equal length."""
-    for name in shared.cameras:
-        one, other = (source.boxes(shared.own(side, name)) for side, source in enumerate(sources))
-        if (one is None) != (other is None):
-            text = f"boxes of {name} are not in {'AB'[other is None]}"
-            yield DiffEntry(level="features", name=f"boxes of {name}", text=text)
-        if one is None or other is None:
-            continue
-        for n, m in pairs.items():
-            lengths = [source.places[number].length for source, number in zip(sources, (n, m), strict=True)]
-            seen = [one.read(n, 0, lengths[0]), other.read(m, 0, lengths[0])]
-            if lengths[0] == lengths[1] and seen[0] != seen[1]:
-                frames = [frame for frame in range(lengths[0]) if _seen_at(seen[0], frame) != _seen_at(seen[1], frame)]
-                where = f" in {len(frames)} of {lengths[0]} frames, first in frame {frames[0]}" if frames else ""
-                yield DiffEntry(level="rows", name=f"boxes of {name}", episodes=(n, m), details={"frames": frames},
-                                 text=f"boxes of {name} differ{where}")  # fmt: skip
+def _statistics(sources: Sequence[LeRobotFolder], entries: Sequence[DiffEntry]) -> Iterator[DiffEntry]:
+    """Yield the differences of statistics for features with equal content; for others they are expected."""
+    a, b = (source.statistics if (source.root / STATS_PATH).exists() else {} for source in sources)
+    if any(source.info.is_old for source in sources) or any(item.name in _OTHER_ROWS for item in entries):
+        return
+    changed = {item.name.partition(":")[0] for item in entries if item.level in ("features", "rows", "images")}
+    for name in sources[0].info.features:
+        if name in sources[1].info.features and name not in (*_POSITIONS, *changed):
+            one, other = a.get(name, {}), b.get(name, {})
+            if wrong := _unequal(one, other):
+                text = f"{name} differs in {', '.join(wrong)}: {_worst(one, other, wrong[0])}"
+                yield DiffEntry(level="statistics", name=name, text=text)
 
 
-def _seen_at(seen: SeenByCamera | None, frame: int) -> list[Any]:
-    return [] if seen is None else [(noun, values) for row, noun, values in seen[2] if row == frame]
+def _unequal(a: Mapping[str, Any], b: Mapping[str, Any]) -> list[str]:
+    """List the statistics that differ by more than the rounding of a writer."""
+    low, high = _flat(a, "min"), _flat(a, "max")
+    wrong = []
+    for key in dict.fromkeys((*a, *b)):
+        x, y = _flat(a, key), _flat(b, key)
+        slack = _TOLERANCE * np.abs(high - low) if low.shape == high.shape == x.shape else 0.0
+        if x.shape != y.shape or not np.isclose(x, y, rtol=_TOLERANCE, atol=slack, equal_nan=True).all():
+            wrong.append(key)
+    return wrong
 
 
-def _notes(sources: Folders, result: DatasetDiff, found: Sequence[DiffEntry]) -> Iterator[str]:
+def _flat(entry: Mapping[str, Any], key: str) -> NDArray[np.float64]:
+    """(N,) numbers of a statistic; (0,) if it is missing or not numeric."""
+    try:
+        return np.asarray(entry.get(key, ()), dtype=np.float64).ravel()
+    except (ValueError, TypeError):
+        return np.zeros(0)
+
+
+def _worst(a: Mapping[str, Any], b: Mapping[str, Any], key: str) -> str:
+    """Describe the element of a statistic that differs most."""
+    x, y = _flat(a, key), _flat(b, key)
+    if x.shape != y.shape or not len(x):
+        shown = [str(entry[key])[:_MAX_TEXT] if key in entry else "missing" for entry in (a, b)]
+        return f"{key} is {shown[0]}, in B {shown[1]}"
+    place = int(np.nan_to_num(np.abs(x - y), nan=np.inf).argmax())
+    return f"{key}{f'[{place}]' if x.size > 1 else ''} is {x[place]:.7g}, in B {y[place]:.7g}"
+
+
+def _notes(sources: Sequence[LeRobotFolder], result: DatasetDiff) -> Iterator[str]:
     a, b = (source.info for source in sources)
+    for side, source in zip("AB", sources, strict=True):
+        yield from (f"{side}: {note}" for note in source.notes)
     if result.is_reordered:
         moved = [f"{n} is {m}" for n, m in result.pairs.items() if n != m]
-        more = f" and {len(moved) - 8} more" if len(moved) > 8 else ""
-        yield f"The same episodes in another order, A to B: {', '.join(moved[:8])}{more}."
-    keys = {key for item in found if item.level == "statistics" for key in item.details.get("of", ("all",))}
-    if keys and all(key.startswith("q") for key in keys):
-        yield "Only quantiles differ in the statistics: LeRobot estimates them, demorec computes them from the rows."
-    tasks = [source.tasks for source in sources]
-    if tasks[0] != tasks[1] and set(tasks[0]) == set(tasks[1]):
-        yield "The same tasks with other numbers."
-    if list(a.features) != list(b.features) and set(a.features) == set(b.features):
-        yield "The same features in another order."
+        yield f"The same episodes in another order, A to B: {listed(moved, 8, ', ')}."
     for name in _STORAGE:
         if getattr(a, name) != getattr(b, name):
             yield f"Stored differently: {name} is {getattr(a, name)}, in B {getattr(b, name)}."

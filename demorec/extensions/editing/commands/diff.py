@@ -32,8 +32,7 @@ class Diff:
     def run(self) -> int:
         """Compare and print the differences."""
         from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.extensions.editing.compare import LEVELS
-        from demorec.extensions.editing.diff import diff
+        from demorec.extensions.editing.diff import LEVELS, diff
 
         leave_pandas_out()
         a, b = dataset_at(self.a), dataset_at(self.b)
