@@ -21,6 +21,7 @@ import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -212,14 +213,12 @@ def train(data: Data, variant: Variant, args: argparse.Namespace, *, seed: int, 
     return seconds
 
 
-def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
+def measure(name: str, variant: Variant, dataset: Path, args: argparse.Namespace) -> dict[str, Any]:
     """Measure one row of the table."""
     from demorec.core.config import GenerateConfig
     from demorec.extensions.policies.rollouts import evaluate, settings_for
     from demorec.extensions.policies.statistics import Rate
 
-    variant = VARIANTS[name]
-    dataset = make_dataset(variant, args)
     data: Data | None = None
     results = []
     for seed in range(args.seeds):
@@ -250,10 +249,8 @@ def measure(name: str, args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
-def main() -> None:
-    """Measure the variants and print the table."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--variants", nargs="+", default=["base", "clean"], choices=list(VARIANTS))
+def options_of(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Add the flags of training and evaluation, and parse all."""
     parser.add_argument("--task", default="pick_place")
     parser.add_argument("--episodes", type=int, default=300)
     parser.add_argument("--steps", type=int, default=3000)
@@ -269,10 +266,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.out.mkdir(parents=True, exist_ok=True)
+    return args
+
+
+def report(variants: Iterable[tuple[str, Variant, Path]], args: argparse.Namespace) -> None:
+    """Measure name, variant and dataset of each row, and print the table."""
     rows = []
     print(f"{'variant':<18} {'success':>9} {'95 % interval':>16} {'train CPU s':>12}  about", flush=True)
-    for name in args.variants:
-        row = measure(name, args)
+    for name, variant, dataset in variants:
+        row = measure(name, variant, dataset, args)
         rows.append(row)
         interval = f"[{100 * row['low']:.0f}, {100 * row['high']:.0f}] %"
         print(
@@ -281,6 +283,13 @@ def main() -> None:
             flush=True,
         )
     (args.out / "learning.json").write_text(json.dumps(rows, indent=1))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--variants", nargs="+", default=["base", "clean"], choices=list(VARIANTS))
+    args = options_of(parser)
+    report(((name, VARIANTS[name], make_dataset(VARIANTS[name], args)) for name in args.variants), args)
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 
+_MEASURED = tuple(name for name in NAMES if name != "count")
 _RENUMBERED = ("index", "episode_index")
 """Columns that LeRobot's delete, split and merge renumber without updating the statistics."""
 MAX_ERROR = 0.02
@@ -81,7 +82,7 @@ def statistic_errors(
             continue  # without these numbers a comparison is impossible, and another check reports them
         ranges = [_quantile_ranges(each) for each in values]
         count = sum(len(rows[name]) for rows in episodes.values())
-        error, quantity = _largest_error(stats.get(name), np.concatenate(values), count, ranges)
+        [(error, quantity)] = _largest_errors([stats.get(name)], [np.concatenate(values)], [count], ranges)
         if error > MAX_ERROR:
             yield StatisticError(None, STATS_PATH, name, quantity, error)
 
@@ -92,16 +93,18 @@ def _of_episodes(
     entries = _old_entries(folder, names) if folder.info.is_old else _table_entries(folder, names)
     place = OLD_STATS if folder.info.is_old else "the table of episodes"
     for number, rows in episodes.items():
-        for name, stored in entries.get(number, {}).items():
-            if name not in rows:
-                continue
-            values = _vectors(folder, name, rows[name])
-            if not np.isfinite(values).all():
-                continue
-            error, quantity = _largest_error(stored, values, len(rows[name]), ())
-            if error > MAX_ERROR:
-                yield StatisticError(number, place, name, quantity, error)
-                break
+        stored = entries.get(number, {})
+        values = {name: _vectors(folder, name, rows[name]) for name in stored if name in rows}
+        values = {name: each for name, each in values.items() if np.isfinite(each).all()}
+        for length in {len(each) for each in values.values()}:
+            same = [name for name, each in values.items() if len(each) == length]
+            errors = _largest_errors(
+                [stored[name] for name in same], [values[name] for name in same], [len(rows[name]) for name in same], ()
+            )
+            for name, (error, quantity) in zip(same, errors, strict=True):
+                if error > MAX_ERROR:
+                    yield StatisticError(number, place, name, quantity, error)
+                    break
 
 
 def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
@@ -142,40 +145,49 @@ def _quantile_ranges(values: Array) -> Ranges:
     return ordered[np.clip([first_ranks, last_ranks], 0, last).astype(np.intp)]
 
 
-def _largest_error(
-    stored: Mapping[str, Any] | None, values: Array, count: int, episodes: Sequence[Ranges]
-) -> tuple[float, str]:
-    """Find the largest error of a feature's quantities in standard deviations, and its quantity.
+def _largest_errors(
+    stored: Sequence[Mapping[str, Any] | None],
+    values: Sequence[Array],
+    counts: Sequence[int],
+    episodes: Sequence[Ranges],
+) -> list[tuple[float, str]]:
+    """Find the largest error of each feature's quantities in standard deviations, and the quantity.
 
     Args:
-        stored: Quantity -> its numbers.
-        values: (N, D) rows.
-        count: Number of rows.
+        stored: Quantity -> its numbers, for each feature.
+        values: (N, D) rows of each feature, N the same for all: their columns are judged at once.
+        counts: Number of rows that each feature's count should have.
         episodes: Quantiles of the episodes; those of the set may be between them.
     """
-    if not stored:
-        return math.inf, "mean"
-    std = values.std(axis=0)
-    scale = np.maximum(std, MIN_DEVIATION)
-    bounds = _bounds(values, std, episodes)
-    worst = (0.0, "")
-    for quantity in NAMES:
-        found = numbers_of(stored.get(quantity))
-        if quantity not in stored and quantity in QUANTILES:
-            continue  # older writers have no quantiles
-        if quantity == "count":
-            error = float(np.abs(found - count).max(initial=0.0)) if len(found) else math.inf
-        elif found.shape != scale.shape:
-            error = math.inf
-        else:
-            low, high = bounds[quantity]
-            error = float((np.maximum(np.maximum(low - found, found - high), 0.0) / scale).max())
-        worst = max(worst, (error, quantity))
-    return worst
+    widths = [each.shape[1] for each in values]
+    entries = [entry or {} for entry in stored]
+    found = np.stack(
+        [np.concatenate([_stored(e, name, w) for e, w in zip(entries, widths, strict=True)]) for name in _MEASURED]
+    )
+    rows = np.hstack(values)
+    std = rows.std(axis=0)
+    low, high = _bounds(rows, std, episodes)
+    errors = np.maximum(np.maximum(low - found, found - high), 0.0) / np.maximum(std, MIN_DEVIATION)
+    errors = np.where(np.isfinite(errors), errors, math.inf)
+    largest = []
+    for entry, part, count in zip(entries, np.split(errors, np.cumsum(widths)[:-1], axis=1), counts, strict=True):
+        of_quantity = dict(zip(_MEASURED, part.max(axis=1).tolist(), strict=True))
+        counted = numbers_of(entry.get("count"))
+        of_quantity["count"] = float(np.abs(counted - count).max()) if len(counted) else math.inf
+        known = [name for name in NAMES if name in entry or name not in QUANTILES]  # older writers have no quantiles
+        worst = max(known, key=of_quantity.__getitem__)
+        largest.append((of_quantity[worst], worst))
+    return largest
 
 
-def _bounds(values: Array, std: Array, episodes: Sequence[Ranges]) -> Mapping[str, tuple[Array, Array]]:
-    """Compute quantity -> its (D,) minimum and maximum value, given the rounding of LeRobot's float32."""
+def _stored(entry: Mapping[str, Any], quantity: str, width: int) -> Array:
+    """Return the (D,) numbers of a quantity; NaN if they are missing or have another length."""
+    found = numbers_of(entry.get(quantity))
+    return found if found.shape == (width,) else np.full(width, np.nan)
+
+
+def _bounds(values: Array, std: Array, episodes: Sequence[Ranges]) -> tuple[Array, Array]:
+    """Compute the minimum and maximum value (Q, D) of each quantity, given the rounding of LeRobot's float32."""
     low, high = values.min(axis=0), values.max(axis=0)
     mean, variance = values.mean(axis=0), std**2
     float32 = float(np.finfo(np.float32).eps)
@@ -184,13 +196,14 @@ def _bounds(values: Array, std: Array, episodes: Sequence[Ranges]) -> Mapping[st
     width = (high - low) / 5000  # LeRobot reads quantiles off a histogram of 5,000 bins
     ranges = np.stack([_quantile_ranges(values), *episodes])
     lowest, highest = ranges[:, 0].min(axis=0) - width, ranges[:, 1].max(axis=0) + width
-    return {
+    bounds = {
         "min": (low - 4 * float32 * np.abs(low), low + 4 * float32 * np.abs(low)),
         "max": (high - 4 * float32 * np.abs(high), high + 4 * float32 * np.abs(high)),
         "mean": (mean - slack, mean + slack),
         "std": (np.sqrt(np.maximum(variance - variance_slack, 0.0)), np.sqrt(variance + variance_slack)),
         **{name: (lowest[place], highest[place]) for place, name in enumerate(QUANTILES)},
     }
+    return np.stack([bounds[name][0] for name in _MEASURED]), np.stack([bounds[name][1] for name in _MEASURED])
 
 
 def numbers_of(value: Any) -> Array:
