@@ -320,9 +320,8 @@ def test_episodes_are_filtered_by_facts(runs: list[Path], dataset: Path) -> None
     assert {TASKS.names()[index] for index in missed} == set(MISSING)
     for run, row in zip(runs, episode_rows(dataset), strict=True):
         with _recording(run) as recording:
-            info, outcome = recording.info, recording.outcome
+            info = recording.info
             assert row["duration_s"] == recording.num_frames / info.fps
-        assert outcome is not None
         body = info.simulated.scene.body(info.simulated.scene.goals[0].object)
         assert (row["task_name"], row["seed"], row["split"], row["variation"]) == (
             info.simulated.task,
@@ -331,11 +330,6 @@ def test_episodes_are_filtered_by_facts(runs: list[Path], dataset: Path) -> None
             "mild",
         )
         assert (row["object_x"], row["object_y"]) == tuple(body.world_from_body.position[:2])
-        assert row["drawn/speed"] == info.simulated.behaviour["speed"]
-        assert row["drawn/object_mass"] == body.mass
-        found = [check.value for check in outcome.checks if check.name.split(":")[0] == "tilt"]
-        assert row["success_checks/tilt"] == max(found)
-        assert (row["success_checks/distance_to_goal"] is None) == (info.simulated.task == "tutorial")
 
 
 @pytest.mark.slow

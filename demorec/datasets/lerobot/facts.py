@@ -14,7 +14,6 @@ are:
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import chain, pairwise
@@ -30,8 +29,6 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import open_table, rows_in
 
 if TYPE_CHECKING:
-    from demorec.episode.episode import SuccessCheck
-    from demorec.episode.info import Simulation
     from demorec.episode.scene import Scene
     from demorec.mcap import Recording
 
@@ -125,7 +122,7 @@ def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
 def episode_facts(recording: Recording) -> dict[str, Any]:
     """Return fact -> value for an episode with a scene; positions in the world frame at the start, metres."""
     info, outcome, simulation = recording.info, recording.outcome, recording.info.simulated
-    facts: dict[str, Any] = {
+    return {
         "success": outcome is not None and outcome.success,
         "failure_phase": "" if outcome is None else outcome.failure_phase,
         "failure_reason": "interrupted" if outcome is None else outcome.failure_reason,
@@ -141,9 +138,6 @@ def episode_facts(recording: Recording) -> dict[str, Any]:
         "num_goals": len(simulation.scene.goals),
         **_first_goal(simulation.scene),
     }
-    facts |= {f"drawn/{name}": value for name, value in sorted(_drawn(simulation).items())}
-    checks = () if outcome is None else outcome.checks
-    return facts | {f"success_checks/{name}": value for name, value in _nearest_to_limit(checks).items()}
 
 
 def _first_goal(scene: Scene) -> dict[str, Any]:
@@ -159,33 +153,3 @@ def _first_goal(scene: Scene) -> dict[str, Any]:
         "goal_x": float(there[0]),
         "goal_y": float(there[1]),
     }
-
-
-def _drawn(simulation: Simulation) -> Mapping[str, float]:
-    """Return the values drawn for the episode: behaviour, light, gravity; size, mass and friction of the object."""
-    scene, light = simulation.scene, simulation.scene.light
-    drawn = dict(simulation.behaviour)
-    drawn |= {"light_ambient": light.ambient, "light_diffuse": light.diffuse, "light_shadow": light.shadow}
-    drawn["light_turn"] = math.atan2(light.direction[1], light.direction[0])
-    drawn["light_elevation"] = math.atan2(light.direction[2], math.hypot(light.direction[0], light.direction[1]))
-    drawn["gravity"] = scene.physics.gravity[2]
-    drawn["distractors"] = float(sum(body.role == "distractor" for body in scene.bodies))
-    if scene.goals:
-        body = scene.body(scene.goals[0].object)
-        drawn |= {"object_size": max(body.shape.extents), "object_mass": body.mass}
-        drawn["object_friction"] = body.lateral_friction
-    return {name: float(value) for name, value in drawn.items()}
-
-
-def _nearest_to_limit(checks: Iterable[SuccessCheck]) -> dict[str, float]:
-    """Return condition -> measured value; with several objects, the one that failed or is closest to failing."""
-    worst: dict[str, SuccessCheck] = {}
-    for check in checks:
-        name = check.name.partition(":")[0]
-        if name not in worst or (check.passed, _slack(check)) < (worst[name].passed, _slack(worst[name])):
-            worst[name] = check
-    return {name: check.value for name, check in worst.items()}
-
-
-def _slack(check: SuccessCheck) -> float:
-    return abs(check.limit - check.value)

@@ -252,7 +252,7 @@ class Condition:
     """A parsed condition of `--where`: comparisons of columns with values, joined by and, or, not.
 
         success and num_frames < 300
-        "cube" in task and drawn/speed >= 0.9
+        "cube" in task and num_retries >= 1
         episode_index in (3, 7)
 
     Nothing is evaluated as Python: the parsed text is translated, and everything beyond this grammar is refused.
