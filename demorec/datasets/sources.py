@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from demorec.core.errors import ConfigError
-from demorec.core.plain import listed
 from demorec.datasets.options import CommonOptions, parse_episodes
 from demorec.episode.episode import POLICY_PHASE, Outcome, interventions
-from demorec.mcap import Recording, open_recording
+from demorec.mcap import Recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
@@ -79,7 +78,6 @@ class Intake:
     Args:
         found: All recordings of the export.
         options: Options of the export.
-        traits_of: Returns the properties that all recordings must share (`ExportEpisode.traits`).
 
     Attributes:
         num_taken: Number of selected recordings.
@@ -87,25 +85,30 @@ class Intake:
         skipped_unknown: Number of recordings left out that end before their outcome.
     """
 
-    def __init__(
-        self, found: Sequence[Path], options: CommonOptions, traits_of: Callable[[Recording], Mapping[str, str]]
-    ) -> None:
+    def __init__(self, found: Sequence[Path], options: CommonOptions) -> None:
         self.skipped_failures = self.skipped_unknown = self.num_taken = 0
         self._found = found
         self._options = options
-        self._traits_of = traits_of
         self._first: tuple[Mapping[str, str], Path] | None = None
 
     def take(self, path: Path, traits: Mapping[str, str]) -> None:
         """Count a selected recording.
 
+        Args:
+            path: The recording.
+            traits: Properties that all recordings must share (`ExportEpisode.traits`).
+
         Raises:
-            ConfigError: Its traits differ from those of the first one.
+            ConfigError: They differ from those of the first one.
         """
-        if self._first is None:
-            self._first = traits, path
-        elif traits != self._first[0]:
-            self._refuse_differences(*self._first)
+        expected, first = self._first = self._first or (traits, path)
+        names = [name for name in dict.fromkeys((*expected, *traits)) if traits.get(name) != expected.get(name)]
+        if names:
+            differences = [f"{name} is {traits.get(name)} instead of {expected.get(name)}" for name in names]
+            raise ConfigError(
+                f"The recording does not fit into one dataset with {first.name}: {'; '.join(differences)}. Export it "
+                f"separately: {path}"
+            )
         self.num_taken += 1
 
     def leave_out(self, outcome: Outcome | None) -> None:
@@ -128,25 +131,3 @@ class Intake:
             f"unknown outcome: {self.skipped_unknown} (--include-failures selects both); the others are not in "
             f"--episodes{corrected}."
         )
-
-    def _refuse_differences(self, traits: Mapping[str, str], reference: Path) -> None:
-        """Raise ConfigError with every difference between the reference and the other selected recordings.
-
-        Reads all headers, so it is called only when a difference is known to exist.
-        """
-        files_by_difference: dict[str, list[str]] = {}
-        for file in self._found:
-            with open_recording(file) as recording:
-                if is_wanted(recording, self._options) and goes_in(recording, self._options):
-                    for what, value in self._traits_of(recording).items():
-                        if traits.get(what, value) != value:
-                            difference = f"{what} is {value} instead of {traits[what]}"
-                            files_by_difference.setdefault(difference, []).append(file.name)
-        if files_by_difference:
-            differences = "; ".join(
-                f"{difference} ({listed(files, 3, ', ')})" for difference, files in files_by_difference.items()
-            )
-            raise ConfigError(
-                f"These recordings do not fit into one dataset with {reference.name}: {differences}. "
-                "Export them separately."
-            )

@@ -151,7 +151,7 @@ def test_a_refused_export_leaves_nothing(
 
 def test_recordings_that_differ_are_refused(exporter: str, run: Path, tmp_path: Path) -> None:
     other = make_run(tmp_path / "other", (4,), video=VideoConfig(), width=48)
-    with pytest.raises(ConfigError, match=r"do not fit into one dataset.*48x48 instead of 64x48"):
+    with pytest.raises(ConfigError, match=r"does not fit into one dataset.*48x48 instead of 64x48"):
         export([run, other], tmp_path / "d", exporter)
     assert [path.name for path in tmp_path.iterdir()] == ["other"]
 

@@ -101,7 +101,7 @@ class _Export:
         self._transcoded: dict[str, None] = {}
         self._digests: dict[Path, str] = {}
         self._silent: list[str] = []
-        self._intake = Intake(found, options, lambda recording: export_episode(recording, options).traits())
+        self._intake = Intake(found, options)
 
     def run(self, folder: Path, progress: ProgressCallback | None) -> ExportReport:
         """Write all recordings to an empty folder, or to one with links to the existing dataset's files."""

@@ -54,7 +54,7 @@ def export_hdf5(
 def _write(
     file: NewFile, found: Sequence[Path], out: Path, options: Hdf5Options, progress: ProgressCallback | None
 ) -> ExportReport:
-    intake = Intake(found, options, lambda recording: ExportEpisode(recording, options).traits())
+    intake = Intake(found, options)
     data = file.root.create_group("data")
     num_frames = 0
     depth_left_out: tuple[str, ...] = ()
