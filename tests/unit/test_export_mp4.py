@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from support.present import present
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
-from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer, Stored
+from demorec.datasets.lerobot.mp4 import EncodedVideo, Mp4Writer
 from demorec.mcap import VideoPacket, VideoSettings
 from demorec.mcap.video import decode, is_keyframe, make_encoder
 
@@ -98,34 +97,6 @@ def test_invalid_images_are_refused(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"cannot be written.*a\.mp4"):
         Mp4Writer(tmp_path / "a.mp4", garbage, fps=30)
     assert list(tmp_path.iterdir()) == []
-
-
-def test_images_of_other_files_are_copied_and_a_file_that_ends_early_is_refused(tmp_path: Path) -> None:
-    video, _ = coded("h264", 9)
-    data = video.read()
-    half = int(video.sizes[:4].sum())
-    (tmp_path / "a").mkdir()
-    (tmp_path / "b").mkdir()
-    given = tmp_path / "given"
-    given.write_bytes(b"before" + data[half:] + b"between" + data[:half])
-    spans = ((6 + len(data) - half + 7, half), (6, len(data) - half))
-    stored = replace(video, samples=Stored(path=given, spans=spans))
-    assert stored.read() == data
-    written = []
-    for name, each in (("a", video), ("b", stored)):
-        writer = Mp4Writer(tmp_path / name / "x.mp4", each, fps=30)
-        writer.add(each)
-        writer.add(video)
-        writer.close()
-        written.append((tmp_path / name / "x.mp4").read_bytes())
-    assert written[0] == written[1]
-    assert given.stat().st_size == len(data) + 13
-    writer = Mp4Writer(tmp_path / "b" / "y.mp4", stored, fps=30)
-    given.write_bytes(given.read_bytes()[:-1])
-    with pytest.raises(OSError, match="ends before"):
-        writer.add(stored)
-    writer.abort()
-    assert [path.name for path in (tmp_path / "b").iterdir()] == ["x.mp4"]
 
 
 def samples_of(video: EncodedVideo) -> list[bytes]:

@@ -7,7 +7,6 @@ end.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import io
 import os
@@ -29,29 +28,6 @@ from demorec.core.errors import ExportError
 _DEMUXERS = {"h264": "h264", "hevc": "hevc", "av1": "obu"}
 
 
-@dataclass(frozen=True, kw_only=True)
-class Stored:
-    """Location of encoded images in a file.
-
-    Attributes:
-        path: Path of the file.
-        spans: (begin, bytes) of the consecutive parts.
-        is_own: Whether the file has no other content and is deleted once the images are written.
-    """
-
-    path: Path
-    spans: tuple[tuple[int, int], ...]
-    is_own: bool = False
-
-    def read(self) -> bytes:
-        """Read all images. Raises OSError if the file cannot be read or is too short."""
-        with self.path.open("rb", buffering=0) as file:
-            data = b"".join(os.pread(file.fileno(), count, begin) for begin, count in self.spans)
-        if len(data) != sum(count for _, count in self.spans):
-            raise OSError(errno.EIO, "the file ends before it should", str(self.path))
-        return data
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EncodedVideo:
     """The T images of one camera in one episode, and further images needed to decode them.
@@ -59,7 +35,7 @@ class EncodedVideo:
     Attributes:
         codec: "h264", "hevc" or "av1", or another one by libav's name.
         first: The first image as encoded, a keyframe; for other codecs an mp4 file of it alone.
-        samples: All images concatenated in mp4's form, or their location.
+        samples: All images concatenated in mp4's form, or a file with them, which is deleted once they are written.
         sizes: (lead + T + tail,) int64, size of each in bytes.
         is_keyframe: (lead + T + tail,) bool, whether each can be decoded independently.
         digest: SHA-256 (hex) of the T samples; with a tail, of the samples stored in their places. "" if not requested.
@@ -73,7 +49,7 @@ class EncodedVideo:
     width: int
     height: int
     first: bytes
-    samples: bytes | Stored
+    samples: bytes | Path
     sizes: NDArray[np.int64]
     is_keyframe: NDArray[np.bool_]
     digest: str = ""
@@ -130,11 +106,11 @@ class EncodedVideo:
         handle, name = tempfile.mkstemp(dir=folder)
         with os.fdopen(handle, "wb") as file:
             file.write(self.read())
-        return replace(self, samples=Stored(path=Path(name), spans=((0, self.num_bytes),), is_own=True))
+        return replace(self, samples=Path(name))
 
     def read(self) -> bytes:
-        """Read all images, concatenated; OSError if a file cannot be read."""
-        return self.samples if isinstance(self.samples, bytes) else self.samples.read()
+        """Read all images, concatenated; OSError if their file cannot be read."""
+        return self.samples if isinstance(self.samples, bytes) else self.samples.read_bytes()
 
     def parameter_sets(self) -> bytes:
         """Parameter sets for the decoder; ExportError if the first image is not an independent keyframe."""
@@ -187,8 +163,8 @@ class Mp4Writer:
                 self._mux(data[begin : begin + size], is_key, shift)
                 begin += size
         self.num_bytes += video.num_bytes
-        if isinstance(video.samples, Stored) and video.samples.is_own:
-            video.samples.path.unlink()
+        if isinstance(video.samples, Path):
+            video.samples.unlink()
 
     def _mux(self, sample: bytes, is_keyframe: bool, shift: int) -> None:
         """Append an image with its display position `shift` after its storage position."""

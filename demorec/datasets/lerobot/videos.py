@@ -27,7 +27,7 @@ from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.episode_table import EpisodePlace
 from demorec.datasets.lerobot.layout import DatasetFeature
-from demorec.datasets.lerobot.mp4 import EncodedVideo, Stored, one_image_file
+from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
 from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
 
@@ -240,14 +240,13 @@ class EpisodeVideo:
         if not file.has_long_lengths:
             raise ExportError(f"The video has lengths of less than four bytes, which are not copied: {self.path}")
         shifts = part.places - np.arange(len(part.places))
-        sizes = file.sizes[part.numbers]
         return EncodedVideo(
             codec=file.codec_name,
             width=file.size[0],
             height=file.size[1],
             first=file.first_image(int(part.numbers[0])),
-            samples=Stored(path=self.path, spans=_spans(file.offsets[part.numbers], sizes)),
-            sizes=sizes,
+            samples=b"".join(file.samples(part.numbers)),
+            sizes=file.sizes[part.numbers],
             is_keyframe=file.is_keyframe[part.numbers],
             lead=part.lead,
             tail=part.tail,
@@ -388,11 +387,3 @@ def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np
         if len(part) > int(frames[part].max() - frames[begin]) or end >= last:
             return part
         end += 1
-
-
-def _spans(offsets: NDArray[np.int64], sizes: NDArray[np.int64]) -> tuple[tuple[int, int], ...]:
-    """Return (begin, bytes) of the contiguous parts of a file."""
-    ends = offsets + sizes
-    begins = np.flatnonzero(np.append(True, offsets[1:] != ends[:-1]))
-    lasts = np.append(begins[1:], len(offsets)) - 1
-    return tuple(zip(offsets[begins].tolist(), (ends[lasts] - offsets[begins]).tolist(), strict=True))
