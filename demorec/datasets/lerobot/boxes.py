@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from bisect import bisect_right
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -125,32 +124,20 @@ class BoxWriter(Closing):
 
 
 class _CameraFile:
-    """One COCO file; the images' descriptions wait in a second file, because both arrive at the same time."""
+    """One COCO file; the images' descriptions follow the annotations, which arrive at the same time."""
 
     def __init__(self, path: Path, key: str, fps: int) -> None:
         path.parent.mkdir(parents=True, exist_ok=True)
-        self._path, self._key, self._fps = path, key, fps
+        self._key, self._fps = key, fps
         self._annotations: IO[str] = path.open("w")
-        self._images: IO[str] = path.with_suffix(".images").open("w+")
         self._annotations.write('{"info": {"description": "boxes from the simulator"},\n"annotations": [\n')
         self._categories: dict[str, int] = {}
         self._num_annotations = 0
-        self._num_images = 0
+        self._episodes: list[tuple[int, int, int, int, int]] = []
 
     def add(self, episode_index: int, seen: SeenByCamera, first_index: int, num_frames: int) -> None:
         width, height, objects = seen
-        for row in range(num_frames):
-            image = {
-                "id": first_index + row,
-                "width": width,
-                "height": height,
-                "file_name": f"{self._key}/episode_{episode_index:06d}/frame_{row:06d}.png",
-                "episode_index": episode_index,
-                "frame_index": row,
-                "timestamp": row / self._fps,
-            }
-            self._images.write((",\n" if self._num_images else "") + json.dumps(image))
-            self._num_images += 1
+        self._episodes.append((episode_index, first_index, num_frames, width, height))
         for row, noun, values in objects:
             category = self._categories.setdefault(noun, len(self._categories) + 1)
             self._num_annotations += 1
@@ -164,13 +151,23 @@ class _CameraFile:
 
     def finish(self) -> None:
         self._annotations.write('\n],\n"images": [\n')
-        self._images.seek(0)
-        shutil.copyfileobj(self._images, self._annotations)
+        separator = ""
+        for episode_index, first_index, num_frames, width, height in self._episodes:
+            for row in range(num_frames):
+                image = {
+                    "id": first_index + row,
+                    "width": width,
+                    "height": height,
+                    "file_name": f"{self._key}/episode_{episode_index:06d}/frame_{row:06d}.png",
+                    "episode_index": episode_index,
+                    "frame_index": row,
+                    "timestamp": row / self._fps,
+                }
+                self._annotations.write(separator + json.dumps(image))
+                separator = ",\n"
         categories = [{"id": number, "name": noun} for noun, number in self._categories.items()]
         self._annotations.write(f'\n],\n"categories": {json.dumps(categories)}}}\n')
         self.close()
-        self._path.with_suffix(".images").unlink()
 
     def close(self) -> None:
         self._annotations.close()
-        self._images.close()
