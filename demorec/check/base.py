@@ -166,6 +166,7 @@ class Check:
             # Data that break one check in an unforeseen way must not hide the findings of the others.
             logging.getLogger(__name__).debug("check %s", self.name, exc_info=True)
             reason = str(error) if isinstance(error, DemorecError) else "it cannot be computed on these data"
+            reason = reason.replace(f"{subject.path}/", "")
             if self.family == "files":
                 found.append(self._finding(Fault(severity="broken", message=reason), path))
                 reason = ""

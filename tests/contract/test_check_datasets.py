@@ -316,3 +316,14 @@ def test_a_recording_with_nan_is_not_exported(tmp_path: Path) -> None:
     with pytest.raises(ExportError, match=r"observation.state is not finite in frame 11"):
         export_lerobot([tmp_path / "b.mcap"], tmp_path / "ds", ExportOptions(verify=False))
     assert not (tmp_path / "ds").exists()
+
+
+def test_a_damaged_table_is_named_once(dataset: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = next(dataset.glob("data/*/*.parquet"))
+    path.write_bytes(path.read_bytes()[:-100])
+    assert exit_code("check", dataset) == 1
+    lines = capsys.readouterr().out.splitlines()
+    (finding, episodes) = (line for line in lines if line.startswith("  broken"))
+    assert finding.startswith("  broken  unreadable_episodes  3 episodes (0, 1, 2), for example 0: ")
+    assert episodes.startswith("  broken  3 episodes (0, 1, 2), score 0.00: The table cannot be read")
+    assert lines[lines.index(finding) + 2].strip() == "-> download the tables again"

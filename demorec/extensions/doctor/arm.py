@@ -23,12 +23,14 @@ class StateJoints:
         urdf: The joint tree.
         joints: (D,) names in it, "" for an element that is not the position of a joint.
         lower, upper: (D,) limits, rad or m; infinite if unknown.
+        is_sliding: (D,) whether the joint slides.
     """
 
     urdf: Urdf
     joints: tuple[str, ...]
     lower: Array
     upper: Array
+    is_sliding: tuple[bool, ...]
 
 
 def arm_of(evidence: Evidence) -> StateJoints:
@@ -46,6 +48,7 @@ def arm_of(evidence: Evidence) -> StateJoints:
         joints=joints,
         lower=np.array([-np.inf if joint is None else joint.lower for joint in found]),
         upper=np.array([np.inf if joint is None else joint.upper for joint in found]),
+        is_sliding=tuple(joint is not None and joint.kind == "prismatic" for joint in found),
     )
 
 

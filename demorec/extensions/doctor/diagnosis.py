@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from demorec.check.base import FAMILIES, RANK, Check, Finding, Verdict
+from demorec.check.base import FAMILIES, RANK, Check, CheckResult, Finding, Verdict
 from demorec.episode.roles import Role
 from demorec.extensions.doctor.checks import all_checks
 from demorec.extensions.doctor.evidence import Evidence
@@ -109,7 +109,7 @@ def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: S
         ResourceError: This machine cannot run one of them.
     """
     results = [check.run(evidence) for check in (all_checks() if checks is None else checks)]
-    made = [result for result in results if result is not None]
+    made = [_unrepeated(result, evidence) for result in results if result is not None]
     findings = [*extra, *(_for_recordings(found, evidence) for result in made for found in result.findings)]
     order = {check.name: FAMILIES.index(check.family) for check in all_checks()}
     findings.sort(
@@ -125,6 +125,15 @@ def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: S
         num_frames=sum(episode.length for episode in evidence.episodes),
         cameras=tuple(evidence.cameras),
     )
+
+
+def _unrepeated(result: CheckResult, evidence: Evidence) -> CheckResult:
+    """Turn the reason of unreadable episodes, met by another check, into its reason for not measuring."""
+    known = [f for f in result.findings if f.episode is None and f.message in evidence.unreadable.values()]
+    if not known:
+        return result
+    others = tuple(finding for finding in result.findings if finding not in known)
+    return replace(result, findings=others, not_measured=known[0].message)
 
 
 def _for_recordings(finding: Finding, evidence: Evidence) -> Finding:

@@ -196,8 +196,7 @@ def _finding(same: Sequence[Finding]) -> Iterator[str]:
     if numbers:
         where = f"episode {numbers[0]}: "
         if len(numbers) > 1:
-            shown = ", ".join(map(str, numbers[:_MAX_NUMBERS])) + (", ..." if len(numbers) > _MAX_NUMBERS else "")
-            where = f"{len(numbers)} episodes ({shown}), for example {numbers[0]}: "
+            where = f"{len(numbers)} episodes ({_listed(numbers)}), for example {numbers[0]}: "
             do = do.replace(f"--episodes {numbers[0]} ", f"--episodes {','.join(map(str, numbers))} ")
     yield f"  {worst.severity:<6}  {worst.check}  {where}{worst.message}"
     yield from textwrap.wrap(worst.why, _WIDTH, initial_indent=" " * 10, subsequent_indent=" " * 10)
@@ -205,13 +204,24 @@ def _finding(same: Sequence[Finding]) -> Iterator[str]:
 
 
 def _episodes(diagnosis: Diagnosis, *, everything: bool) -> Iterator[str]:
-    listed = [each for each in diagnosis.episodes if everything or each.verdict != "good"]
-    for each in listed if everything else listed[:MAX_EPISODES]:
-        reasons = f": {each.reasons[0]}" if each.reasons else ""
-        more = f" (and {len(each.reasons) - 1} more)" if len(each.reasons) > 1 else ""
-        yield f"  {each.verdict:<6}  episode {each.episode}, score {each.score:.2f}{reasons}{more}"
-    if len(listed) > MAX_EPISODES and not everything:
-        yield f"  and {len(listed) - MAX_EPISODES} more episodes (--all prints them)"
+    """Format the episodes, worst first; those with the same score and reasons share a line."""
+    groups: dict[tuple[str, str, tuple[str, ...]], list[int]] = {}
+    for each in diagnosis.episodes:
+        if everything or each.verdict != "good":
+            groups.setdefault((each.verdict, f"{each.score:.2f}", each.reasons), []).append(each.episode)
+    for (verdict, score, reasons), numbers in list(groups.items())[: None if everything else MAX_EPISODES]:
+        shown = _listed(numbers, len(numbers) if everything else _MAX_NUMBERS)
+        which = f"episode {numbers[0]}" if len(numbers) == 1 else f"{len(numbers)} episodes ({shown})"
+        reason = f": {reasons[0]}" if reasons else ""
+        more = f" (and {len(reasons) - 1} more)" if len(reasons) > 1 else ""
+        yield f"  {verdict:<6}  {which}, score {score}{reason}{more}"
+    hidden = sum(map(len, list(groups.values())[MAX_EPISODES:]))
+    if hidden and not everything:
+        yield f"  and {hidden} more episodes (--all prints them)"
+
+
+def _listed(numbers: Sequence[int], shown: int = _MAX_NUMBERS) -> str:
+    return ", ".join(map(str, numbers[:shown])) + (", ..." if len(numbers) > shown else "")
 
 
 def as_json(path: Path, diagnosis: Diagnosis) -> dict[str, Any]:

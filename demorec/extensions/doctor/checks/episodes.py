@@ -142,7 +142,7 @@ def _returns(evidence: Evidence, state: Array) -> int:
     needs="state",
     measures="idle time at the start or the end",
     unit="s",
-    why="The policy learns to do nothing at the start, and may never begin to move.",
+    why="The policy learns to do nothing: at the start it may never begin to move.",
     do="demorec dataset trim {path} --idle --out NEW",
 )
 def idle_ends(evidence: Evidence) -> Iterator[Fault]:

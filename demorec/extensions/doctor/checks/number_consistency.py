@@ -213,10 +213,11 @@ def joint_limits(evidence: Evidence) -> Iterator[Fault]:
         worst = float(beyond[frame, place])
         if worst > 0.1:
             frames = np.flatnonzero((beyond > 0.1).any(axis=1))
+            unit = "m" if arm.is_sliding[known[place]] else "rad"
             yield Fault(
                 severity="broken" if worst > 0.5 else "look",
                 episode=episode.number,
                 frames=(int(frames[0]), int(frames[-1])),
-                value=f"{worst:.2f} rad",
-                message=f"{evidence.elements[known[place]]} is {worst:.2f} rad or m beyond its limit",
+                value=f"{worst:.2f} {unit}",
+                message=f"{evidence.elements[known[place]]} is {worst:.2f} {unit} beyond its limit",
             )
