@@ -100,49 +100,44 @@ class ExportReport:
 
 
 def parse_episodes(text: str) -> Callable[[int], bool]:
-    """Parse "0:100", "::2", "7" and comma-separated lists into a test of episode numbers; "" accepts all.
+    """Parse "0:100", "::2", "7" and lists of them into a test of episode numbers; "" accepts all.
 
     Raises:
         OptionError: Invalid text.
     """
-    parts: list[range] = []
-    for part in text.split(",") if text.strip() else []:
-        match = re.fullmatch(r"\s*(\d*)(?:(:)(\d*)(?::(\d*))?)?\s*", part)
-        if match is None or (not match[2] and not match[1]) or match[4] == "0":
-            raise OptionError("episodes", f"is {text!r}, expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")
-        first = int(match[1] or 0)
-        if not match[2]:
-            parts.append(range(first, first + 1))
-        else:
-            parts.append(range(first, int(match[3]) if match[3] else 2**62, int(match[4] or 1)))
-        if not parts[-1]:
-            raise OptionError("episodes", f"is {text!r}, but {part.strip()} ends before it begins.")
-    if not parts:
-        return lambda index: True
-    return lambda index: any(index in part for part in parts)
+    parts = _ranges(text, "episodes")
+    return lambda index: not parts or any(index in part for _, part in parts)
 
 
-def select_episodes[E](episodes: Sequence[E], text: str) -> list[E]:
-    """Select "7", "0:20" or "3,5,8:10", numbered from 0; "" for all.
+def select_episodes[E](episodes: Sequence[E], text: str, option: str = "episodes") -> list[E]:
+    """Select episodes, numbered from 0, by a list as in `parse_episodes` and in its order; "" for all.
 
     Raises:
         ConfigError: Invalid text, or numbers out of range.
     """
-    if not text:
-        return list(episodes)
     chosen: list[E] = []
-    for word in text.split(","):
-        first, colon, last = word.partition(":")
-        try:
-            low = int(first or 0)
-            high = (int(last) if last else len(episodes)) if colon else low + 1
-        except ValueError as error:
-            raise OptionError("episodes", f"is {text!r}, expected numbers and ranges like 7 or 0:20.") from error
-        part = episodes[low:high] if 0 <= low < high else ()
+    for word, part in _ranges(text, option):
+        numbers = range(part.start, min(part.stop, len(episodes)), part.step)
+        if not numbers:
+            raise ConfigError(f"--{option} {word} is out of range: choose from 0 to {len(episodes) - 1}.")
+        chosen += [episodes[number] for number in numbers]
+    return chosen if text.strip() else list(episodes)
+
+
+def _ranges(text: str, option: str) -> list[tuple[str, range]]:
+    """Split a list at commas and spaces into its words and their numbers; an open end is 2**62."""
+    found = []
+    for word in text.replace(",", " ").split():
+        match = re.fullmatch(r"(\d*)(?:(:)(\d*)(?::(\d*))?)?", word)
+        if match is None or (not match[2] and not match[1]) or match[4] == "0":
+            raise OptionError(option, f"is {text!r}, expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")
+        first = int(match[1] or 0)
+        last = int(match[3] or 2**62) if match[2] else first + 1
+        part = range(first, last, int(match[4] or 1))
         if not part:
-            raise ConfigError(f"--episodes {word} is out of range: choose from 0 to {len(episodes) - 1}.")
-        chosen += part
-    return chosen
+            raise OptionError(option, f"is {text!r}, but {word} ends before it begins.")
+        found.append((word, part))
+    return found
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -102,9 +102,9 @@ class Intake:
             ConfigError: They differ from those of the first one.
         """
         expected, first = self._first = self._first or (traits, path)
-        names = [name for name in dict.fromkeys((*expected, *traits)) if traits.get(name) != expected.get(name)]
-        if names:
-            differences = [f"{name} is {traits.get(name)} instead of {expected.get(name)}" for name in names]
+        wrong = {name: value for name, value in traits.items() if expected.get(name, value) != value}
+        if wrong:
+            differences = [f"{name} is {value} instead of {expected[name]}" for name, value in wrong.items()]
             raise ConfigError(
                 f"The recording does not fit into one dataset with {first.name}: {'; '.join(differences)}. Export it "
                 f"separately: {path}"

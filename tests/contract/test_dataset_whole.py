@@ -324,8 +324,8 @@ def test_chosen_episodes_are_imported(
 
 @pytest.mark.parametrize(
     ("words", "told"),
-    [("9", "--episodes 9 is out of range: choose from 0 to 3."), ("2:1", "--episodes 2:1 is out of range"),
-     ("-1", "--episodes -1 is out of range"), ("first", "expected numbers and ranges like 7 or 0:20.")],
+    [("9", "--episodes 9 is out of range: choose from 0 to 3."), ("2:1", "2:1 ends before it begins"),
+     ("first", "expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")],
 )  # fmt: skip
 def test_missing_episodes_are_one_sentence(
     words: str, told: str, apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

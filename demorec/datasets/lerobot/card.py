@@ -175,10 +175,12 @@ def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str])
 
 
 def _success(root: Path) -> str:
-    """Report the success rate of the attempts made for this dataset; "" if no outcome is known."""
-    outcomes = [row["success"] for row in rows_in(root, f"{SIDECAR_DIR}/attempts", ["success"], schema=ATTEMPT_SCHEMA)]
-    known = len(outcomes) - outcomes.count(None)
-    if not known:
-        return ""
-    good = outcomes.count(True)
-    return f"{good} of {known} attempts that were made for this dataset succeeded ({100 * good / known:.1f} %)."
+    """Report the success rate of the attempts made for this dataset, and the number of unknown outcomes."""
+    rows = rows_in(root, f"{SIDECAR_DIR}/attempts", ["success"], schema=ATTEMPT_SCHEMA)
+    outcomes = [row["success"] for row in rows]
+    good, unknown = outcomes.count(True), outcomes.count(None)
+    known = len(outcomes) - unknown
+    text = f"Episodes with an unknown outcome: {unknown}." if unknown else ""
+    if known:
+        text += f" {good} of {known} attempts that were made for this dataset succeeded ({100 * good / known:.1f} %)."
+    return text.strip()

@@ -56,11 +56,9 @@ def columns_of(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, 
     return columns
 
 
-def chosen(source: LeRobotFolder, rows: Rows, where: str = "", episodes: Sequence[int] | None = None) -> list[int]:
-    """Numbers of the listed episodes that fulfil a condition; ConfigError for impossible ones."""
-    if episodes is not None and (wrong := [number for number in episodes if not 0 <= number < len(rows)]):
-        raise ConfigError(f"Episode {wrong[0]} does not exist, the dataset has 0 to {len(rows) - 1}: {source.root}")
-    found = list(range(len(rows))) if episodes is None else list(dict.fromkeys(episodes))
+def chosen(rows: Rows, where: str, episodes: Sequence[int]) -> list[int]:
+    """Numbers of the listed episodes that fulfil a condition, each once; ConfigError for an impossible one."""
+    found = list(dict.fromkeys(episodes))
     if where:
         condition = Condition(where, _names(rows))
         found = [number for number in found if condition.holds(rows[number])]

@@ -179,22 +179,8 @@ def dataset_at(path: Path) -> Path:
     return path / DATASET
 
 
-def episode_numbers(texts: Sequence[str]) -> list[int]:
-    """Parse episode numbers such as 0,3,5:9 or 0 3 5:9; a range excludes its end."""
-    found: list[int] = []
-    try:
-        for part in " ".join(texts).replace(",", " ").split():
-            first, colon, last = part.partition(":")
-            found += range(int(first), int(last)) if colon else [int(first)]
-    except (ValueError, MemoryError, OverflowError):
-        found = []
-    if texts and not found:
-        raise ConfigError(f"Episodes are numbers and ranges, such as 0,3,5:9, not {' '.join(texts)!r}.")
-    return found
-
-
 def _listed(numbers: Sequence[int]) -> str:
-    """Format some episode numbers in the form of `episode_numbers`."""
+    """Format some episode numbers in the form of --episodes."""
     parts: list[tuple[int, int]] = []
     for number in numbers:
         if parts and parts[-1][1] == number:

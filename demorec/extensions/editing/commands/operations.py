@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import say
 from demorec.core.errors import ConfigError
-from demorec.extensions.editing.commands.edit import CONDITION_HELP, Edit, EditOne, dataset_at, episode_numbers, pairs
+from demorec.extensions.editing.commands.edit import CONDITION_HELP, Edit, EditOne, dataset_at, pairs
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -27,10 +27,11 @@ class Chosen(EditOne):
 
     def chosen(self, source: LeRobotFolder) -> list[int]:
         """Numbers of the selected episodes."""
+        from demorec.datasets.options import select_episodes
         from demorec.extensions.editing.operations import chosen, columns_of, names_in
 
         rows = columns_of(source, names_in(self.where))
-        return chosen(source, rows, self.where, episode_numbers(self.episodes) if self.episodes else None)
+        return chosen(rows, self.where, select_episodes(range(len(rows)), " ".join(self.episodes)))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -260,10 +261,13 @@ class Reorder(EditOne):
 
     def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
         """All episodes in the new order."""
+        from demorec.datasets.options import select_episodes
         from demorec.extensions.editing.operations import columns_of, reorder
 
         rows = columns_of(sources[0], {self.by}) if self.by else ()
-        return reorder(sources[0], rows, self.by, episode_numbers(self.order), descending=self.descending)
+        numbers = range(len(sources[0].places))
+        order = select_episodes(numbers, " ".join(self.order), "order") if self.order else ()
+        return reorder(sources[0], rows, self.by, order, descending=self.descending)
 
 
 @dataclass(frozen=True, kw_only=True)
