@@ -91,7 +91,6 @@ def test_meshes_are_not_copied(exported: Path) -> None:
     assert record["spec"]["urdf"] == "franka_panda/panda.urdf"
     assert "<mesh" not in urdf_file.read_text()
     assert {path.suffix for path in (exported / "demorec" / "robots").iterdir()} == {".json", ".urdf"}
-    assert urdf_file.name in (exported / "README.md").read_text()
 
 
 def test_no_path_of_the_machine_gets_into_a_dataset() -> None:
