@@ -7,6 +7,9 @@ from collections.abc import Iterator, Sequence
 
 _SUFFIX = re.compile(r"[._/](pos|position|vel|velocity|width|effort|torque)$")
 """Suffix of an element's name that is not part of its joint's name."""
+VELOCITY_WORDS = frozenset(("velocity", "velocities", "vel", "qvel"))
+FORCE_WORDS = frozenset(("effort", "efforts", "torque", "torques", "current", "force", "wrench", "tactile"))
+_WORD = re.compile("[A-Z]?[a-z]+|[A-Z]+")
 _GRIPPER = re.compile("gripper|finger", re.IGNORECASE)
 
 
@@ -48,6 +51,11 @@ def is_numbered(names: Sequence[str]) -> bool:
 def joint_of(name: str) -> str:
     """Remove the suffix for position, velocity or effort from an element's name."""
     return _SUFFIX.sub("", name)
+
+
+def is_position(name: str) -> bool:
+    """Check whether an element is not named after a velocity or a force."""
+    return (VELOCITY_WORDS | FORCE_WORDS).isdisjoint(word.lower() for word in _WORD.findall(name))
 
 
 def is_gripper(name: str) -> bool:

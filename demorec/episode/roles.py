@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
 from demorec.core.registry import nearest_match
-from demorec.episode.element_names import is_gripper, is_numbered, joint_of
+from demorec.episode.element_names import FORCE_WORDS, VELOCITY_WORDS, is_gripper, is_numbered, joint_of
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, VELOCITY
 from demorec.episode.info import EpisodeInfo, Feature
 
@@ -64,8 +64,8 @@ _LABEL = frozenset(
 )
 _COMMAND = frozenset(("command", "commands", "cmd", "target", "targets"))
 _KINDS: tuple[tuple[Role, frozenset[str]], ...] = (
-    ("velocity", frozenset(("velocity", "velocities", "vel", "qvel"))),
-    ("sensor", frozenset(("effort", "efforts", "torque", "torques", "current", "force", "wrench", "tactile"))),
+    ("velocity", VELOCITY_WORDS),
+    ("sensor", FORCE_WORDS),
     ("pose", _WORLD | {"pose", "poses", "ee", "eef", "tcp", "end", "endpose", "cartesian", "orientation"}),
     ("gripper", frozenset(("gripper", "grippers", "finger", "fingers", "effector"))),
 )

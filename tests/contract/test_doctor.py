@@ -254,6 +254,52 @@ def test_a_hand_of_numbered_joints_may_snap(sound: Evidence) -> None:
     assert found(diagnose(replace(spoilt(sound, snap), roles=roles)), "state_jumps") == set()
 
 
+def test_a_velocity_may_change_within_a_frame(sound: Evidence) -> None:
+    names = (*NAMES[:3], "Wrist_Vel4", "LeftForce.fx")
+    roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", NAMES)}, NO_NAMES)
+
+    def brake(state: Array, action: Array) -> tuple[Array, Array]:
+        state[60:, 3:] += 200
+        return state, action
+
+    assert found(diagnose(replace(spoilt(sound, brake), roles=roles)), "state_jumps") == set()
+
+
+def test_slow_motion_is_no_idle_end(sound: Evidence) -> None:
+    """The arm moves on by less than a degree a frame, or its reading stays where it is."""
+
+    def ending(rise: float) -> Change:
+        slow = rise * np.arange(1.0, 301)[:, None] * np.array([1, 0, 0, 0, 0])
+        return lambda s, a: (np.vstack([s, s[-1] + slow]), np.vstack([a, a[-1] + slow]))
+
+    assert found(diagnose(spoilt(sound, ending(0.5))), "idle_ends") == set()
+    assert found(diagnose(spoilt(sound, ending(0.0))), "idle_ends") == {BAD}
+
+
+def test_an_episode_in_which_nothing_moves(sound: Evidence) -> None:
+    diagnosis = diagnose(spoilt(sound, lambda s, a: (np.repeat(s[:1], 90, axis=0), np.repeat(a[:1], 90, axis=0))))
+    messages = [(each.episode, each.message) for each in diagnosis.findings if each.check == "idle_ends"]
+    assert messages == [(BAD, "nothing moves in it")]
+
+
+def test_a_joint_that_hardly_moves_although_its_action_does_is_dead(sound: Evidence) -> None:
+    """Its reading changes by a step once, in one episode, while the servo of a sound joint would follow."""
+    episodes = []
+    for each in sound.episodes[:3]:
+        assert each.state is not None
+        assert each.action is not None
+        state = each.state.copy()
+        state[:, 3] = 10.0
+        state[0, 3] += 0.1 * (each.number == 1)
+        episodes.append(episode(each.number, state, each.action))
+    messages = [
+        (each.severity, each.message)
+        for each in diagnose(replace(sound, episodes=episodes, cameras={})).findings
+        if each.check == "frozen_state"
+    ]
+    assert messages == [("broken", "wrist.pos never changes although its action does")]
+
+
 def test_measured_velocities_as_actions_are_worth_a_look(sound: Evidence) -> None:
     """A controller's feedback at t is centred on t; the motion that an action causes is centred on t + 1/2."""
     episodes = []

@@ -177,6 +177,18 @@ def test_a_resting_arm_hides_no_damage(tmp_path: Path, capsys: pytest.CaptureFix
     assert all(each["score"] > 0.8 for number, each in found.items() if number != BAD)
 
 
+def test_grippers_held_at_any_opening_switch_as_usual(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Objects have all sizes, and the largest of them leave the gripper nearer to open than to closed."""
+    episodes = [demonstration(number) for number in range(EPISODES_IN_ALL)]
+    for number, rows in enumerate(episodes):
+        held = (0.0, 0.1, 0.2, 0.3, 0.2, 0.4)[number % 6]
+        rows["action"][CLOSES:OPENS, 2] = held
+        rows["state"][CLOSES + 1 : OPENS + 1, 2] = max(held, 0.35)
+    exit_code("check", str(write(tmp_path / "d", episodes)), "--no-images", "--json")
+    found = json.loads(capsys.readouterr().out)["episodes"]
+    assert [each["reasons"] for each in found if each["score"] < 0.8] == []
+
+
 @pytest.fixture
 def late(tmp_path: Path) -> Path:
     """A dataset in which the actions of one episode are late."""

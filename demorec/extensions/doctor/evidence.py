@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array, signs_of_course
-from demorec.episode.element_names import joint_of
+from demorec.episode.element_names import is_position, joint_of
 from demorec.episode.roles import Role, Roles
 from demorec.extensions.doctor.robust import without_gaps
 
@@ -133,6 +133,11 @@ class Evidence:
             return np.zeros(0, dtype=np.bool_)
         hands = np.array([_HAND.search(name) is not None for name in self.elements], dtype=np.bool_)
         return np.asarray(self.roles.grippers() | hands)
+
+    @cached_property
+    def is_position(self) -> Flags:
+        """Flags (D,) of the state's elements that are positions, not velocities or forces."""
+        return np.array([is_position(name) for name in self.elements], dtype=np.bool_)
 
     @cached_property
     def action_of(self) -> list[int | None]:

@@ -22,7 +22,7 @@ from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import NORMAL
-from demorec.extensions.doctor.units import moving_elements
+from demorec.extensions.doctor.units import MIN_OTHERS, moving_elements
 
 MIN_EPISODES = 12
 """Minimum number of episodes with one instruction to compare them with each other; fewer are compared with the whole
@@ -44,10 +44,9 @@ _QUANTITIES: Mapping[str, tuple[float, str]] = {
 _TWO_SIDED = ("duration", "lag", "switches")
 """Quantities for which less than usual is unusual as well."""
 _MIN_FRAMES = 8
-_HIGH = 0.65
-"""Minimum of a gripper's high command, as a ratio of its range."""
-_LOW = 0.35
-"""Maximum of a gripper's low command, as a ratio of its range."""
+_LEVELS = ((0.35, 0.65), (0.25, 0.55), (0.45, 0.75))
+"""Maximum of a gripper's low command and minimum of its high one, as ratios of its range. A number of switches must be
+unusual at all of them: objects of other sizes hold the gripper at any opening."""
 _STILL_RATIO = 0.08
 """Maximum speed of an arm at rest, relative to the episode's fast speed (its 90 % quantile)."""
 _STEADY = 0.02
@@ -75,11 +74,12 @@ class EpisodeScore:
 
 
 class QuantityReading(NamedTuple):
-    """A number, and its first and last frame."""
+    """A number, its first and last frame, and the number measured in other ways."""
 
     value: float
     first: int
     last: int
+    others: tuple[float, ...] = ()
 
 
 class ArmMotion(NamedTuple):
@@ -101,7 +101,7 @@ def score_episodes(evidence: Evidence) -> dict[int, EpisodeScore]:
     for group in _groups(tasks):
         for name in _QUANTITIES:
             known = {number: readings[number][name] for number in group if name in readings[number]}
-            for number, reason in _judged(name, known) if known else ():
+            for number, reason in _judged(name, known) if len(known) > MIN_OTHERS else ():
                 reasons[number].append(reason)
     return {
         number: EpisodeScore(
@@ -125,12 +125,14 @@ def _groups(tasks: Mapping[int, str]) -> Iterable[list[int]]:
 def _judged(name: str, readings: Mapping[int, QuantityReading]) -> Iterator[tuple[int, Reason]]:
     """Yield (number, reason) of each reading."""
     floor, words = _QUANTITIES[name]
-    values = np.array([reading.value for reading in readings.values()])
-    usual = float(np.median(values))
-    spread = max(NORMAL * float(np.median(np.abs(values - usual))), floor)
-    for number, (value, first, last) in readings.items():
-        distance = (value - usual) / spread
-        spreads = abs(distance) if name in _TWO_SIDED else max(distance, 0.0)
+    values = np.array([(reading.value, *reading.others) for reading in readings.values()])
+    centres = np.median(values, axis=0)
+    usual_spreads = np.maximum(NORMAL * np.median(np.abs(values - centres), axis=0), floor)
+    distances = (values - centres) / usual_spreads
+    distances = np.abs(distances) if name in _TWO_SIDED else np.maximum(distances, 0.0)
+    usual = float(centres[0])
+    for (number, reading), spreads in zip(readings.items(), distances.min(axis=1).tolist(), strict=True):
+        value, first, last, _ = reading
         text = words.format(value=value, usual=usual, ratio=math.exp(min(value - usual, 50.0)))
         yield number, Reason(name, math.exp(-((spreads / _HALF) ** _STEEPNESS)), spreads, text, first, last)
 
@@ -183,13 +185,15 @@ def _readings(
     action = _shares(motion.action[:, arm], ranges.action[:, arm])
     openings = _shares(motion.state[:, is_gripper], ranges.state[:, is_gripper])
     commands = _shares(motion.action[:, is_gripper], ranges.action[:, is_gripper])
-    switches = sorted({frame for command in commands.T for frame in _switches(command)})
+    switches = [sorted({frame for command in commands.T for frame in _switches(command, *pair)}) for pair in _LEVELS]
+    counts = [len(frames) for frames in switches]
     last = len(state) - 1
+    detours = [_detour(state, [0, *(frame for frame in frames if frame < last), last]) for frames in switches]
     return {
         "pause": _pause(state, openings, fps),
         "duration": QuantityReading(float(np.log(len(state) / fps)), 0, last),
-        "switches": QuantityReading(len(switches), 0, last),
-        "path": _detour(state, [0, *(frame for frame in switches if frame < last), last]),
+        "switches": QuantityReading(counts[0], 0, last, tuple(counts[1:])),
+        "path": detours[0]._replace(others=tuple(detour.value for detour in detours[1:])),
         "noise": _roughness(action),
     }
 
@@ -223,10 +227,10 @@ def _roughness(values: Array) -> QuantityReading:
     return QuantityReading(float(np.log(np.quantile(third, 0.75) + 1e-4)), 0, len(values) - 1)
 
 
-def _switches(command: Array) -> list[int]:
+def _switches(command: Array, low: float, high: float) -> list[int]:
     """Return the frames from which a gripper's command (T,) is at the other of two levels, low and high."""
-    level = np.where(command > _HIGH, 1, np.where(command < _LOW, 0, -1))
+    level = np.where(command > high, 1, np.where(command < low, 0, -1))
     if level[0] < 0:
-        level[0] = int(command[0] > 0.5)
+        level[0] = int(command[0] > (low + high) / 2)
     latest = np.maximum.accumulate(np.where(level >= 0, np.arange(len(level)), 0))  # between the levels it stays
     return [int(frame) + 1 for frame in np.flatnonzero(np.diff(level[latest]))]

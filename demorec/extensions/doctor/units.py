@@ -50,8 +50,8 @@ def element_ticks(evidence: Evidence) -> Array:
 
 
 def moving_elements(evidence: Evidence) -> Flags:
-    """Flag the (D,) elements that usually move, and do not merely flicker under a load while another arm works."""
-    return np.asarray(evidence.ranges > MIN_MOTION_TICKS * evidence.once(element_ticks))
+    """Flag the (D,) positions that usually move, and do not merely flicker under a load while another arm works."""
+    return np.asarray(evidence.is_position & (evidence.ranges > MIN_MOTION_TICKS * evidence.once(element_ticks)))
 
 
 def _other_sizes(values: Mapping[int, Array]) -> dict[int, float]:

@@ -34,7 +34,7 @@ MIN_IDLE_S = 3.0
 IDLE_TIMES = 4.0
 """Minimum factor over the usual idle time."""
 IDLE_RATIO = 0.02
-"""Maximum step of an element at rest, as a ratio of its usual range."""
+"""Maximum distance of an element at rest from its position, as a ratio of its usual range."""
 MIN_RETURN = 0.08
 """Minimum distance of an arm from its start, as a ratio of the range, before it jumps back."""
 MIN_LENGTH_TIMES = 3.0
@@ -146,16 +146,28 @@ def _returns(evidence: Evidence, state: Array) -> int:
     do="demorec dataset trim {path} --idle --out NEW",
 )
 def idle_ends(evidence: Evidence) -> Iterator[Fault]:
-    """Find episodes that rest for seconds before the first motion or after the last, far longer than the others."""
+    """Find episodes that stay at their first or last position for seconds, far longer than the others, or throughout.
+
+    A slow motion leaves this position.
+    """
     times: dict[int, tuple[float, float]] = {}
+    alive = evidence.once(moving_elements)
     for episode, state in evidence.need_state(8):
-        alive = evidence.ranges > 0
-        moved = (np.abs(np.diff(state[:, alive], axis=0)) > IDLE_RATIO * evidence.ranges[alive]).any(axis=1)
-        moving = np.flatnonzero(moved)
-        if len(moving):
-            times[episode.number] = (
-                evidence.seconds(float(moving[0])),
-                evidence.seconds(float(len(moved) - 1 - moving[-1])),
+        limit = IDLE_RATIO * evidence.ranges[alive]
+        left, reached = (
+            np.flatnonzero((np.abs(state[:, alive] - position) > limit).any(axis=1))
+            for position in (state[0, alive], state[-1, alive])
+        )
+        if len(left):
+            idle_frames = left[0] - 1, len(state) - 2 - reached[-1]
+            times[episode.number] = (evidence.seconds(float(idle_frames[0])), evidence.seconds(float(idle_frames[1])))
+        elif alive.any():
+            yield Fault(
+                severity="look",
+                episode=episode.number,
+                value="0",
+                message="nothing moves in it",
+                do=DROP,
             )
     for place, words in enumerate(("starts", "ends")):
         typical, _ = usual([each[place] for each in times.values()])

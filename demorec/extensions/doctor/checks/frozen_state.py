@@ -25,6 +25,10 @@ MIN_FROZEN_RANGE = 0.3
 MIN_FROZEN_ERRORS = 2.0
 """Minimum factor of the distance between action and a frozen element over the usual one: a hobby servo holds its joint
 for seconds while the difference is within its dead band and load."""
+MIN_COMMANDED_RANGE = 0.1
+"""Minimum range of an element's action, relative to the usual one, at which the element must move."""
+MAX_FLICKER = 0.01
+"""Maximum range of an element that does not move, relative to the usual one: an encoder flickers by a tick or two."""
 MIN_UNCOMMANDED_RANGE = 0.3
 """Minimum range of an element without commands, relative to the arm's usual one: load and sag move a joint less."""
 MAX_END_STOP_RANGE = 0.02
@@ -71,15 +75,18 @@ def frozen_state(evidence: Evidence) -> Iterator[Fault]:
 
 
 def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:
+    """Find elements of the arm that are constant, but for a flicker, while their action moves as far as others."""
+    acting = [each.action for each, _ in episodes if each.action is not None]
+    if not acting:
+        return
+    spans = np.median(np.stack([np.ptp(action, axis=0) for action in acting]), axis=0)
+    usual_span = float(np.median(spans[spans > 0])) if (spans > 0).any() else 0.0
+    commanded = [element for element, column in enumerate(evidence.action_of) if column is not None]
+    usual_range = float(np.median(evidence.ranges[commanded])) if commanded else 0.0
     for element, column in enumerate(evidence.action_of):
-        if column is None or evidence.is_gripper[element] or any(np.ptp(state[:, element]) for _, state in episodes):
+        if column is None or evidence.is_gripper[element] or evidence.ranges[element] > MAX_FLICKER * usual_range:
             continue
-        acting = [each.action for each, _ in episodes if each.action is not None]
-        if not acting:
-            return
-        spans = np.median(np.stack([np.ptp(action, axis=0) for action in acting]), axis=0)
-        usual_span = float(np.median(spans[spans > 0])) if (spans > 0).any() else 0.0
-        if spans[column] > 0.1 * usual_span:
+        if spans[column] > MIN_COMMANDED_RANGE * usual_span > 0:
             yield Fault(
                 severity="broken",
                 value="0",

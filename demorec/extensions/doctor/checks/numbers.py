@@ -173,11 +173,12 @@ def _action_units(evidence: Evidence) -> Iterator[Fault]:
 def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     """Find steps several times as large as the largest usual one and as the steps before and after them.
 
-    Grippers are excluded, because they snap. A reading that jumps away and back also counts. Steps next to which
-    other elements also move fast are excluded: a whole arm that starts or stops in a few frames.
+    Grippers are excluded, because they snap, and so are velocities and forces. A reading that jumps away and back also
+    counts. Steps next to which other elements also move fast are excluded: a whole arm that starts or stops in a few
+    frames.
     """
     episodes = evidence.need_state(8)
-    arm, moves = ~evidence.is_gripper, evidence.once(moving_elements)
+    arm, moves = evidence.is_position & ~evidence.is_gripper, evidence.once(moving_elements)
     largest = [np.abs(np.diff(state, axis=0)).max(axis=0) for _, state in episodes]
     typical = [np.quantile(np.abs(np.diff(state, axis=0)), 0.98, axis=0) for _, state in episodes]
     lowest, highest = evidence.once(state_bounds)
