@@ -142,7 +142,7 @@ def lerobots(bag: Path, out: Path, mapping: Path) -> None:
         for name in rows.cameras
     }
     for name in rows.table.features:
-        names = [element for line in lines.sources(name) for element in line.stream.names]
+        names = [element for key, _ in lines.sources(name) for element in lines.lines[key].stream.names]
         features[name] = {"dtype": "float32", "shape": (len(names),), "names": names}
     dataset = LeRobotDataset.create("local/x", fps=FPS, features=features, root=out / "dataset", use_videos=True)
     decoder, kept = BagDecoder(), {name: list[NDArray[np.uint8]]() for name in rows.cameras}

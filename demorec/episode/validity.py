@@ -204,8 +204,8 @@ _RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera", "langua
 _DATASET = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task", "next", "observation.images")
 """Column names of datasets."""
 _MAX_ELEMENTS = 4096
-MAX_FEATURES = 256
-MAX_CAMERAS = 64
+_MAX_FEATURES = 256
+_MAX_CAMERAS = 64
 _MAX_TEXT = 10_000
 
 
@@ -224,10 +224,10 @@ def _external(info: EpisodeInfo) -> Iterator[str]:
     for what, text in (("task text", info.instruction), ("name of the robot", info.robot_name)):
         if len(text) > _MAX_TEXT or not text.isprintable():
             yield f"the {what} is not a single line of at most {_MAX_TEXT} characters"
-    if not 1 <= len(info.features) <= MAX_FEATURES or len(info.cameras) > MAX_CAMERAS:
+    if not 1 <= len(info.features) <= _MAX_FEATURES or len(info.cameras) > _MAX_CAMERAS:
         yield (
-            f"there are {len(info.features)} features and {len(info.cameras)} cameras, allowed are 1 to {MAX_FEATURES}"
-            f" and up to {MAX_CAMERAS}"
+            f"there are {len(info.features)} features and {len(info.cameras)} cameras, allowed are 1 to {_MAX_FEATURES}"
+            f" and up to {_MAX_CAMERAS}"
         )
     yield from _unique("features", [feature.name for feature in info.features], commas=False)
     yield from _unique("cameras", [camera.name for camera in info.cameras], commas=False)

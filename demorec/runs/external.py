@@ -222,14 +222,6 @@ def open_external_run(path: Path, *, recovers: bool = True) -> Iterator[External
                     path.rmdir()
 
 
-def is_cut_off(path: Path) -> bool:
-    """Check whether the last import into a run ended before it had imported everything."""
-    run = json_object(path / RUN_NAME)
-    sessions = run.get("sessions")
-    last = sessions[-1] if isinstance(sessions, list) and sessions else None
-    return bool(run.get("planned")) or (isinstance(last, dict) and last.get("ended") == "")
-
-
 def _refuse_foreign(path: Path) -> None:
     """Raise ConfigError for an entry with a recording's name that is not a recording."""
     if not path.is_file() or not RECORDING.recognises(path):

@@ -100,7 +100,7 @@ def test_a_mask_selects_episodes_and_a_dataset_sets_the_outcome(tmp_path: Path) 
     assert (result.num_episodes, result.num_frames) == (2, 13)
     lines = load_any_run_file(run).attempts
     assert [(line.num_frames, line.success) for line in lines] == [(7, True), (6, False)]
-    assert tuple(result.left_out) == ("dones", "states", "next_obs")
+    assert set(result.left_out) == {"dones", "states", "next_obs"}
 
 
 @pytest.mark.parametrize("is_compressed", [False, True])
@@ -179,33 +179,6 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
         import_hdf5([file], mapping, tmp_path / "other")
 
 
-@pytest.mark.parametrize(
-    ("kind", "has_channels_first"),
-    [("uint8", True), ("float32", False), ("float64", True), ("float16", False), ("255", True)],
-)
-def test_pixels_in_other_layouts_give_the_same_recording(kind: str, has_channels_first: bool, tmp_path: Path) -> None:
-    """The same images in other layouts than (height, width, RGB) uint8 make the same recording, apart from its
-    description.
-    """
-    found = []
-    for folder in ("usual", "other"):
-        file = write_aloha(tmp_path / folder / "episode_0.hdf5")
-        with h5py.File(file, "r+") as opened:
-            for camera in ALOHA_CAMERAS if folder == "other" else ():
-                images = opened[f"observations/images/{camera}"][:]
-                if kind != "uint8":
-                    images = images.astype("float32") if kind == "255" else (images / 255).astype(kind)
-                del opened[f"observations/images/{camera}"]
-                shown = images.transpose(0, 3, 1, 2) if has_channels_first else images
-                opened[f"observations/images/{camera}"] = shown
-        result, run = imported(file)
-        with Recording(recordings(run)[0]) as recording:
-            found.append([[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS])
-    assert found[0] == found[1]
-    told = {"uint8": "64x48, pixels", "255": "64x48, float32 from 0 to 255"}.get(kind, f"64x48, {kind} from 0 to 1")
-    assert all(words.startswith(told) for words in result.cameras.values())
-
-
 def _one_observation_more(file: Path) -> None:
     """Add a row to every observation, like recorders that observe both before and after each action."""
     with h5py.File(file, "r+") as opened:
@@ -228,36 +201,8 @@ def test_one_observation_more_than_actions_is_left_out(tmp_path: Path, capsys: p
             packets = [[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS]
             found.append((table.time_ns.tolist(), packets, {n: v.tolist() for n, v in table.features.items()}))
         told = "the last observation of each episode is left out: no action follows it." in capsys.readouterr().out
-        assert told == ("The last observation of each episode" in file.with_suffix(".toml").read_text())
         assert told == (folder == "other")
     assert found[0] == found[1]
-
-
-@pytest.mark.parametrize("camera", ["jpeg", "pixels", "depth", "floats", "next"])
-def test_a_camera_is_left_out_only_by_the_mapping(
-    camera: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    file = write_robomimic(tmp_path / "demo.hdf5")
-    mapping = suggested(file)
-    assert 'leave_out = ["next_obs"]' in mapping.read_text()
-    name = "next_obs" if camera == "next" else f"obs/{camera}"
-    with h5py.File(file, "r+") as opened:
-        for demo, length in zip(DEMOS, ROBOMIMIC_LENGTHS, strict=True):
-            data = np.frombuffer(jpeg(images(1, 0)[0], 50), np.uint8)
-            values = {
-                "jpeg": np.tile(data, (length, 1)),
-                "pixels": images(length, 0),
-                "depth": np.ones((length, HEIGHT, WIDTH), np.float32),
-                "floats": (images(length, 0) / 255).transpose(0, 3, 1, 2),
-            }
-            if camera in values:
-                opened[f"data/{demo}/obs/{camera}"] = values[camera]
-    if camera == "next":
-        mapping.write_text(mapping.read_text().replace('leave_out = ["next_obs"]', ""))
-    _refused(file, mapping, f"does not name the cameras in {name} of data/demo_0", capsys)
-    text = mapping.read_text().replace('leave_out = ["next_obs"]', "")
-    mapping.write_text(f'leave_out = ["next_obs", "{name}"]\n{text}')
-    assert name in import_hdf5([file], mapping, tmp_path / "run").left_out
 
 
 def _soft_link(file: h5py.File) -> None:
@@ -337,10 +282,8 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     "another width": (
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 8)))), "The episodes differ"
     ),
-    "images of integers": (_images(np.zeros((5, 8, 8, 3), np.int32)), "images are uint8 or floats"),
-    "images of one colour": (_images(np.zeros((5, 8, 8, 1), np.uint8)), "images are uint8 or floats"),
-    "images from -1": (_images(np.linspace(-1, 1, 5 * 192).reshape(5, 8, 8, 3)), "has pixels from -1 to 1, floats"),
-    "images of nan": (_images(np.full((5, 8, 8, 3), np.nan)), "not finite in row 0"),
+    "images of integers": (_images(np.zeros((5, 8, 8, 3), np.int32)), "images are uint8 of rows"),
+    "images of one colour": (_images(np.zeros((5, 8, 8, 1), np.uint8)), "images are uint8 of rows"),
     "soft link": (_soft_link, "data/demo_1/actions is a link"),
     "external link": (_external_link, "data/demo_1 is a link"),
     "masked external link": (_external_link, "data/demo_1 is a link"),
@@ -445,7 +388,7 @@ def test_damaged_compression_is_reported(tmp_path: Path, capsys: pytest.CaptureF
 JPEG_FAULTS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "cut off": (lambda row: row[:300].ljust(len(row), b"\0"), "holds no whole JPEG file in row 2"),
     "no jpeg": (lambda row: b"\x89PNG".ljust(200, b"x") + b"\xff\xd9", "in row 2"),
-    "another size": (lambda row: jpeg(np.zeros((16, 16, 3), np.uint8), 50), "compress_len"),
+    "another size": (lambda row: jpeg(np.zeros((16, 16, 3), np.uint8), 50), "changes its size to 16x16 in row 2"),
     "empty": (lambda row: b"", "holds no whole JPEG file in row 2"),
 }
 
@@ -514,7 +457,7 @@ def test_the_state_of_isaac_lab_is_the_absolute_one(robot: str, tmp_path: Path) 
             assert names["observation.ee_pose"][3:] == ("qw", "qx", "qy", "qz")
 
 
-@pytest.mark.parametrize("layout", ["isaac", "root", "aloha", "unknown"])
+@pytest.mark.parametrize("layout", ["isaac", "aloha", "unknown"])
 def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "demo.hdf5"
     if layout == "unknown":
@@ -522,10 +465,10 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
             file["log/values"] = np.zeros((3, 2))
     else:
         writers: dict[str, Callable[[Path], Path]]
-        writers = {"isaac": write_isaac, "root": write_groups_at_root, "aloha": write_aloha}
+        writers = {"isaac": write_isaac, "aloha": write_aloha}
         writers[layout](path)
     with h5py.File(path) as file:
-        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "root": ("demo_0", 3, 15), "aloha": ("/", 1, 8),
+        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "aloha": ("/", 1, 8),
                               "unknown": ("/", None, 0)}[layout]  # fmt: skip
         expected: dict[str, list[int]] = {}
         file[first].visititems(
@@ -541,23 +484,19 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
     )
 
 
-@pytest.mark.parametrize(
-    ("action", "state", "demos"),
-    [
-        ("action", "observation", ("demo_0", "demo_2", "demo_10")),
-        ("actions", "obs", ("Trial 4", "ep-3", "x")),
-        ("action", "state", ("0", "7")),
-        ("actions", "qpos", ("x",)),
-    ],
-)
-def test_episodes_that_are_groups_at_the_root(action: str, state: str, demos: tuple[str, ...], tmp_path: Path) -> None:
-    others = ("contact 2", "force", "tip/pose")
-    file = write_groups_at_root(tmp_path / "demo.hdf5", action=action, state=state, others=others, demos=demos)
-    result, run = imported(file, changes={"# fps = 20 ": "fps = 20 "})
-    assert result.num_episodes == len(demos)
+def test_episodes_that_are_groups_at_the_root(tmp_path: Path) -> None:
+    demos = ("ep-3", "0", "Trial 4")
+    file = write_groups_at_root(tmp_path / "demo.hdf5", demos)
+    mapping = tmp_path / "robot.toml"
+    mapping.write_text(
+        '[robot]\nname = "arm"\n[task]\ntext = "push"\n[clock]\nfps = 20\n[episodes]\ngroup = "/"\n'
+        '[[features."observation.state"]]\ndataset = "observation"\n[[features.action]]\ndataset = "action"\n'
+        '[[features."observation.tip"]]\ndataset = "tip/pose"\n'
+    )
+    assert import_hdf5([file], mapping, tmp_path / "run").num_episodes == len(demos)
     with h5py.File(file) as source:
-        for demo, path in zip(demos, recordings(run), strict=True):
+        for demo, path in zip(("Trial 4", "ep-3", "0"), recordings(tmp_path / "run"), strict=True):
             with Recording(path) as recording:
                 held = {values.tobytes() for values in recording.table().features.values()}
-            for name in (action, state, *others):
+            for name in ("action", "observation", "tip/pose"):
                 assert source[f"{demo}/{name}"][:].tobytes() in held, name

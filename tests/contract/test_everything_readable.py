@@ -268,7 +268,7 @@ def test_omissions_and_the_mapping_are_reported(
     printed = capsys.readouterr()
     assert printed.out.startswith(f"{source}: ")
     assert f"{source}: read by the suggested mapping (observation.state from obs/robot0_joint_pos and" in printed.err
-    assert "because the mapping does not name them: dones, rewards, states, next_obs." in printed.err
+    assert "because the mapping does not name them: dones, next_obs, rewards, states." in printed.err
 
 
 def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -26,7 +26,7 @@ _NUMBERS: tuple[Any, ...] = (
 _TOML_VALUES = (
     "0", "-1", "1", "9" * 30, "9" * 5000, "1e300", "-1e300", "inf", "nan", "true", '""', '"\\u0000"', '"a\\u0000b"',
     "[]", "[[]]", "[[0, 1]]", "[[0, 1e300]]", "[[-5, 1e9]]", "{}", "{a = 1}", "2001-99-99", "2001-01-01", '"grid"',
-    '"/joints"', '"/image"', '"linear"', '"nearest"', '"' + "a." * 3000 + '"', '["a", "a"]', "[0, 0]", "[99999]",
+    '"/joints"', '"/image"', '"nearest"', '"' + "a." * 3000 + '"', '["a", "a"]', "[0, 0]", "[99999]",
     '"position[0]"', '"[0][0]"', '"x[a=b]"', '"header.stamp"', '"\\u202e<script>"', '"/"', '"../../etc/passwd"', '"."',
 )  # fmt: skip
 _YAML_VALUES = (
@@ -48,7 +48,7 @@ info_topic = "/info"
 """
 )
 _EXTRAS = (
-    '[episodes]\ncut = "marker"\ntopic = "/text"\n', '[episodes]\ncut = "gap"\ngap_s = 0.01\n',
+    '[episodes]\ncut = "marker"\ntopic = "/text"\n',
     '[episodes]\ncut = "times"\ntimes_s = [[0.0, 0.2], [0.1, 0.3]]\n', '[subtasks]\ntopic = "/text"\n',
     "",
 )  # fmt: skip
@@ -142,7 +142,7 @@ class FuzzedBags:
         lines = (MAPPING + chance.choice(_EXTRAS)).splitlines()
         keys = (
             "urdf", "urdf_topic", "max_age_s", "max_trim_s", "stamp", "sample", "rows", "elements", "names", "joints",
-            "limits", "unit", "to", "prefix", "times_s", "gap_s", "when_old", "fps", "field", "names_field", "cut",
+            "unit", "to", "prefix", "times_s", "when_old", "fps", "field", "cut",
         )  # fmt: skip
         for _ in range(chance.choice((1, 1, 2, 4))):
             at = chance.randrange(len(lines))

@@ -147,27 +147,10 @@ def pose_stamped(topic: str, *, ahead_ns: int = 0) -> Topic:
 
 
 POSE_NAMES = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
-TWIST_NAMES = tuple(f"{part}.{axis}" for part in ("linear", "angular") for axis in "xyz")
 
 
 def flat(body: Body) -> list[float]:
     return [number for part in body.values() for number in part.values()]
-
-
-def twist_at(time: int) -> Body:
-    return {part: dict(zip("xyz", motion(time, 3, shift=k).tolist(), strict=True))
-            for k, part in enumerate(("linear", "angular"))}  # fmt: skip
-
-
-def cmd_vel(topic: str) -> Topic:
-    return Topic(name=topic, type="geometry_msgs/msg/Twist", has_header=False, body=lambda time, number: twist_at(time))
-
-
-def odometry(topic: str) -> Topic:
-    return Topic(
-        name=topic, type="nav_msgs/msg/Odometry",
-        body=lambda time, number: {"pose": {"pose": pose_at(time)}, "twist": {"twist": twist_at(time)}},
-    )  # fmt: skip
 
 
 def trajectory(topic: str, names: Sequence[str]) -> Topic:
@@ -299,12 +282,6 @@ LAYOUTS: dict[str, Layout] = {
             for side in ("left", "right")
         ),
         cameras=2,
-    ),
-    "mobile base": Layout(
-        topics=(odometry("/odom"), cmd_vel("/cmd_vel"), camera("/camera/image_raw/compressed")),
-        state=(Part(topic="/odom", names=(*POSE_NAMES, *TWIST_NAMES),
-                    numbers=lambda body: [*flat(body["pose"]["pose"]), *flat(body["twist"]["twist"])]),),
-        action=(Part(topic="/cmd_vel", names=TWIST_NAMES, numbers=flat),),
     ),
     "topics of numbers": Layout(
         topics=(

@@ -10,7 +10,6 @@ import pytest
 from support import bag_mappings, bags
 from support.commands import exit_code
 
-from demorec.extensions.imports.bag import open_bag
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.fields import (
     FieldError,
@@ -20,9 +19,8 @@ from demorec.extensions.imports.fields import (
     parse_path,
     reader_of,
 )
+from demorec.extensions.imports.import_run import import_bags
 from demorec.extensions.imports.mapping import Source
-from demorec.extensions.imports.mapping_file import read_mapping
-from demorec.extensions.imports.streams import read_streams
 from demorec.extensions.imports.words import task_in_name
 
 WRONG = [
@@ -31,15 +29,14 @@ WRONG = [
     ('field = "position"', 'feild = "position"', r"unknown key 'feild' in features.observation.state"),
     ('fps = 30', 'fps = "x"', r"'x' is not a whole number"),
     ('fps = 30', 'fps = 0', r"clock.fps is 0, allowed are 1 to 1000"),
-    ('[robot]', '[episodes]\ncut = "service"\n[robot]', r"'service' is not one of 'file', 'marker', 'gap', 'times'"),
+    ('[robot]', '[episodes]\ncut = "service"\n[robot]', r"'service' is not one of 'file', 'marker', 'times'"),
     ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
     ('text = "stack the cups"', '', r"\[task\] needs one of text, topic and file_name"),
     ('[features.action]', '[features.act]', r"missing feature 'action'"),
-    ('[cameras.front]', '[cameras."a b"]', r"a camera cannot be called 'a b'"),
+    ('[cameras.front]', '[cameras."a b"]', r"a camera is called 'a b', allowed are letters"),
     ('topic = "/leader/joint_states"', 'next = "observation.stat"', r"Did you mean 'observation.state'\?"),
     ('topic = "/leader/joint_states"', 'next = "observation.state"\ntopic = "/x"', r"either a topic or next"),
     ('field = "position"\n[cam', 'field = "position"\nunit = "rad"\nto = "m"\n[cam', r"cannot turn rad into m"),
-    ('field = "position"\n[cam', 'field = "position"\nunit = "percent"\nto = "rad"\n[cam', r"needs limits"),
     ("/follower/joint_states", "/folower/joint_states", r"no message of '/folower/joint_states'. Did you mean '/foll"),
     ('field = "position"', 'field = "postion"', r"no field 'postion'. Did you mean 'position'\?"),
     ('field = "position"', 'field = "header.frame_id"', r"holds no numbers"),
@@ -66,11 +63,11 @@ def test_a_wrong_mapping_is_refused(
 
 
 def test_two_topics_for_the_same_elements_are_refused(tmp_path: Path) -> None:
-    bag = open_bag(bags.write_mcap(bags.in_order(bags.agilex(0.3)), tmp_path / "bag.mcap"))
+    bag = bags.write_mcap(bags.in_order(bags.agilex(0.3)), tmp_path / "bag.mcap")
     text = bag_mappings.AGILEX.replace('prefix = "right_"', 'prefix = "left_"')
-    mapping = read_mapping(bag_mappings.write_mapping(text, tmp_path / "robot.toml"))
-    with pytest.raises(BagError, match=r"gets 'left_joint0' from /puppet/joint_left and from /puppet/joint_right"):
-        read_streams(bag, mapping)
+    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
+    with pytest.raises(BagError, match=r"2 elements of the feature 'observation.state' are called 'left_joint0'"):
+        import_bags([bag], mapping, tmp_path / "run")
 
 
 def test_paths_of_fields() -> None:
@@ -99,16 +96,15 @@ def test_publishers_of_velocities_alone_are_separate() -> None:
         reader_of(source, {"position": np.array([1.0])})
 
 
-def test_a_source_without_a_list_is_refused_where_publishers_differ(tmp_path: Path) -> None:
+def test_messages_of_another_publisher_are_a_finding_without_a_list_of_joints(tmp_path: Path) -> None:
     notes = bags.so101(0.3)
     notes += bags.joints("/follower/joint_states", ("wheel_left", "wheel_right"), bags.times(50, 0.3, seed=9))
-    bag = open_bag(bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap"))
-    mapping = read_mapping(bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml"))
-    told = r"takes all joints of /follower/joint_states.*joints = \["
-    with pytest.raises(BagError, match=told) as caught:
-        read_streams(bag, mapping)
-    assert '"wheel_left", "wheel_right"' in str(caught.value)
-    assert "\n" not in str(caught.value)
+    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "robot.toml")
+    (report,) = import_bags([bag], mapping, tmp_path / "run").reports
+    (text,) = [finding.text for finding in report.findings if finding.kind == "malformed"]
+    assert "15 messages cannot be used" in text
+    assert "'wheel_left': select one publisher by joints" in text
 
 
 @pytest.mark.timeout(60)
@@ -122,10 +118,9 @@ def test_long_numbers_in_a_name_do_not_slow_it_down() -> None:
     [
         ("degree", "rad", [180.0, -90.0], [np.pi, -np.pi / 2]),
         ("rad", "degree", [np.pi, 0.0], [180.0, 0.0]),
-        ("percent", "rad", [-100.0, 50.0], [-1.0, 1.5]),
         ("mm", "m", [5.0, 0.0], [0.005, 0.0]),
     ],
 )
 def test_units(unit: str, to: str, given: list[float], expected: list[float]) -> None:
-    source = Source(topic="/j", field="x", unit=unit, to=to, limits=((-1.0, 1.0), (-3.0, 3.0)))  # type: ignore[arg-type]
+    source = Source(topic="/j", field="x", unit=unit, to=to)  # type: ignore[arg-type]
     assert np.allclose(converted(source, np.array([given])), expected)

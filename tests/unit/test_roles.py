@@ -131,7 +131,7 @@ def test_other_ways_to_name_a_role_wrongly(tmp_path: Path, capsys: Capture) -> N
     assert exit_code("replay", root, *NAMED) == 2
     assert "add --robot" in capsys.readouterr().err
     assert exit_code("import", "bag.mcap", "--out", tmp_path / "run", *NAMED) == 2
-    assert "belong to datasets" in capsys.readouterr().err
+    assert "only for datasets" in capsys.readouterr().err
     assert exit_code("import", "lerobot", root, "--out", tmp_path / "run", *NAMED, "--gripper", "3") == 2
     assert "An import takes whole features" in capsys.readouterr().err
 

@@ -213,21 +213,16 @@ def _folder(path: Path) -> Bag:
         raise BagError(f"The bag is compressed with {compression[:40]!r}, only zstd is supported: {path}")
     if not names:
         raise BagError(f"The bag's {ROSBAG2} names no files: {path}")
-    files = _renamed(tuple(path / name for name in dict.fromkeys(names)))
+    files = tuple(path / name for name in dict.fromkeys(names))
+    if len(files) == 1 and not os.path.lexists(files[0]):  # a bag's only file may have been renamed
+        found = tuple(path.glob(f"*{files[0].suffix}"))
+        files = found if len(found) == 1 else files
     for file in files:
         if not os.path.lexists(file):
             raise BagError(f"The bag lacks its file {file.name[:80]}: {path}")
         _refuse_link(file)
         _magic_of(file)
     return Bag(path=path, files=files, messages_are_compressed=mode == "message")
-
-
-def _renamed(files: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Find a bag's only file under its new name if it is missing under the old one."""
-    if len(files) != 1 or os.path.lexists(files[0]):
-        return files
-    found = tuple(files[0].parent.glob(f"*{files[0].suffix}"))
-    return found if len(found) == 1 else files
 
 
 def _refuse_link(file: Path) -> None:

@@ -14,7 +14,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError
 from demorec.core.extension import ReaderRow
 from demorec.core.extensions import reader_rows
 from demorec.core.registry import nearest_match
@@ -25,7 +25,6 @@ if TYPE_CHECKING:
     from demorec.extensions.imports.episode_writer import FramesImport
     from demorec.extensions.imports.import_file import BagReport
 
-MAX_WORKERS = 1000
 _BAGS = "Bags; each is one episode, or several by the mapping."
 BAGS = reader_rows()["rosbag"]
 _FORMATS = {row.word: row for row in reader_rows().values() if row.word}
@@ -69,8 +68,6 @@ class Import:
     """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and unreadable episodes of a
     dataset; list them at the end and exit with 1. Otherwise the first of them ends the import.
     """
-    workers: int = 1
-    """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or file to standard output instead of importing."""
     motors: MotorsByFlags = field(default_factory=MotorFlags)
@@ -84,7 +81,6 @@ class Import:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.out is not None:
             refuse_inside([self.out])
-        check_option("workers", self.workers, 1, MAX_WORKERS)
         word = str(self.bags[0])
         form = _FORMATS.get(word, BAGS)
         self._check_flags(form)
@@ -121,21 +117,17 @@ class Import:
 
     def _check_flags(self, form: ReaderRow) -> None:
         """Raise ConfigError for flags of another format."""
-        if form.suggester and self.motors.named is not None:
-            raise ConfigError("--motor-units belongs to datasets: demorec import lerobot DATASET --out RUN.")
-        if form.suggester and self.roles.named:
-            raise ConfigError(
-                "--state, --action and --gripper belong to datasets (demorec import lerobot DATASET --out RUN); "
-                "bags and HDF5 files have roles in their mapping."
-            )
-        if form is not BAGS and (self.workers > 1 or (self.skip_bad and form.suggester)):
-            raise ConfigError(
-                "--workers is for bags, and --skip-bad for bags and episodes of datasets: leave them out."
-            )
-        if form.suggester and self.episodes:
-            raise ConfigError(
-                "--episodes belongs to datasets (demorec import lerobot DATASET --out RUN); mappings have [episodes]."
-            )
+        of_datasets = {
+            "--motor-units": self.motors.named,
+            "--state, --action and --gripper": self.roles.named,
+            "--episodes": self.episodes,
+            "--skip-bad": form is not BAGS and self.skip_bad,
+        }
+        for flag, value in of_datasets.items():
+            if form.suggester and value:
+                raise ConfigError(
+                    f"{flag}: only for datasets (demorec import lerobot DATASET --out RUN), leave it out."
+                )
         if not form.suggester and (self.suggest or self.mapping is not None):
             raise ConfigError(f"The import of {form.name} needs no mapping: leave --mapping and --suggest out.")
 
@@ -160,7 +152,6 @@ class Import:
                 mapping,
                 out,
                 video=self.video,
-                workers=self.workers,
                 skip_bad=self.skip_bad,
                 tell=lambda report: say(*_report_lines(report), ""),
                 progress=bar.set,

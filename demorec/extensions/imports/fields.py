@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import base64
-import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -165,8 +165,6 @@ class SourceReader:
         several share one.
         steps: Path of the numbers.
         names_steps: Path of the corresponding names; None if elements have none.
-        quaternions: First element of each x, y, z, w group.
-        others: Names that later messages add, if the source takes all elements.
     """
 
     source: Source
@@ -174,8 +172,6 @@ class SourceReader:
     joints: tuple[str, ...] = ()
     steps: tuple[Step, ...] = ()
     names_steps: tuple[Step, ...] | None = None
-    quaternions: tuple[int, ...] = ()
-    others: dict[str, None] = field(init=False, compare=False, default_factory=dict)
     _orders: dict[tuple[str, ...], list[int]] = field(init=False, compare=False, default_factory=dict)
 
     def read(self, values: Values) -> NDArray[np.floating[Any]]:
@@ -206,12 +202,14 @@ class SourceReader:
         return vector
 
     def _order_of(self, names: tuple[str, ...]) -> list[int]:
-        takes_all = not self.source.joints and not self.source.elements
-        if takes_all and len(self.others) < MAX_ELEMENTS:
-            self.others |= dict.fromkeys(name for name in names if name not in self.joints)
         missing = [joint for joint in self.joints if joint not in names]
-        if missing and len(missing) == len(self.joints):
+        if self.source.joints and len(missing) == len(self.joints):
             raise OtherPublisherError("it names none of the joints")
+        takes_all = not self.source.joints and not self.source.elements
+        if takes_all and (others := [name for name in names if name not in self.joints]):
+            raise FieldError(
+                f"it names other joints than the first message, such as {others[0]!r}: select one publisher by joints"
+            )
         if missing:
             raise FieldError(f"the joint {missing[0]!r} is missing")
         order = [names.index(joint) for joint in self.joints]
@@ -235,24 +233,19 @@ def reader_of(source: Source, values: Values) -> SourceReader:
     count = sum(np.size(item) for _, item in parts)
     if count > MAX_ELEMENTS:
         raise FieldError(f"the field {source.field!r} holds {count:,} numbers, at most {MAX_ELEMENTS:,} are supported")
-    if source.names_field:
-        names_steps: tuple[Step, ...] | None = parse_path(source.names_field)
+    beside = _names_beside(values, steps)
+    if not source.joints:
+        beside = [(place, names) for place, names in beside if len(names) == np.size(found)]
+    names_steps, named = beside[0] if beside else (None, None)
+    if not source.joints:
+        labels = picked(source, named or _labels(source.field, parts), repr(source.field))
+    elif named is None:
+        raise FieldError(f"the elements of {source.field!r} have no names, pick them by elements = [0, 1, ...]")
+    elif missing := [joint for joint in source.joints if joint not in named]:
+        problem = f"there is no joint {missing[0]!r}.{nearest_match(missing[0], named)}".rstrip(".")
+        raise OtherPublisherError(problem) if len(missing) == len(source.joints) else FieldError(problem)
     else:
-        beside = _names_beside(values, steps)
-        names_steps = next((place for place, names in beside if len(names) == np.size(found)), None)
-    named = _names_at(values, names_steps) if names_steps is not None else None
-    if source.joints:
-        if named is None:
-            others = {name for _, names in _names_beside(values, steps) for name in names}
-            if others and not others & {*source.joints}:
-                raise OtherPublisherError("it names none of the joints")
-            raise FieldError(f"the elements of {source.field!r} have no names, pick them by elements = [0, 1, ...]")
-        if missing := [joint for joint in source.joints if joint not in named]:
-            problem = f"there is no joint {missing[0]!r}.{nearest_match(missing[0], named)}".rstrip(".")
-            raise OtherPublisherError(problem) if len(missing) == len(source.joints) else FieldError(problem)
         labels = list(source.joints)
-    else:
-        labels = picked(source, named if named is not None else _labels(source.field, parts), repr(source.field))
     is_named = bool(source.joints) or (named is not None and len(set(named)) == len(named))
     return SourceReader(
         source=source,
@@ -260,7 +253,6 @@ def reader_of(source: Source, values: Values) -> SourceReader:
         joints=tuple(labels) if is_named else (),
         steps=steps,
         names_steps=names_steps,
-        quaternions=() if source.joints else _quaternions(labels),
     )
 
 
@@ -273,21 +265,18 @@ def picked[T](source: Source, elements: Sequence[T], place: str) -> list[T]:
 
 def names_of(source: Source, labels: Sequence[str], place: str) -> tuple[str, ...]:
     """Names in the feature of the selected elements; FieldError if their numbers differ."""
-    for what, given in (("names", source.names), ("limits", source.limits)):
-        if given and len(given) != len(labels):
-            raise FieldError(f"{what}: {len(given)} given for the {len(labels)} elements of {place}")
+    if source.names and len(source.names) != len(labels):
+        raise FieldError(f"names: {len(source.names)} given for the {len(labels)} elements of {place}")
     return tuple(source.prefix + name for name in source.names or labels)
 
 
-def _names_beside(values: Values, steps: tuple[Step, ...]) -> Iterator[tuple[tuple[Step, ...], list[str]]]:
+def _names_beside(values: Values, steps: tuple[Step, ...]) -> list[tuple[tuple[Step, ...], list[str]]]:
     """Path and texts of each list of names that may belong to the numbers at a path."""
+    found = []
     for place in dict.fromkeys([*((*steps[:-1], name) for name in _NAME_FIELDS), *((name,) for name in _NAME_FIELDS)]):
-        try:
-            names = follow(values, place)
-        except (FieldError, OtherPublisherError):
-            continue
-        if isinstance(names, list) and all(isinstance(name, str) for name in names):
-            yield place, names
+        with suppress(FieldError, OtherPublisherError):
+            found.append((place, _names_at(values, place)))
+    return found
 
 
 def _names_at(values: Values, steps: tuple[Step, ...]) -> list[str]:
@@ -305,16 +294,6 @@ def _labels(field: str, parts: Sequence[tuple[str, Any]]) -> list[str]:
     return labels
 
 
-def _quaternions(labels: Sequence[str]) -> tuple[int, ...]:
-    """Positions of four elements that are x, y, z, w of the same parent."""
-    starts = []
-    for index in range(len(labels) - 3):
-        four = [label.rpartition(".") for label in labels[index : index + 4]]
-        if [name for _, _, name in four] == ["x", "y", "z", "w"] and len({parent for parent, _, _ in four}) == 1:
-            starts.append(index)
-    return tuple(starts)
-
-
 def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
     """Concatenate numbers to a vector: float32 if all are, otherwise float64, which holds the others exactly."""
     arrays = [np.atleast_1d(np.asarray(part)) for part in parts]
@@ -325,10 +304,4 @@ def _joined(parts: Sequence[Any]) -> NDArray[np.floating[Any]]:
 def converted(part: Source, vectors: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
     """Return (N, D) in the feature's unit; the same array if the units are equal."""
     factor = CONVERSIONS.get((part.unit, part.to or part.unit))
-    if factor is None:
-        return vectors
-    if math.isnan(factor):
-        low, high = np.array(part.limits, dtype=np.float64).T
-        scaled: NDArray[np.float64] = low + (vectors.astype(np.float64) + 100.0) / 200.0 * (high - low)
-        return scaled
-    return vectors.astype(np.float64) * factor
+    return vectors if factor is None else vectors.astype(np.float64) * factor

@@ -1,4 +1,4 @@
-"""Findings about a stream of a bag: lost, repeated and late messages, clocks, images, with a name for each kind.
+"""Findings about a bag: lost and repeated messages, clocks, streams that are shorter than others, and images in no row.
 
 The limits give no findings for sensors with ordinary jitter and latency, or for robots that rest for a while. Nothing
 is repaired: a finding describes the data in the rows.
@@ -6,30 +6,29 @@ is repaired: a finding describes the data in the rows.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from demorec.extensions.imports.bag import EPOCH_S
 from demorec.extensions.imports.clock import NS, SKEW_S, Int, Numbers, Timeline, without_log_time
-from demorec.extensions.imports.streams import NO_STAMP, Stream
+from demorec.extensions.imports.rows import RATE, EpisodeRows, Timelines
+from demorec.extensions.imports.streams import NO_STAMP
 
-_JITTER = 0.25
-"""Maximum deviation of nine in ten sensor steps, as a ratio of the period."""
-GAP = 5.0
+_YEAR_S = 365.25 * 86_400
+_GAP = 5.0
 """Minimum periods without a message for a gap; shorter ones are lost messages."""
-_STEP_S = 0.05
-"""Minimum jump or drift of a clock in a bag that is reported."""
-STILL_S = 0.5
-"""Minimum time by which a stream must begin later or end earlier than others; no camera repeats an image for
-that long.
-"""
-FROZEN = 5
-"""Minimum images in a row with the same bytes: no real camera is free of noise."""
+_LOST = 1.6
+"""Minimum step in periods that implies a lost message."""
+_MOVED_S = 0.05
+"""Minimum change of a clock in a bag that is reported."""
+_SHORTER_S = 0.5
+"""Minimum time by which a stream must begin later or end earlier than others."""
 _EARLY_S = 0.05
 """Maximum time by which a header may be later than its log time: clocks set by NTP differ by less."""
-LOST = 1.6
-"""Minimum step in periods that implies a lost message."""
+_MAX_ENCODER_NOISE = 1e-3
+"""Maximum range of a resting joint: radians or metres, or the same ratio of larger values in degrees or counts."""
 NOTE = "note"
 """Kind of an observation that is not a problem."""
 
@@ -49,62 +48,57 @@ class ImportFinding:
     text: str
 
 
-def stream_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
+def bag_findings(bag: Timelines) -> tuple[ImportFinding, ...]:
+    """Findings about a bag's messages, each once."""
+    lines = list(bag.lines.values())
+    skews = _comparable_skews(lines)
+    found = [finding for line in lines for finding in _stream_findings(line, skews[line])]
+    found += [ImportFinding(kind="cut_off", stream="", text=problem) for problem in bag.streams.problems]
+    found += [*_extent_findings(lines), *_clock_findings(bag, lines), *_still_findings(lines)]
+    once: dict[tuple[str, str], ImportFinding] = {}
+    for finding in found:  # features that share a topic also share its findings
+        once.setdefault((finding.kind, finding.text), finding)
+    return tuple(once.values())
+
+
+def _of(line: Timeline, kind: str, text: str) -> ImportFinding:
+    return ImportFinding(kind=kind, stream=line.stream.label, text=f"{line.stream.topic}: {text}")
+
+
+def _stream_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
     """Findings about a stream; (K,) its skews relative to the others."""
-    found = (*_message_findings(line), *_time_findings(line), *_clock_findings(skew), *_image_findings(line))
-    for kind, text in found:
-        yield of_stream(line.stream, kind, text)
-
-
-def of_stream(stream: Stream, kind: str, text: str) -> ImportFinding:
-    """Create a finding about a stream."""
-    return ImportFinding(kind=kind, stream=stream.label, text=f"{stream.topic}: {text}")
-
-
-def _message_findings(line: Timeline) -> Iterator[tuple[str, str]]:
     stream = line.stream
     if stream.num_malformed:
-        yield "malformed", f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
+        text = f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
+        yield _of(line, "malformed", text)
     if not line.is_header and (untimed := int(without_log_time(stream.log_ns).sum())):
-        yield "unstamped", f"{untimed} of {len(stream)} messages have no log time and are left out"
+        yield _of(line, "unstamped", f"{untimed} of {len(stream)} messages have no log time and are left out")
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
     if unstamped and not line.is_log_asked:
-        yield "unstamped", f"{unstamped} of {len(stream)} headers have no time"
+        yield _of(line, "unstamped", f"{unstamped} of {len(stream)} headers have no time")
+    known = line.stamps_ns[line.stamps_ns > 0]
+    if late := max(int(np.sum(np.diff(stream.log_ns) < 0)), int(np.sum(np.diff(known) < 0))):
+        yield _of(line, "order", f"{late} messages come before earlier ones")
+    if repeated := len(known) - len(np.unique(known)):
+        yield _of(line, "duplicates", f"{repeated} messages have the time of another one")
+    if line.is_regular:
+        yield from _loss_findings(line)
+    yield from _skew_findings(line, skew)
+    if stream.heads and not stream.heads[0].is_keyframe:
+        first = int(np.argmax(stream.are_keyframes))
+        yield _of(line, "keyframe", f"its first {first} images cannot be decoded, since no keyframe is before them")
 
 
-def _time_findings(line: Timeline) -> Iterator[tuple[str, str]]:
-    late = int(np.sum(np.diff(line.stream.log_ns) < 0))
-    is_known = line.stamps_ns > 0
-    known = line.stamps_ns[is_known]
-    backwards = int(np.sum(np.diff(known) < 0))
-    if late or backwards:
-        yield "order", f"{max(late, backwards)} messages come before earlier ones"
-    if repeated := line.num_repeated:
-        checksums = np.asarray(line.stream.sums)[is_known].astype(np.int64)
-        same = int(np.sum((np.diff(known) == 0) & (np.diff(checksums) == 0)))
-        yield "duplicates", f"{repeated} messages have the time of another one, {same} of them the same bytes as well"
-    if not line.is_regular:
-        return
-    steps = np.diff(line.times_ns)
-    gaps = np.flatnonzero(steps > GAP * line.period_ns)
-    lost = lost_in(line)
-    small = np.flatnonzero((lost > 0) & (steps <= GAP * line.period_ns))
+def _loss_findings(line: Timeline) -> Iterator[ImportFinding]:
+    steps, lost = np.diff(line.times_ns), lost_in(line)
+    is_gap = steps > _GAP * line.period_ns
+    gaps = np.flatnonzero(is_gap)
     if len(gaps):
-        longest = int(steps[gaps].max())
         begin = (line.times_ns[gaps[0]] - line.times_ns[0]) / NS
-        yield "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest / NS:.3f} s"
-    if len(small):
-        yield "drops", f"{int(lost[small].sum())} of {len(line.times_ns) + int(lost[small].sum())} messages are lost"
-    off = _unevenness(line)
-    if off > _JITTER * line.period_ns:
-        yield "jitter", f"its steps of {line.period_ns / 1e6:.1f} ms are off by {off / 1e6:.1f} ms (one of ten by more)"
-
-
-def _unevenness(line: Timeline) -> float:
-    """Maximum deviation of nine in ten steps of a stream from its period, nanoseconds."""
-    steps = np.diff(line.times_ns)
-    regular = steps[steps <= LOST * line.period_ns]
-    return float(np.percentile(np.abs(regular - line.period_ns), 90)) if len(regular) else 0.0
+        longest = steps.max() / NS
+        yield _of(line, "gap", f"{len(gaps)} gaps, the first at {begin:.2f} s, the longest of {longest:.3f} s")
+    if num_lost := int(lost[~is_gap].sum()):
+        yield _of(line, "drops", f"{num_lost} of {len(line.times_ns) + num_lost} messages are lost")
 
 
 def lost_in(line: Timeline) -> Int:
@@ -113,60 +107,160 @@ def lost_in(line: Timeline) -> Int:
     If its steps are uneven, a long one is not a loss: nine in ten are within 1.6 deviations, nearly all within 4.
     """
     steps = np.diff(line.times_ns)
-    least = max(LOST * line.period_ns, line.period_ns + 4 / 1.6 * _unevenness(line))
+    usual = steps[steps <= _LOST * line.period_ns]
+    uneven = float(np.percentile(np.abs(usual - line.period_ns), 90)) if len(usual) else 0.0
+    least = max(_LOST * line.period_ns, line.period_ns + 4 / 1.6 * uneven)
     return np.where(steps > least, np.round(steps / line.period_ns).astype(np.int64) - 1, 0)
 
 
-def _clock_findings(skew: Numbers) -> Iterator[tuple[str, str]]:
+def _skew_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
     """Findings about the difference between log times and header times."""
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
     if median > SKEW_S:
-        yield "clock_offset", f"its headers are {median:.3f} s behind the times of recording"
+        yield _of(line, "clock_offset", f"its headers are {median:.3f} s behind the times of recording")
     elif median < -_EARLY_S:
-        yield "clock_offset", f"its headers are {-median:.3f} s later than the times of recording"
-    width = max(3, min(20, len(skew) // 4))
+        yield _of(line, "clock_offset", f"its headers are {-median:.3f} s later than the times of recording")
+    width = max(3, min(20, len(skew) // 4))  # a delay of single messages does not change a median
     smooth = np.array([np.median(part) for part in np.array_split(skew, max(2, len(skew) // width))]) / NS
-    # A jump in the middle of a part is split between the steps before and after it.
-    steps = np.diff(smooth)
-    pairs = steps[:-1] + steps[1:] if len(steps) > 1 else steps
-    largest = int(np.argmax(np.abs(pairs)))
-    step = float(pairs[largest])
-    rest = np.delete(steps, [largest, min(largest + 1, len(steps) - 1)])
-    total = float(smooth[-1] - smooth[0])
-    if abs(step) > _STEP_S and abs(step) > 5 * (np.abs(rest).max(initial=0.0) + 1e-4):
-        yield "clock_jump", f"its clock jumps by {-step:+.3f} s"
-    elif abs(total) > _STEP_S and abs(total) > 0.7 * np.abs(np.diff(smooth)).sum():
-        yield "clock_drift", f"its clock drifts by {-total:+.3f} s in the bag"
+    if np.ptp(smooth) > _MOVED_S:
+        yield _of(line, "clock_drift", f"its clock moves by {np.ptp(smooth):.3f} s against the times of recording")
 
 
-def frozen_images(line: Timeline) -> tuple[int, int] | None:
-    """First and last index of consecutive images with the same bytes, for a camera without shorter repetitions."""
-    if not line.stream.heads:
-        return None
-    sums = np.asarray(line.stream.image_sums)[line.order].astype(np.int64)
-    edges = np.concatenate(([0], np.flatnonzero(np.diff(sums) != 0) + 1, [len(sums)]))
-    runs = np.diff(edges)
-    longest = int(np.argmax(runs))
-    # a rendered camera repeats its image whenever everything rests
-    has_noise = not ((runs > 1) & (runs < FROZEN)).any()
-    is_frozen = runs[longest] >= FROZEN and has_noise
-    return (int(edges[longest]), int(edges[longest + 1]) - 1) if is_frozen else None
+def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
+    """(K,) skews of each stream: log time minus header time, nanoseconds.
+
+    If all headers have another epoch than the log times (simulated time), the absolute difference implies nothing about
+    a stream: the result is then relative to the stream with most messages.
+    """
+    skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
+    known = _of_another_epoch(lines)
+    if not known:
+        return skews
+    usual = max(known, key=lambda line: len(line.skews_ns))
+    stamps = usual.stream.header_ns[usual.stream.header_ns > 0]
+    order = np.argsort(stamps, kind="stable")
+    for line in known:
+        own = line.stream.header_ns[line.stream.header_ns > 0]
+        skews[line] = line.skews_ns - np.interp(own, stamps[order], usual.skews_ns[order])
+    return skews
 
 
-def _image_findings(line: Timeline) -> Iterator[tuple[str, str]]:
-    stream = line.stream
-    if not stream.heads:
+def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
+    """Return the streams with header times if all of these have another epoch than the log times."""
+    known = [line for line in lines if len(line.skews_ns)]
+    return known if all(abs(np.median(line.skews_ns)) >= EPOCH_S * NS for line in known) else []
+
+
+def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
+    """Streams with another clock than most, and header times of another epoch that the rows use."""
+    skews = {line: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
+    if not skews:
         return
-    formats = {(head.format, head.encoding) for head in stream.heads.kinds()}
-    if len(formats) > 1:
-        kinds = ", ".join(sorted(f"{name} {encoding}".strip() for name, encoding in formats))
-        yield "format", f"its images are of several kinds ({kinds})"
-    sizes = {(head.width, head.height) for head in stream.heads.kinds() if head.width}
-    if len(sizes) > 1:
-        yield "size", f"its images change their size ({', '.join(f'{w}x{h}' for w, h in sorted(sizes))})"
-    if stream.heads[0].format in ("h264", "h265", "av1") and not stream.heads[0].is_keyframe:
-        keyframes = np.flatnonzero(stream.heads.are_keyframes)
-        first = int(keyframes[0]) if len(keyframes) else len(stream.heads)
-        yield "keyframe", f"its first {first} images cannot be decoded, since no keyframe is before them"
+    usual = float(np.median(list(skews.values())))
+    for line, skew in skews.items():
+        if abs(skew - usual) > SKEW_S:
+            yield _of(line, "clock_offset", f"its clock is off by {usual - skew:+.3f} s against the other streams")
+    used = [skews[line] for line in lines if line.is_header]
+    if not used or abs(usual := float(np.median(used))) <= SKEW_S:
+        return
+    text = f'is on times of recording, {usual:+.3f} s from the headers of the other streams: set clock.stamp = "log"'
+    for line in (line for line in lines if not line.is_header):
+        yield _of(line, "clock_offset", text)
+    for topic, texts in bag.streams.texts.items():
+        if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
+            yield ImportFinding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
+    if _of_another_epoch(lines):
+        text = (
+            f"all headers are {abs(usual) / _YEAR_S:.1f} years {'behind' if usual > 0 else 'ahead of'} the times of "
+            "recording, and rows follow them: simulated time, or a clock that was never set"
+        )
+        yield ImportFinding(kind=NOTE, stream="", text=text)
+
+
+def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
+    """Streams that begin later or end earlier than most."""
+    regular = [line for line in lines if line.is_regular]
+    begin = float(np.median([line.times_ns[0] for line in regular] or [0]))
+    end = float(np.median([line.times_ns[-1] for line in regular] or [0]))
+    for line in regular:
+        late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
+        if late > _SHORTER_S:
+            yield _of(line, "late_start", f"begins {late:.2f} s late")
+        if early > _SHORTER_S:
+            yield _of(line, "early_end", f"ends {early:.2f} s early")
+
+
+def _still_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
+    """A robot without any motion in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
+    measured = [line for line in lines if line.stream.names and len(line.times_ns) > 1]
+    if measured and not any(_moves(line) for line in measured):
+        text = f"nothing moves: no number of {', '.join(line.stream.label for line in measured)} changes in this bag"
+        yield ImportFinding(kind="still", stream="", text=text)
+
+
+def _moves(line: Timeline) -> bool:
+    values = line.stream.values.astype(np.float64)
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < 2:
+        return False
+    noise = _MAX_ENCODER_NOISE * np.maximum(np.abs(values).max(axis=0), 1.0)
+    return bool((np.ptp(values, axis=0) > noise).any())
+
+
+def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:
+    """Findings about the rows of a bag's episodes."""
+    if not episodes:
+        return
+    fps, follows = lines.mapping.clock.fps, next((rows.follows for rows in episodes if rows.follows), "")
+    steps = np.concatenate([np.diff(rows.table.time_ns) for rows in episodes])
+    if follows and len(steps):
+        rate = NS / float(steps[steps <= _LOST * np.median(steps)].mean())
+        if abs(rate - fps) > RATE * fps:
+            text = f"rows follow its messages, {rate:.1f} a second, but fps is {fps}"
+            yield ImportFinding(kind="fps", stream=follows, text=text)
+    for line in lines.lines.values():
+        # Cameras, if any, decide the rows.
+        if line.stream.heads or (line.is_regular and not lines.mapping.cameras):
+            yield from _use_findings(line, episodes, fps, follows)
+
+
+def _use_findings(line: Timeline, episodes: Sequence[EpisodeRows], fps: int, follows: str) -> Iterator[ImportFinding]:
+    """Rows that repeat a message, and messages in no row: a finding if other rows would lose fewer images, else a
+    note.
+    """
+    num_rows = num_repeated = num_free = num_messages = num_skipped = 0
+    for rows in episodes:
+        index = line.chosen(rows.table.time_ns).index
+        steps = np.diff(index)
+        num_rows += len(index)
+        num_messages += int(np.ptp(index)) + 1
+        num_skipped += int(np.maximum(steps - 1, 0).sum())
+        num_repeated += int((steps == 0).sum())
+        # A row may repeat a message if the next one is lost, or at the stream's end, or once at an episode's edge.
+        again = index[1:][steps == 0]
+        again = again[again < len(line.times_ns) - 1]
+        waits = line.times_ns[again + 1] - line.times_ns[again]
+        num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)
+    is_repeated, skipped = num_free > RATE * num_rows, num_skipped / num_messages
+    rate = NS / max(line.period_ns, 1)
+    what = "image" if line.stream.heads else "message"
+    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows repeat its {what}"
+    skips = f"{100 * skipped:.3g} % of its {what}s are in no row"
+    rates = f"since it comes {rate:.1f} times a second and rows {fps} times"
+    if num_free and num_skipped and line.stream.heads:
+        is_other_rate = abs(rate - fps) > max(RATE * fps, 0.5)
+        advice = f"use fps = {max(1, round(rate))}" if is_other_rate else 'use rows = "camera"'
+        advice = "they come too unevenly for these rows" if follows and not is_other_rate else advice
+        yield _of(line, "repeats", f"{repeats} and {skips}: {advice}")
+    elif is_repeated or skipped > RATE:
+        text = f"{repeats if is_repeated else skips}, {rates}"
+        # Taking every second image can be intended; an irregular step is only justified by a camera that rows follow.
+        is_uneven = is_repeated or abs(rate / fps - round(rate / fps)) > RATE
+        if line.stream.heads and is_uneven and not follows:
+            yield _of(line, "repeats" if is_repeated else "skips", f"{text}: use fps = {max(1, round(rate))}")
+        else:
+            yield _of(line, NOTE, text)
+    elif num_skipped and follows and line.stream.heads:
+        yield _of(line, NOTE, f"{skips}: rows follow {follows}")

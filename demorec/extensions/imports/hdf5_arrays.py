@@ -109,7 +109,7 @@ def _labels(array: StoredArray, count: int) -> list[str]:
 
 
 _LEAST_SIDE = 16
-"""Minimum side in pixels: smaller arrays of floats are not images unless the mapping names them as such."""
+"""Minimum side in pixels: smaller arrays of floats are not depth unless the mapping names them as such."""
 _JPEG, _JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 
 
@@ -121,51 +121,35 @@ class StoredCamera:
         kept: "jpeg" for passthrough JPEG files, "16UC1" or "32FC1" for depth; "" for pixels, which are encoded once.
         description: Treatment of the images, in words.
 
-    Args:
-        name: Name of the camera.
-        camera: Its entry in the mapping.
-        array: Its dataset.
-        lengths: (C, T) lengths of all cameras' JPEG files, in unknown camera order; None if the file has none.
-
     Raises:
         FieldError: They are not images.
         Hdf5Error: They cannot be read.
     """
 
-    def __init__(
-        self, name: str, camera: CameraSource, array: StoredArray, lengths: NDArray[np.generic] | None
-    ) -> None:
+    def __init__(self, name: str, camera: CameraSource, array: StoredArray) -> None:
         self.name = name
-        self._camera, self._array, self._lengths = camera, array, lengths
-        self._scale = 0.0
+        self._camera, self._array, self._form = camera, array, image_form(array)
         self.kept: Kept = ""
-        shape = array.shape
-        form = image_form(array)
-        if form is None:
-            found = f"{array.dtype.name} of {'x'.join(map(str, shape))}"
-            raise FieldError(
-                f"{array.place} is {found}, images are uint8 or floats of rows, height, width and 3 colours, or of "
-                "rows, 3 colours, height and width, or rows of JPEG, distances uint16 or float32 of rows, height, width"
-            )
-        self._form = form
-        if form == "jpeg":
+        if self._form == "jpeg":
             _, self.width, self.height = self._file(array.read(0, 1)[0], 0)
             self.kept = "jpeg" if camera.colors == "rgb" else ""
-            self.description = (
-                "jpeg passed through as it is" if self.kept else "jpeg with red and blue exchanged, encoded once"
-            )
-        elif form == "depth":
-            self.height, self.width = shape[1:3]
+            self.description = "jpeg passed through as it is" if self.kept else "jpeg"
+        elif self._form == "depth":
+            self.height, self.width = array.shape[1:3]
             self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
             self.description = f"distances ({self.kept}) passed through as they are"
+        elif self._form == "pixels":
+            self.height, self.width = array.shape[1:3]
+            self.description = "pixels"
         else:
-            self.height, self.width = shape[1:3] if shape[3] == 3 else shape[2:]
-            self.description = f"pixels{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
+            raise FieldError(
+                f"{array.place} is {array.dtype.name} of {'x'.join(map(str, array.shape))}, images are uint8 of rows, "
+                "height, width and 3 colours, or rows of JPEG, distances uint16 or float32 of rows, height, width"
+            )
+        if not self.kept:
+            self.description += f"{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
         if not 1 <= self.width * self.height <= MAX_PIXELS:
             raise FieldError(f"{array.place} has {self.width}x{self.height} pixels, allowed are 1 to {MAX_PIXELS}")
-        if form == "pixels" and array.dtype.kind == "f":
-            self._scale = _float_scale(array)
-            self.description = f"{array.dtype.name} from 0 to {255 / self._scale:g} to 8 bits, {self.description}"
 
     def described(self) -> Camera:
         """The camera in recordings' form."""
@@ -183,29 +167,21 @@ class StoredCamera:
             if self._form == "depth":
                 yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
                 continue
-            if self._form == "pixels":
-                image = row if row.shape[2] == 3 else row.transpose(1, 2, 0)
-                scaled = np.rint(image.astype(np.float64) * self._scale) if self._scale else image
-                yield self._ordered(np.ascontiguousarray(scaled, dtype=np.uint8))
-                continue
-            data, width, height = self._file(row, number)
-            if (width, height) != (self.width, self.height):
-                raise FieldError(f"{self._array.place} changes its size to {width}x{height} in row {number}")
-            yield data if self.kept else self._ordered(self._used(decode_image, data, number))
-
-    def _ordered(self, image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return image if self._camera.colors == "rgb" else np.ascontiguousarray(image[:, :, ::-1])
+            image: Image = row
+            if self._form == "jpeg":
+                image, width, height = self._file(row, number)
+                if (width, height) != (self.width, self.height):
+                    raise FieldError(f"{self._array.place} changes its size to {width}x{height} in row {number}")
+                image = image if self.kept else self._used(decode_image, image, number)
+            if not isinstance(image, bytes) and self._camera.colors == "bgr":
+                image = np.ascontiguousarray(image[:, :, ::-1])
+            yield image
 
     def _file(self, row: NDArray[np.generic], number: int) -> tuple[bytes, int, int]:
         """JPEG file of a row without padding (it ends with its end marker, never with a zero), and its size."""
         data = row.tobytes().rstrip(b"\0")
         if not data.endswith(_JPEG_END):
             raise FieldError(f"{self._array.place} holds no whole JPEG file in row {number}")
-        if self._lengths is not None and len(data) not in self._lengths[:, number].tolist():
-            raise FieldError(
-                f"{self._array.place} holds {len(data):,} bytes of JPEG in row {number}, unlike the lengths "
-                "in compress_len"
-            )
         head = self._used(image_head, data, number)
         if head.format != "jpeg":
             raise FieldError(f"{self._array.place} holds {head.format} in row {number}, not a JPEG file")
@@ -219,21 +195,6 @@ class StoredCamera:
             raise FieldError(f"{self._array.place} cannot be used in row {number}, since {error}") from error
 
 
-def _float_scale(array: StoredArray) -> float:
-    """Factor for floating-point pixels: 255 if none is above 1; FieldError for other ranges."""
-    lowest, highest = 0.0, 0.0
-    for number, row in enumerate(array.rows()):
-        values = row.astype(np.float64)
-        if not np.isfinite(values).all():
-            raise FieldError(f"{array.place} has pixels that are not finite in row {number}")
-        lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
-    if lowest < 0 or highest > 255:
-        raise FieldError(
-            f"{array.place} has pixels from {lowest:g} to {highest:g}, floats are read from 0 to 1 or from 0 to 255"
-        )
-    return 255.0 if highest <= 1 else 1.0
-
-
 def is_camera(array: StoredArray) -> bool:
     """Whether a dataset holds images, JPEG files or, by its name or last axis, depth.
 
@@ -243,9 +204,6 @@ def is_camera(array: StoredArray) -> bool:
     form, place = image_form(array), array.place.rpartition("/")[2]
     if form == "jpeg":
         return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)
-    if form == "pixels" and array.dtype.kind == "f":  # points and transforms are similar arrays
-        first = array.read(0, min(1, len(array))).astype(np.float64)
-        return min(sorted(array.shape[1:])[1:]) >= _LEAST_SIDE and bool(((first >= 0) & (first <= 255)).all())
     is_image = len(array.shape) == 4 and min(array.shape[1:3]) >= _LEAST_SIDE  # form of depth in demorec's own exports
     return form == "pixels" or (form == "depth" and (is_image or "depth" in place))
 
@@ -255,7 +213,7 @@ def image_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
     shape, kind = array.shape, array.dtype
     if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
         return "jpeg"
-    if len(shape) == 4 and (kind == np.uint8 or kind.kind == "f") and 3 in (shape[1], shape[3]):
+    if len(shape) == 4 and kind == np.uint8 and shape[3] == 3:
         return "pixels"
     is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
     return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None

@@ -22,12 +22,10 @@ from demorec.core.registry import nearest_match
 
 Kind = Literal["group", "dataset", "other"]
 Scalar = str | bool | int | float
-_MAX_DEPTH = 6
-"""Maximum depth of groups searched for datasets."""
 _BLOCK_BYTES = 8 << 20
-"""Size of the rows read at once; whole chunks of the file, unless these exceed `_MAX_BLOCK_BYTES`."""
+"""Size of the rows read at once from a dataset without chunks."""
 _MAX_BLOCK_BYTES = 64 << 20
-_KINDS: dict[int, Kind] = {h5py.h5o.TYPE_GROUP: "group", h5py.h5o.TYPE_DATASET: "dataset"}
+_KINDS: dict[type | None, Kind] = {h5py.Group: "group", h5py.Dataset: "dataset"}
 _REASONS = (
     ("truncated file", "it is cut off"),
     ("required filter", "it is compressed in a way that is not installed here"),
@@ -68,8 +66,12 @@ class StoredArray:
         return rows
 
     def rows(self) -> Iterator[NDArray[np.generic]]:
-        """Yield row after row, with some of them in memory at a time."""
-        step = self._rows_at_once()
+        """Yield row after row, with some of them in memory at a time: whole chunks of the file, unless these are
+        large.
+        """
+        row_bytes = max(1, math.prod(self.shape[1:]) * self.dtype.itemsize)
+        step = self._dataset.chunks[0] if self._dataset.chunks else _BLOCK_BYTES // row_bytes
+        step = 1 if self.is_ragged else max(1, min(step, _MAX_BLOCK_BYTES // row_bytes))
         for begin in range(0, len(self), step):
             yield from self.read(begin, min(begin + step, len(self)))
 
@@ -77,17 +79,12 @@ class StoredArray:
         """An attribute of the dataset, as in `ForeignFile.attribute`."""
         return _attribute(self._dataset, name, self.place, self._file)
 
-    def _rows_at_once(self) -> int:
-        if self.is_ragged:  # the length of a row is only known after reading it
-            return 1
-        row = max(1, math.prod(self.shape[1:]) * self.dtype.itemsize)
-        chunk = self._dataset.chunks[0] if self._dataset.chunks else 1
-        step = chunk * max(1, _BLOCK_BYTES // (chunk * row))
-        return step if step * row <= _MAX_BLOCK_BYTES else max(1, _MAX_BLOCK_BYTES // row)
-
 
 class ForeignFile(Closing):
     """An HDF5 file from any writer; a context manager.
+
+    Its groups and datasets are those with a hard link, each under one name: other links can lead out of the file, or
+    in circles.
 
     Attributes:
         path: Path of the file.
@@ -98,11 +95,13 @@ class ForeignFile(Closing):
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._kinds: dict[str, type] = {}
         with _errors_reported("The HDF5 file cannot be read", path):
             with open_regular(path) as file:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                     raise Hdf5Error(f"This is not an HDF5 file: {path}")
             self._root = h5py.File(path, "r", locking=False)
+            self._root.visititems(lambda name, item: self._kinds.__setitem__(name, type(item)))
 
     def close(self) -> None:
         """Close the file; idempotent."""
@@ -114,36 +113,21 @@ class ForeignFile(Closing):
         if not isinstance(group, h5py.Group):
             raise Hdf5Error(f"{_shown(place)} is not a group: {self.path}")
         with _errors_reported(f"{_shown(place)} cannot be read", self.path):
-            return {str(name): self._kind(group, str(name)) for name in group}
+            kinds = {str(name): self._kinds.get(f"{place}/{name}".lstrip("/")) for name in group}
+        return {name: _KINDS.get(kind, "other") for name, kind in kinds.items()}
 
-    def datasets(self, place: str) -> Iterator[str]:
-        """Paths of all datasets below a group, up to a maximum depth; each group once, because it may contain
-        itself.
-        """
-        waiting, seen = [(place, 0)], {self.address(place)}
-        while waiting:
-            group, depth = waiting.pop()
-            below = [(f"{group}/{name}".lstrip("/"), kind) for name, kind in self.children(group).items()]
-            yield from (name for name, kind in below if kind == "dataset")
-            for name, kind in reversed(below):
-                if kind == "group" and depth < _MAX_DEPTH and (address := self.address(name)) not in seen:
-                    seen.add(address)
-                    waiting.append((name, depth + 1))
+    def datasets(self, place: str) -> list[str]:
+        """Paths of all datasets below a group."""
+        inside = f"{place}/" if place else ""
+        return [name for name, kind in self._kinds.items() if kind is h5py.Dataset and name.startswith(inside)]
 
     def has(self, place: str) -> bool:
         """Whether a group or dataset with that name exists; targets of links do not count."""
-        try:
-            self._find(place)
-        except Hdf5Error:
-            return False
-        return True
+        return place.strip("/") in self._kinds
 
     def is_group(self, place: str) -> bool:
         """Whether a group with that name exists."""
-        try:
-            return isinstance(self._find(place), h5py.Group)
-        except Hdf5Error:
-            return False
+        return self._kinds.get(place) is h5py.Group
 
     def attribute(self, place: str, name: str) -> Scalar | None:
         """A text, number or boolean attribute of a group or dataset; None if it is missing."""
@@ -171,41 +155,25 @@ class ForeignFile(Closing):
         found = self._find(place)
         with _errors_reported(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
-            kind = h5py.check_string_dtype(found.dtype) if is_list else None
-            if kind is None or found.external:
+            if not is_list or h5py.check_string_dtype(found.dtype) is None or found.external:
                 raise Hdf5Error(f"{place} is not a list of texts: {self.path}")
             return [str(text) for text in found.asstr(errors="replace")[:]]
 
-    def address(self, place: str) -> int:
-        """Address that identifies a group or dataset, which may have several names."""
-        found = self._find(place)
-        with _errors_reported(f"{_shown(place)} cannot be read", self.path):
-            return int(h5py.h5o.get_info(found.id).addr)
-
     def _find(self, place: str) -> h5py.Group | h5py.Dataset:
-        """Find the object with a name, by hard links alone: others can lead out of the file, or in circles."""
-        found: h5py.Group | h5py.Dataset = self._root
-        walked = ""
-        for part in filter(None, place.split("/")):
-            with _errors_reported(f"{walked}{part} cannot be read", self.path):
-                names = found if isinstance(found, h5py.Group) else ()
-                if part not in names:
-                    near = nearest_match(part, list(names)).rstrip("?")
-                    raise Hdf5Error(f"Missing {walked}{part}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
-                if self._kind(found, part) == "other":
-                    raise Hdf5Error(
-                        f"{walked}{part} is a link or a type, only groups and datasets within the file are read: "
-                        f"{self.path}"
-                    )
-                found, walked = found[part], f"{walked}{part}/"
-        return found
-
-    @staticmethod
-    def _kind(group: h5py.Group, name: str) -> Kind:
-        key = name.encode(errors="surrogateescape")  # h5py's low-level API takes a fraction of the time
-        if group.id.links.get_info(key).type != h5py.h5l.TYPE_HARD:
-            return "other"
-        return _KINDS.get(h5py.h5o.get_info(group.id, key).type, "other")
+        if not place:
+            return self._root
+        if place in self._kinds:
+            with _errors_reported(f"{place} cannot be read", self.path):
+                return self._root[place]
+        parent, _, name = place.rpartition("/")
+        names = self.children(parent)
+        if name in names:
+            raise Hdf5Error(
+                f"{place} is a link, a type or a second name, only groups and datasets within the file are read, each "
+                f"under one name: {self.path}"
+            )
+        near = nearest_match(name, names).rstrip("?")
+        raise Hdf5Error(f"Missing {place}.{near and f'{near}?'}".rstrip(".") + f": {self.path}")
 
 
 def _why_unusable(found: h5py.Group | h5py.Dataset, may_be_ragged: bool) -> str:

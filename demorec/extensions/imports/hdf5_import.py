@@ -10,7 +10,7 @@ import math
 import reprlib
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -28,17 +28,14 @@ from demorec.episode.validity import find_problems
 from demorec.extensions.imports.description import imported_info, urdf_text
 from demorec.extensions.imports.episode_writer import FramesImport, add_episode
 from demorec.extensions.imports.fields import FieldError
-from demorec.extensions.imports.hdf5_arrays import StoredCamera, StoredFeature, is_camera
+from demorec.extensions.imports.hdf5_arrays import StoredCamera, StoredFeature
 from demorec.extensions.imports.hdf5_file import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.extensions.imports.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.extensions.imports.mapping_file import read_mapping
-from demorec.extensions.imports.words import in_natural_order, quoted, task_in_name
+from demorec.extensions.imports.words import in_natural_order, task_in_name
 from demorec.mcap.streams import frame_times
 from demorec.runs.external import differences, open_external_run, planned_episode
 from demorec.runs.find import expect
-
-_LENGTHS = "compress_len"
-"""Dataset of ALOHA's recorders with the length of each row's JPEG file, without padding."""
 
 
 def import_hdf5(
@@ -117,6 +114,11 @@ def _planned(
                 if stored.has_last:
                     left_out["the last observation of each episode"] = "no action follows it"
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
+            success = mapping.episodes.success
+            if success and all(one.outcome.success is None for one in episodes if one.path == path):
+                near = nearest_match(success, list(file.children(places[0])))
+                told = f"No episode has an attribute or dataset {success!r} with its outcome.{near}"
+                raise Hdf5Error(f"{told.rstrip('.?')}: {path}")
     return episodes, cameras, left_out
 
 
@@ -153,20 +155,10 @@ class _Stored:
             raise FieldError(
                 f"{place or 'the episode'} has {num_rows} rows, but its num_samples is {reprlib.repr(stated)}"
             )
-        files = [images for images in cameras.values() if len(images.shape) == 2]
-        lengths = None
-        if files and file.has(f"{place}/{_LENGTHS}"):
-            found = array(_LENGTHS)
-            if len(found.shape) != 2 or found.shape[1] != len(files[0]):
-                raise FieldError(f"{found.place} has the shape {found.shape}, it must have {len(files[0])} columns")
-            lengths = found.read(0, len(found))
         self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
         if self.num_frames < 1:
             raise FieldError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
-        self.cameras = [
-            StoredCamera(name, mapping.cameras[name], images, lengths if len(images.shape) == 2 else None)
-            for name, images in cameras.items()
-        ]
+        self.cameras = [StoredCamera(name, mapping.cameras[name], images) for name, images in cameras.items()]
 
     def table(self, fps: int) -> Table:
         """Read the numbers of every frame."""
@@ -235,11 +227,10 @@ class _Stored:
         return found
 
     def outcome(self) -> Outcome:
-        """Outcome, which is unknown if the mapping does not name its source, or only other episodes of the file have
-        it.
+        """Outcome, which is unknown if the mapping does not name its source, or the episode does not have it.
 
         Raises:
-            Hdf5Error: No episode has it, or this one has an invalid value.
+            Hdf5Error: It has an invalid value.
         """
         name = self._mapping.episodes.success.strip("/")
         return Outcome(success=self._success(name) if name else None, num_frames=self.num_frames)
@@ -255,11 +246,7 @@ class _Stored:
         if found is not None:
             return bool(found)
         if not file.has(f"{place}/{name}"):
-            if any(file.attribute(other, name) is not None for other in episode_places(file, self._mapping.episodes)):
-                return None
-            near = nearest_match(name, list(file.children(place)))
-            told = f"{place or 'The episode'} has no attribute or dataset {name!r} with its outcome.{near}"
-            raise Hdf5Error(f"{told.rstrip('.?')}: {file.path}")
+            return None
         array = file.array(f"{place}/{name}".lstrip("/"))
         if len(array) != self.num_rows:
             raise Hdf5Error(f"{array.place} has {len(array)} rows, the episode has {self.num_rows}: {file.path}")
@@ -275,30 +262,11 @@ def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str)
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:
-    """Datasets that the mapping does not name; groups without any named ones appear as one.
-
-    Raises:
-        Hdf5Error: They include cameras that it does not list in leave_out.
-    """
+    """Datasets that the mapping does not name; groups without any named ones appear as one."""
     used = {name.partition("/")[0] for name in mapping.datasets}
-    found: dict[str, str] = {}
-    cameras: dict[str, None] = {}
-    for dataset in file.datasets(place):
-        name = dataset.removeprefix(place).lstrip("/")
-        if name not in mapping.datasets and name != _LENGTHS:
-            group = name.partition("/")[0]
-            shown = name if group in used else group
-            found[shown] = ""
-            if not mapping.leaves_out(name):
-                with suppress(Hdf5Error):  # an unreadable dataset is not a camera
-                    cameras |= {shown: None} if is_camera(file.array(dataset, may_be_ragged=True)) else {}
-    if cameras:
-        raise Hdf5Error(
-            f"The mapping does not name the cameras in {', '.join(cameras)} of {place or 'the file'}: give them a "
-            f"[cameras.NAME] each, or write above its tables leave_out = [{', '.join(map(quoted, cameras))}]: "
-            f"{file.path}"
-        )
-    return found
+    names = (dataset.removeprefix(place).lstrip("/") for dataset in file.datasets(place))
+    others = [name for name in names if name not in mapping.datasets]
+    return {name if (group := name.partition("/")[0]) in used else group: "" for name in others}
 
 
 @contextmanager
@@ -318,7 +286,7 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
     """Groups of the episodes, demo_2 before demo_10.
 
     Raises:
-        Hdf5Error: None exist, some of the mask are missing, or one occurs twice.
+        Hdf5Error: None exist, some of the mask are missing, or one is a link.
     """
     group = episodes.group.strip("/")
     if not episodes.group:
@@ -334,17 +302,10 @@ def episode_places(file: ForeignFile, episodes: Episodes) -> list[str]:
         raise Hdf5Error(f"No episodes in {group or 'the root'}: {file.path}")
     if others := [name for name in names if kinds[name] == "other"]:
         raise Hdf5Error(
-            f"{_below(group, others[0])} is a link or a type, only groups within the file are episodes: {file.path}"
+            f"{_below(group, others[0])} is a link, a type or a second name, only groups within the file are episodes: "
+            f"{file.path}"
         )
-    places = [_below(group, name) for name in sorted(names, key=in_natural_order)]
-    seen: dict[int, str] = {}
-    for place in places:
-        first = seen.setdefault(file.address(place), place)
-        if first != place:
-            raise Hdf5Error(
-                f"{place} is the same group as {first}, an episode may occur only once in a file: {file.path}"
-            )
-    return places
+    return [_below(group, name) for name in sorted(names, key=in_natural_order)]
 
 
 def _below(group: str, name: str) -> str:

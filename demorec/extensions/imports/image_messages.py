@@ -6,7 +6,6 @@ implementations agree on: bilinear interpolation, and ITU-R BT.601 with limited 
 from __future__ import annotations
 
 import io
-from array import array
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple, cast
@@ -22,30 +21,31 @@ from demorec.extensions.imports.fields import FieldError, image_bytes, whole
 from demorec.mcap.cdr import Values
 from demorec.mcap.gray_video import deep_gray
 from demorec.mcap.lossless import decode_millimetres
-from demorec.mcap.video import DECODERS, Rgb, is_keyframe, nal_units
+from demorec.mcap.video import DECODERS, is_keyframe, nal_units
 
-_CHANNELS: dict[str, tuple[int, tuple[int, int, int]]] = {
-    "rgb8": (3, (0, 1, 2)),
-    "bgr8": (3, (2, 1, 0)),
-    "rgba8": (4, (0, 1, 2)),
-    "bgra8": (4, (2, 1, 0)),
-    "8UC3": (3, (2, 1, 0)),
-    "mono8": (1, (0, 0, 0)),
-    "8UC1": (1, (0, 0, 0)),
+_PIXELS: dict[str, tuple[str, int]] = {
+    "rgb8": ("rgb24", 3),
+    "bgr8": ("bgr24", 3),
+    "rgba8": ("rgba", 4),
+    "bgra8": ("bgra", 4),
+    "8UC3": ("bgr24", 3),  # OpenCV's own names mean blue first
+    "mono8": ("gray", 1),
+    "8UC1": ("gray", 1),
+    "bayer_rggb8": ("bayer_rggb8", 1),
+    "bayer_grbg8": ("bayer_grbg8", 1),
+    "bayer_gbrg8": ("bayer_gbrg8", 1),
+    "bayer_bggr8": ("bayer_bggr8", 1),
+    "yuyv": ("yuyv422", 2),
+    "yuv422_yuy2": ("yuyv422", 2),
+    "uyvy": ("yuyv422", 2),
+    "yuv422": ("yuyv422", 2),
 }
-"""Encoding -> bytes per pixel, and those of red, green and blue; OpenCV's own names mean blue first."""
-_BAYER = {"bayer_rggb8": (0, 0), "bayer_grbg8": (0, 1), "bayer_gbrg8": (1, 0), "bayer_bggr8": (1, 1)}
-"""Encoding -> row and column of the first red pixel."""
-_YUV = {"uyvy": (1, 0, 2), "yuv422": (1, 0, 2), "yuyv": (0, 1, 3), "yuv422_yuy2": (0, 1, 3)}
-"""Encoding -> positions of the first luma, U and V in the four bytes of a pair of pixels."""
+"""Encoding -> FFmpeg's pixel format, and bytes per pixel."""
+_LUMA_SECOND = ("uyvy", "yuv422")
+"""Encodings with each two bytes exchanged."""
 _DEPTH = {"16UC1": "u2", "32FC1": "f4"}
 """Depth encoding -> type of a value."""
-_PIXEL_BYTES = (
-    {encoding: count for encoding, (count, _) in _CHANNELS.items()}
-    | dict.fromkeys(_BAYER, 1)
-    | dict.fromkeys(_YUV, 2)
-    | {encoding: np.dtype(kind).itemsize for encoding, kind in _DEPTH.items()}
-)
+_PIXEL_BYTES = {encoding: count for encoding, (_, count) in _PIXELS.items()} | {"16UC1": 2, "32FC1": 4}
 
 
 def raw_image(values: Values) -> NDArray[Any]:
@@ -60,16 +60,17 @@ def raw_image(values: Values) -> NDArray[Any]:
         kind = np.dtype(_DEPTH[encoding]).newbyteorder(">" if values.get("is_bigendian") else "<")
         stored = np.ascontiguousarray(rows).view(kind)
         return stored.astype(stored.dtype.newbyteorder("="))
-    if encoding in _CHANNELS:
-        channels, order = _CHANNELS[encoding]
-        return np.ascontiguousarray(rows.reshape(height, -1, channels)[:, :, list(order)])
-    return _from_bayer(rows, *_BAYER[encoding]) if encoding in _BAYER else _from_yuv(rows, *_YUV[encoding])
+    form, channels = _PIXELS[encoding]
+    pixels = rows.reshape(height, -1, channels) if channels > 1 else rows
+    pixels = pixels[:, :, ::-1] if encoding in _LUMA_SECOND else pixels
+    return av.VideoFrame.from_ndarray(np.ascontiguousarray(pixels), format=form).to_ndarray(format="rgb24")
 
 
 def _check_raw(values: Values) -> tuple[int, int]:
     """Bytes per row, with and without padding; FieldError if a message's bytes do not match its size."""
     encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
-    if encoding not in _PIXEL_BYTES or (encoding in _YUV and width % 2):
+    is_odd = (width % 2 and "yu" in encoding) or (encoding.startswith("bayer") and (width % 2 or height % 2))
+    if encoding not in _PIXEL_BYTES or is_odd:
         raise FieldError(f"its encoding {encoding[:40]!r} is not supported; {', '.join(_PIXEL_BYTES)} are")
     used = width * _PIXEL_BYTES[encoding]
     step = whole(values, "step") if values.get("step") and height > 1 else used
@@ -89,40 +90,6 @@ def _rows(values: Values) -> NDArray[np.uint8]:
     padded = np.zeros(step * height, np.uint8)
     padded[: min(len(data), len(padded))] = data[: len(padded)]
     return padded.reshape(height, step)[:, :used]
-
-
-def _from_bayer(pixels: NDArray[np.uint8], red_row: int, red_column: int) -> Rgb:
-    height, width = pixels.shape
-    rows, columns = np.indices((height, width))
-    is_red = ((rows % 2) == red_row) & ((columns % 2) == red_column)
-    is_blue = ((rows % 2) != red_row) & ((columns % 2) != red_column)
-    masks = (is_red, ~(is_red | is_blue), is_blue)
-    return np.stack([_filled(pixels, mask) for mask in masks], axis=2)
-
-
-def _filled(pixels: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Fill in a colour at every pixel: its own, or the mean of the neighbours with that colour, with double weight for
-    the nearer ones.
-    """
-    known, weights = np.pad(np.where(mask, pixels, 0).astype(np.float64), 1), np.pad(mask.astype(np.float64), 1)
-
-    def blurred(plane: NDArray[np.float64]) -> NDArray[np.float64]:
-        lines = plane[:-2] + 2 * plane[1:-1] + plane[2:]
-        return np.asarray(lines[:, :-2] + 2 * lines[:, 1:-1] + lines[:, 2:])
-
-    mean = blurred(known) / np.maximum(blurred(weights), 1e-9)
-    return np.where(mask, pixels, np.rint(mean)).astype(np.uint8)
-
-
-def _from_yuv(pixels: NDArray[np.uint8], luma: int, u: int, v: int) -> Rgb:
-    quads = pixels.reshape(pixels.shape[0], -1, 4).astype(np.float64)
-    y = np.repeat(quads[:, :, [luma]], 2, axis=2)
-    y[:, :, 1] = quads[:, :, luma + 2]
-    scaled = 1.164383 * (y - 16)
-    blue, red = quads[:, :, [u]] - 128, quads[:, :, [v]] - 128
-    channels = (scaled + 1.596027 * red, scaled - 0.391762 * blue - 0.812968 * red, scaled + 2.017232 * blue)
-    rgb = np.stack([channel.reshape(len(pixels), -1) for channel in channels], axis=2)
-    return np.clip(np.rint(rgb), 0, 255).astype(np.uint8)
 
 
 VIDEO_FORMATS = tuple(DECODERS)
@@ -152,40 +119,6 @@ class ImageHead(NamedTuple):
     width: int
     height: int
     is_keyframe: bool
-
-
-class ImageHeads:
-    """Heads of a camera's images in order; a bag has up to a million of them, of few kinds."""
-
-    def __init__(self) -> None:
-        self._kinds: list[ImageHead] = []
-        self._places: dict[ImageHead, int] = {}
-        self._of = array("I")
-
-    def append(self, head: ImageHead) -> None:
-        """Append a head."""
-        place = self._places.get(head)
-        if place is None:
-            place = self._places[head] = len(self._kinds)
-            self._kinds.append(head)
-        self._of.append(place)
-
-    def __len__(self) -> int:
-        return len(self._of)
-
-    def __getitem__(self, index: int) -> ImageHead:
-        return self._kinds[self._of[index]]
-
-    def kinds(self, among: NDArray[np.int64] | None = None) -> list[ImageHead]:
-        """Different heads, among all images or those with these numbers."""
-        if among is None:
-            return list(self._kinds)
-        return [self._kinds[place] for place in np.unique(np.array(self._of)[among]).tolist()]
-
-    @property
-    def are_keyframes(self) -> NDArray[np.bool_]:
-        """(N,) whether each can be decoded independently."""
-        return np.array([head.is_keyframe for head in self._kinds], bool)[np.array(self._of, np.intp)]
 
 
 def image_head(values: Values) -> ImageHead:

@@ -20,8 +20,8 @@ from typing import Any, Literal
 from demorec.core.plain import digest
 
 SourceKind = Literal["bag", "hdf5"]
-Unit = Literal["", "rad", "degree", "percent", "m", "mm"]
-Sampling = Literal["latest", "nearest", "linear"]
+Unit = Literal["", "rad", "degree", "m", "mm"]
+Sampling = Literal["latest", "nearest"]
 Stamp = Literal["header", "log"]
 MAX_FPS = 1000
 MAX_ELEMENTS = 4096
@@ -55,7 +55,6 @@ class Source:
         topic: Topic of the numbers, for bags.
         field: Path of the numbers in a message: "position", "pose.orientation", "transforms[child_frame_id=hand]".
         joints: Elements by name, in this order, if the message names them.
-        names_field: Field of the names (auto: "name" or "joint_names" next to the field).
         stamp: As `Clock.stamp`, for this source.
         sample: As `Clock.sample`, for this source.
         max_age_s: As `Clock.max_age_s`, for this source.
@@ -65,7 +64,6 @@ class Source:
         prefix: Prefix of each name, for two arms with the same names.
         unit: Unit of the source.
         to: Unit of the feature (auto: the source's, which keeps values bit-exact).
-        limits: [lowest, highest] of each element in the unit `to`, as the range of -100..100 ("percent").
         next: Instead of a source: a feature to take from the next row.
     """
 
@@ -74,12 +72,10 @@ class Source:
     prefix: str = ""
     unit: Unit = ""
     to: Unit = ""
-    limits: tuple[tuple[float, float], ...] = ()
     next: str = ""
     topic: str = _bag("")
     field: str = _bag("")
     joints: tuple[str, ...] = _bag(())
-    names_field: str = _bag("")
     stamp: Stamp | None = _bag(None)
     sample: Sampling | None = _bag(None)
     max_age_s: float | None = _bag(None)
@@ -100,7 +96,7 @@ class CameraSource:
         CompressedVideo.
         info_topic: Topic of its calibration (CameraInfo, CameraCalibration).
         stamp: As `Clock.stamp`, for this camera.
-        sample: As `Clock.sample`; images are never interpolated.
+        sample: As `Clock.sample`, for this camera.
         max_age_s: As `Clock.max_age_s`, for this camera.
         dataset: Dataset of an HDF5 file below the episode's group: (T, H, W, 3) or (T, 3, H, W), uint8 or floats from 0
         to 1 or to 255; or a JPEG file in each row, (T, N) uint8 padded with zeros or (T,) of variable length; for a
@@ -112,7 +108,7 @@ class CameraSource:
     topic: str = _bag("")
     info_topic: str = _bag("")
     stamp: Stamp | None = _bag(None)
-    sample: Literal["latest", "nearest"] | None = _bag(None)
+    sample: Sampling | None = _bag(None)
     max_age_s: float | None = _bag(None)
     dataset: str = _hdf5("")
     colors: Literal["rgb", "bgr"] = _hdf5("rgb")
@@ -177,7 +173,7 @@ class Clock:
         rows: "camera": a row for each image of the slowest camera among those with `fps` images per second (without
         any, a grid); "grid": evenly spaced; or a topic: a row for each of its messages.
         stamp: Whether a message's time is its header time or its log time.
-        sample: The last message before the row, the nearest one, or linear interpolation of its neighbours.
+        sample: The last message before the row, or the nearest one.
         max_age_s: Maximum distance of a message from the row.
         when_old: Treatment of messages that are farther away or missing.
         max_trim_s: Maximum time to leave out at the bag's beginning and end if a stream starts late or ends early.
@@ -197,7 +193,7 @@ class Episodes:
     """Boundaries of episodes.
 
     Attributes:
-        cut: Whether a whole bag is one episode, or markers, gaps in the rows' streams, or a list of times split it.
+        cut: Whether a whole bag is one episode, or markers or a list of times split it.
         topic: Topic of the markers.
         field: Field of the text, number or boolean in a marker.
         start, stop: Texts of markers that begin and end an episode (text only; a boolean does both).
@@ -205,13 +201,12 @@ class Episodes:
         or a dataset with a last row above 0 for success.
         discard: Marker texts that discard the current episode or, between episodes, the previous one.
         ignore: Marker texts without a meaning; other unknown texts are errors.
-        gap_s: Minimum pause of all streams that ends an episode.
         group: Group of an HDF5 file in which each group is an episode, "/" for the root; "" if the file itself is one.
         mask: Use only the episodes listed in this dataset of `mask`.
         times_s: [begin, end] of each episode, seconds from the bag's first message.
     """
 
-    cut: Literal["file", "marker", "gap", "times"] = _bag("file")
+    cut: Literal["file", "marker", "times"] = _bag("file")
     topic: str = _bag("")
     field: str = _bag("data")
     start: str = _bag("start")
@@ -220,7 +215,6 @@ class Episodes:
     failure: str = _bag("failure")
     discard: tuple[str, ...] = _bag(("discard",))
     ignore: tuple[str, ...] = _bag(())
-    gap_s: float = _bag(5.0)
     times_s: tuple[tuple[float, float], ...] = _bag(())
     group: str = _hdf5("")
     mask: str = _hdf5("")
@@ -235,7 +229,6 @@ class SourceMapping:
         robot, task, subtasks, clock, episodes: See these classes.
         features: Name of a feature -> its sources, in order.
         cameras: Name of a camera -> its images.
-        leave_out: Datasets of an HDF5 file, or groups of them, with images that are not imported.
     """
 
     kind: SourceKind = "bag"
@@ -246,16 +239,11 @@ class SourceMapping:
     episodes: Episodes = dataclasses.field(default_factory=Episodes)
     features: Mapping[str, tuple[Source, ...]] = dataclasses.field(default_factory=dict)
     cameras: Mapping[str, CameraSource] = dataclasses.field(default_factory=dict)
-    leave_out: tuple[str, ...] = _hdf5(())
 
     @cached_property
     def digest(self) -> str:
-        """First 16 hex digits of the digest of all settings for its kind of source."""
-        return digest(_said(self, self.kind))
-
-    def leaves_out(self, dataset: str) -> bool:
-        """Whether it excludes a dataset, or a group that contains it."""
-        return any(f"{dataset}/".startswith(f"{name.strip('/')}/") for name in self.leave_out)
+        """First 16 hex digits of the digest of all settings."""
+        return digest(self)
 
     @property
     def datasets(self) -> frozenset[str]:
@@ -265,23 +253,10 @@ class SourceMapping:
         return frozenset(name.strip("/") for name in named)
 
 
-def _said(value: Any, kind: SourceKind) -> Any:
-    """The settings of a mapping for its kind of source, as plain data."""
-    if dataclasses.is_dataclass(value):
-        own = [one.name for one in dataclasses.fields(value) if one.metadata.get(KIND, kind) == kind]
-        return {name: _said(getattr(value, name), kind) for name in own}
-    if isinstance(value, Mapping):
-        return {key: _said(item, kind) for key, item in value.items()}
-    return [_said(item, kind) for item in value] if isinstance(value, tuple) else value
-
-
 CONVERSIONS: Mapping[tuple[str, str], float] = {
     ("degree", "rad"): math.pi / 180,
     ("rad", "degree"): 180 / math.pi,
     ("mm", "m"): 1e-3,
     ("m", "mm"): 1e3,
-    ("percent", "rad"): math.nan,
-    ("percent", "degree"): math.nan,
-    ("percent", "m"): math.nan,
 }
-"""(unit of the source, unit of the feature) -> factor; NaN if it differs between elements."""
+"""(unit of the source, unit of the feature) -> factor."""

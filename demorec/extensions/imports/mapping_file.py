@@ -16,7 +16,6 @@ from demorec.core.files import read_text_limited
 from demorec.core.plain import MAX_LISTED, from_plain, listed
 from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
-from demorec.episode.validity import MAX_CAMERAS, MAX_FEATURES
 from demorec.extensions.imports.mapping import (
     CONVERSIONS,
     KIND,
@@ -98,44 +97,32 @@ def _unknown_keys(value: Any, kind: Any, place: str, of: SourceKind) -> Iterator
 
 
 def _problems(mapping: SourceMapping) -> Iterator[str]:
-    """Yield the problems of a mapping that do not depend on a bag or file."""
-    yield from _feature_problems(mapping)
-    if ACTION not in mapping.features:
-        what = "topic" if mapping.kind == "bag" else "dataset"
-        yield f"missing feature 'action': name its {what}, or next = \"observation.state\""
-    yield from _camera_problems(mapping)
-    if not mapping.robot.name.strip():
-        yield "robot.name is empty"
-    task, clock = mapping.task, mapping.clock
-    elsewhere = "topic" if mapping.kind == "bag" else "attribute"
-    if (bool(task.text.strip()) + bool(task.topic or task.attribute) + task.file_name) != 1:
-        yield f"[task] needs one of text, {elsewhere} and file_name"
-    if mapping.robot.urdf and (mapping.robot.urdf_topic or mapping.robot.urdf_attribute):
-        yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
-    if not (clock.fps == 0 and mapping.kind == "hdf5") and not 1 <= clock.fps <= MAX_FPS:
-        yield f"clock.fps is {clock.fps}, allowed are 1 to {MAX_FPS}"
-    if mapping.kind == "bag":
-        yield from _bag_problems(mapping)
-        return
-    for name in sorted(filter(mapping.leaves_out, mapping.datasets)):
-        yield f"leave_out leaves out {name!r}, which the mapping names"
-    if mapping.episodes.mask and not mapping.episodes.group:
-        yield "episodes.mask chooses among the episodes of a group, but episodes.group is empty"
-
-
-def _feature_problems(mapping: SourceMapping) -> Iterator[str]:
-    if len(mapping.features) > MAX_FEATURES:
-        yield f"there are {len(mapping.features):,} features, allowed are up to {MAX_FEATURES}"
-        return
-    if STATE not in mapping.features:
-        yield f'missing feature {STATE!r}: write [[features."{STATE}"]] with its source'
+    """Yield the problems of a mapping that neither depend on a bag or file nor make every episode invalid."""
+    is_bag = mapping.kind == "bag"
+    what, elsewhere = ("topic", "topic") if is_bag else ("dataset", "attribute")
+    for name, advice in ((STATE, "with its source"), (ACTION, f'with its {what}, or next = "{STATE}"')):
+        if name not in mapping.features:
+            key = name if "." not in name else f'"{name}"'
+            yield f"missing feature {name!r}: write [[features.{key}]] {advice}"
     for name, sources in mapping.features.items():
-        if "/" in name or not name or name.startswith("observation.images"):
-            yield f"a feature cannot be called {name!r}"
         if not sources:
             yield f"the feature {name!r} has no source"
         for source in sources:
             yield from _source_problems(mapping, name, source)
+    for name, camera in mapping.cameras.items():
+        if not (camera.topic or camera.dataset):
+            yield f"cameras.{name} needs a {what}"
+        yield from _age_problems(f"cameras.{name}", camera.max_age_s)
+    task, clock, episodes = mapping.task, mapping.clock, mapping.episodes
+    if (bool(task.text.strip()) + bool(task.topic or task.attribute) + task.file_name) != 1:
+        yield f"[task] needs one of text, {elsewhere} and file_name"
+    if mapping.robot.urdf and (mapping.robot.urdf_topic or mapping.robot.urdf_attribute):
+        yield f"robot.urdf and robot.urdf_{elsewhere} are both given, one is enough"
+    if not (clock.fps == 0 and not is_bag) and not 1 <= clock.fps <= MAX_FPS:
+        yield f"clock.fps is {clock.fps}, allowed are 1 to {MAX_FPS}"
+    yield from _bag_problems(mapping) if is_bag else ()
+    if episodes.mask and not episodes.group:
+        yield "episodes.mask chooses among the episodes of a group, but episodes.group is empty"
 
 
 def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Iterator[str]:
@@ -148,12 +135,15 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
     pair = (source.unit, source.to or source.unit)
     if pair not in CONVERSIONS and pair[0] != pair[1]:
         yield f"{place} cannot turn {source.unit or 'no unit'} into {source.to}"
-    if "percent" in pair and pair[0] != pair[1] and not source.limits:
-        yield f"{place} needs limits, because -100..100 means each joint's own range"
-    if any(not low < high for low, high in source.limits):
-        yield f"{place} has limits that are not [lowest, highest]"
     if source.next:
-        yield from _next_problems(mapping, name, source.next, is_bag=is_bag)
+        known = [other for other in mapping.features if other != name]
+        if len(mapping.features[name]) > 1 and not is_bag:
+            yield f"{place} has other parts next to next"
+        if source.next not in known:
+            near = nearest_match(source.next, known)
+            yield f"{place} follows {source.next!r}, which is not a feature.{near}".rstrip(".")
+        elif any(other.next for other in mapping.features[source.next]):
+            yield f"{place} follows {source.next!r}, which follows another feature itself"
     if bool(source.topic or source.dataset) == bool(source.next):
         what, parts = ("topic", "sources") if is_bag else ("dataset", "parts")
         yield f"{place} needs either a {what} or next in each of its {parts}"
@@ -164,46 +154,19 @@ def _source_problems(mapping: SourceMapping, name: str, source: Source) -> Itera
     yield from _age_problems(place, source.max_age_s)
 
 
-def _next_problems(mapping: SourceMapping, name: str, following: str, *, is_bag: bool) -> Iterator[str]:
-    place, known = f"the feature {name!r}", [other for other in mapping.features if other != name]
-    if len(mapping.features[name]) > 1 and not is_bag:
-        yield f"{place} has other parts next to next"
-    if following not in known and (following in mapping.features or following != STATE):  # already reported as missing
-        yield f"{place} follows {following!r}, which is not a feature.{nearest_match(following, known)}".rstrip(".")
-    elif any(other.next for other in mapping.features.get(following, ())):
-        yield f"{place} follows {following!r}, which follows another feature itself"
-
-
-def _camera_problems(mapping: SourceMapping) -> Iterator[str]:
-    if len(mapping.cameras) > MAX_CAMERAS:
-        yield f"there are {len(mapping.cameras):,} cameras, allowed are up to {MAX_CAMERAS}"
-        return
-    for name, camera in mapping.cameras.items():
-        if not name.isidentifier():
-            yield f"a camera cannot be called {name!r}: letters, digits and underscores are allowed"
-        if not (camera.topic or camera.dataset):
-            yield f"cameras.{name} needs a {'topic' if mapping.kind == 'bag' else 'dataset'}"
-        yield from _age_problems(f"cameras.{name}", camera.max_age_s)
-
-
 def _bag_problems(mapping: SourceMapping) -> Iterator[str]:
     task, clock, episodes = mapping.task, mapping.clock, mapping.episodes
     yield from _age_problems("clock", clock.max_age_s)
     fields = {task.topic: task.field, **({episodes.topic: episodes.field} if episodes.cut == "marker" else {})}
     if mapping.subtasks.topic and fields.get(mapping.subtasks.topic, mapping.subtasks.field) != mapping.subtasks.field:
         yield f"subtasks.field is {mapping.subtasks.field!r}, but another field of the same topic is taken for texts"
-    if episodes.cut == "marker" and not episodes.topic:
-        yield 'episodes.cut = "marker" needs episodes.topic'
-    if episodes.cut == "times" and not episodes.times_s:
-        yield 'episodes.cut = "times" needs episodes.times_s'
-    if any(not begin < end for begin, end in episodes.times_s):
-        yield "episodes.times_s has an episode that ends before it begins"
-    if not 0 < episodes.gap_s <= MAX_SECONDS:
-        yield f"episodes.gap_s is {episodes.gap_s:g}, it must be above 0 and at most {MAX_SECONDS:g}"
+    for cut, key in (("marker", "topic"), ("times", "times_s")):
+        if episodes.cut == cut and not getattr(episodes, key):
+            yield f'episodes.cut = "{cut}" needs episodes.{key}'
+    if any(not -MAX_SECONDS <= begin < end <= MAX_SECONDS for begin, end in episodes.times_s):
+        yield f"episodes.times_s has an episode that ends before it begins, or a time beyond {MAX_SECONDS:g} s"
     if not 0 <= clock.max_trim_s <= MAX_SECONDS:
         yield f"clock.max_trim_s is {clock.max_trim_s:g}, it must be 0 to {MAX_SECONDS:g}"
-    if any(not -MAX_SECONDS <= time <= MAX_SECONDS for times in episodes.times_s for time in times):
-        yield f"episodes.times_s has a time beyond {MAX_SECONDS:g} s"
 
 
 def _age_problems(place: str, age: float | None) -> Iterator[str]:

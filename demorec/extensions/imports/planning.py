@@ -19,11 +19,10 @@ from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
 from demorec.episode.validity import find_problems
 from demorec.extensions.imports.bag import Bag, Files
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.bag_findings import all_findings, row_findings
 from demorec.extensions.imports.clock import NS
 from demorec.extensions.imports.description import imported_feature, imported_info
 from demorec.extensions.imports.fields import FieldError
-from demorec.extensions.imports.findings import ImportFinding
+from demorec.extensions.imports.findings import ImportFinding, bag_findings, row_findings
 from demorec.extensions.imports.import_file import BagReport, EpisodeReport, stream_figures
 from demorec.extensions.imports.mapping import Episodes, SourceMapping
 from demorec.extensions.imports.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
@@ -50,61 +49,60 @@ class PlannedEpisode:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PlannedBag:
-    """A bag that has been read; its episodes are numbered from 0 until the run's numbers are known."""
+    """A bag that has been read."""
 
     bag: Bag
     report: BagReport
     episodes: tuple[PlannedEpisode, ...]
 
-    def numbered(self, first: int) -> PlannedBag:
-        """Renumber the episodes for a run."""
-        reports = (
-            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
-            for row in self.report.episodes
-        )
-        episodes = (
-            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
-            for episode in self.episodes
-        )
-        return replace(self, report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
+
+@dataclass(frozen=True, kw_only=True)
+class ImportSettings:
+    """Settings of an import.
+
+    Attributes:
+        mapping: Mapping of the bags.
+        urdf: The robot's URDF, None if the mapping names no file.
+        video: Encoding of pixels.
+    """
+
+    mapping: SourceMapping
+    urdf: str | None
+    video: VideoConfig
 
 
-def plan_bag(bag: Bag, mapping: SourceMapping, urdf: str | None, video: VideoConfig) -> PlannedBag:
+def plan_bag(bag: Bag, files: Files, settings: ImportSettings, first_index: int) -> PlannedBag:
     """Read and judge a bag.
 
     Args:
         bag: Bag to read.
-        mapping: Its mapping.
-        urdf: The robot's URDF, None if the mapping names no file.
-        video: Encoding of pixels.
+        files: Digests of its files.
+        settings: Settings of the import.
+        first_index: Number of its first episode in the run.
 
     Raises:
         BagError: It cannot be read, does not fit the mapping, or would yield an incomplete episode.
         ConfigError: Its episodes differ.
     """
-    files = bag.sha256s()
+    mapping = settings.mapping
     streams = read_streams(bag, mapping)
     try:
         lines = Timelines(streams, mapping)
-        findings = all_findings(lines)
+        findings = bag_findings(lines)
         begin = min(int(line.times_ns[0]) for line in lines.lines.values())
         episodes: list[PlannedEpisode] = []
         reports: list[EpisodeReport] = []
         for window in windows(lines):
-            episode, reason = None, ""
-            if window.discarded:
-                reason = f"its marker is {window.discarded!r}"
-            else:
-                try:
+            episode, reason = None, f"its marker is {window.discarded!r}" if window.discarded else ""
+            try:
+                if not window.discarded:
                     rows = lines.rows(window)
-                    episode = _episode(bag, files, lines, rows, urdf, len(episodes))
-                    if wrong := list(_problems(episode, video)):
-                        raise BagError(f"The episode cannot be recorded: {'; '.join(wrong)}")
+                    episode = _episode(bag, files, lines, rows, settings, first_index + len(episodes))
                     episodes.append(episode)
-                except NoRowsError as error:
-                    if mapping.clock.when_old == "error":
-                        raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
-                    reason = str(error)
+            except NoRowsError as error:
+                if mapping.clock.when_old == "error":
+                    raise BagError(f"The bag yields no complete episode: {error}{_reported(findings)}") from error
+                reason = str(error)
             reports.append(_report(window, begin, episode, reason))
         for episode in episodes:
             if different := differences(episodes[0].info, episode.info):
@@ -132,9 +130,10 @@ def _reported(findings: Sequence[ImportFinding]) -> str:
 
 
 def _episode(
-    bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, urdf: str | None, index: int
+    bag: Bag, files: Files, lines: Timelines, rows: EpisodeRows, settings: ImportSettings, index: int
 ) -> PlannedEpisode:
-    mapping = lines.mapping
+    """Describe an episode; BagError if it cannot be recorded, before anything of the bag is written."""
+    mapping, urdf = lines.mapping, settings.urdf
     if topic := mapping.robot.urdf_topic:
         texts = lines.streams.texts[topic]
         urdf = texts[0].value if texts else ""
@@ -151,9 +150,12 @@ def _episode(
             cameras=(_camera(name, plan, lines) for name, plan in rows.cameras.items()),
             files=(SourceFile(name=name, sha256=sha256) for name, sha256 in files),
         )
+        episode = PlannedEpisode(info=info, rows=rows, subtasks=_subtask_rows(lines, rows))
+        if wrong := list(_problems(episode, settings.video)):
+            raise FieldError("; ".join(wrong))
     except FieldError as error:
         raise BagError(f"The episode cannot be recorded: {error}") from error
-    return PlannedEpisode(info=info, rows=rows, subtasks=_subtask_rows(lines, rows))
+    return episode
 
 
 def windows(lines: Timelines) -> list[Window]:
@@ -174,10 +176,6 @@ def windows(lines: Timelines) -> list[Window]:
                 f"{(end - begin) / NS:.1f} s"
             )
         return found
-    if episodes.cut == "gap":
-        times = np.unique(np.concatenate([line.times_ns for line in lines.lines.values()]))
-        parts = np.split(times, np.flatnonzero(np.diff(times) > episodes.gap_s * NS) + 1)
-        return [Window(begin_ns=int(part[0]), end_ns=int(part[-1])) for part in parts]
     markers = lines.streams.texts[episodes.topic]
     if unknown := _unknown_words(markers, lines.mapping):
         raise BagError(
@@ -280,7 +278,7 @@ def _feature(name: str, dtype: DTypeLike, lines: Timelines) -> Feature:
         else f"{source.topic} {source.field}, {lines.lines[name, index].rule}"
         for index, source in enumerate(lines.mapping.features[name])
     ]
-    streams = [line.stream for line in lines.sources(name)]
+    streams = [lines.lines[key].stream for key, _ in lines.sources(name)]
     names = tuple(element for stream in streams for element in stream.names)
     units = (stream.unit for stream in streams for _ in stream.names)
     return imported_feature(name, dtype, names, units, called=names, source="; ".join(rules))

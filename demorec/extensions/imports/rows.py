@@ -4,7 +4,7 @@ episode.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import cast
 
@@ -115,14 +115,15 @@ class Timelines:
         if empty := [line for line in self.lines.values() if not len(line.times_ns)]:
             raise BagError(f"No message of {empty[0].label} has a usable time")
 
-    def sources(self, feature: str) -> list[Timeline]:
-        """Timelines of a feature's sources; for a source that is another feature's next row, the timelines of that
-        feature.
+    def sources(self, feature: str) -> Iterator[tuple[Key, int]]:
+        """Stream of each of a feature's sources, and the number of rows by which it is later: 1 for the streams of
+        another feature's next row.
         """
-        found: list[Timeline] = []
         for index, source in enumerate(self.mapping.features[feature]):
-            found += self.sources(source.next) if source.next else [self.lines[feature, index]]
-        return found
+            if source.next:
+                yield from ((key, 1) for key, _ in self.sources(source.next))
+            else:
+                yield (feature, index), 0
 
     def rows(self, window: Window) -> EpisodeRows:
         """Rows of an episode; NoRowsError if a stream has no usable data for them."""
@@ -156,19 +157,15 @@ class Timelines:
     def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> tuple[Numbers, Int]:
         """Return the first `count` rows (R, D) of a feature and their timestamps.
 
-        The rows are float32 if all sources are, otherwise float64. A source that is a feature's next row is sampled one
-        row later.
+        The rows are float32 if all sources are, otherwise float64.
         """
         values, ages = [], []
-        for index, source in enumerate(self.mapping.features[name]):
-            later = 1 if source.next else 0
+        for key, later in self.sources(name):
             part = slice(later, later + count)
-            followed_sources = self.mapping.features.get(source.next, ())
-            keys: list[Key] = [(source.next, number) for number in range(len(followed_sources))] or [(name, index)]
-            for key in keys:
-                values.append(self.lines[key].sampled(chosen[key])[part])
-                # The age of a next row is relative to the row that contains it, and thus negative.
-                ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
+            line = self.lines[key]
+            values.append(line.stream.values[line.order[chosen[key].index]][part])
+            # The age of a next row is relative to the row that contains it, and thus negative.
+            ages.append(chosen[key].age_ns[part] - (times[part] - times[:count]))
         return np.concatenate(values, axis=1), times[:count] - np.max(np.stack(ages), axis=0)
 
     def _extent(self, window: Window) -> tuple[int, int]:
@@ -243,7 +240,7 @@ def _first(line: Timeline, window: Window) -> int:
 def _last(line: Timeline, window: Window) -> int:
     """Time until which a stream has data: its last message is valid until the next would have arrived."""
     last = max(0, int(np.searchsorted(line.times_ns, window.end_ns, side="right")) - 1)
-    age = 0 if line.sample == "linear" else line.max_age_ns
+    age = line.max_age_ns
     if line.is_regular:
         age = min(age, line.period_ns if line.sample == "latest" else line.period_ns // 2)
     return int(line.times_ns[last]) + age
@@ -251,7 +248,7 @@ def _last(line: Timeline, window: Window) -> int:
 
 def _too_old(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
     """Reason why the rows' data is missing or too old; "" if it is not."""
-    ages = chosen.reach_ns
+    ages = np.abs(chosen.age_ns)
     bad = np.flatnonzero((ages > line.max_age_ns) | (chosen.index < 0))
     if not len(bad):
         return ""
@@ -267,17 +264,13 @@ def _unfit(line: Timeline, chosen: ChosenSamples, times: Int) -> str:
     """Reason why the rows' data cannot be recorded; "" if it can."""
     stream = line.stream
     if stream.names:
-        used = stream.values[line.order[chosen.index]]
-        if chosen.fraction is not None:
-            after = np.minimum(chosen.index + 1, len(line.order) - 1)
-            used = np.where(chosen.fraction[:, np.newaxis] > 0, used + stream.values[line.order[after]], used)
-        bad = np.flatnonzero(~np.isfinite(used).all(axis=1))
+        bad = np.flatnonzero(~np.isfinite(stream.values[line.order[chosen.index]]).all(axis=1))
         if len(bad):
             at = (times[bad[0]] - times[0]) / NS
             return f"{line.label} has numbers that are not finite at {len(bad)} rows, from {at:.2f} s on"
         return ""
     first, last = int(chosen.index.min()), int(chosen.index.max())
-    heads = stream.heads.kinds(line.order[first : last + 1])
+    heads = {stream.heads[place] for place in line.order[first : last + 1].tolist()}
     sizes = sorted({(head.width, head.height) for head in heads if head.width})
     formats = sorted({head.format for head in heads})
     if len(sizes) > 1:

@@ -6,10 +6,9 @@ read again for the images when the rows are written.
 
 from __future__ import annotations
 
-import zlib
 from array import array
 from collections import defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -28,23 +27,18 @@ from demorec.extensions.imports.fields import (
     SourceReader,
     converted,
     follow,
-    image_bytes,
     parse_path,
     reader_of,
     stamp_of,
 )
-from demorec.extensions.imports.image_messages import ImageHeads, image_head
+from demorec.extensions.imports.image_messages import ImageHead, image_head
 from demorec.extensions.imports.mapping import ROWS, CameraSource, Source, SourceMapping, Unit
-from demorec.extensions.imports.words import quoted
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
 
 NO_STAMP = -(2**63)
 Key = tuple[str, int] | str
 """A stream: (feature, number of its source), or the name of a camera."""
-_MAX_TEXT = 10_000
-_MAX_URDF = 4 << 20
-_SHOWN_JOINTS = 40
 _INFO_FIELDS = ("width", "height", "k", "K", "d", "D")
 """Fields of a camera's calibration that are read."""
 
@@ -64,8 +58,6 @@ class Stream:
         much memory for a million messages, and fragment it.
         dtype: Type of the vectors.
         heads: (N,) head of each image; empty except for cameras.
-        sums: CRC-32 of each message's bytes.
-        image_sums: CRC-32 of each image's bytes; empty except for cameras.
         num_malformed: Number of messages that cannot be read or are incomplete.
         first_problem: Problem of the first of them.
         first_refusal: Reason why the first message was left to another publisher.
@@ -80,14 +72,13 @@ class Stream:
     places: array[int] = field(default_factory=lambda: array("q"))
     vectors: bytearray = field(default_factory=bytearray)
     dtype: np.dtype[np.floating[Any]] | None = None
-    heads: ImageHeads = field(default_factory=ImageHeads)
-    sums: array[int] = field(default_factory=lambda: array("I"))
-    image_sums: array[int] = field(default_factory=lambda: array("I"))
+    heads: list[ImageHead] = field(default_factory=list)
+    _known_heads: dict[ImageHead, ImageHead] = field(default_factory=dict)
     num_malformed: int = 0
     first_problem: str = ""
     first_refusal: str = ""
 
-    def add(self, number: int, message: ScannedMessage, values: Values, checksum: int) -> None:
+    def add(self, number: int, message: ScannedMessage, values: Values) -> None:
         """Add one message."""
         self.type = self.type or message.channel.type
         try:
@@ -95,9 +86,8 @@ class Stream:
                 self.reader = self.reader or reader_of(self.part, values)
                 self._add_vector(self.reader.read(values))
             else:
-                head, image_sum = image_head(values), zlib.crc32(image_bytes(values))
-                self.heads.append(head)  # add both or neither
-                self.image_sums.append(image_sum)
+                head = image_head(values)
+                self.heads.append(self._known_heads.setdefault(head, head))
                 self.places.append(number)
         except OtherPublisherError as error:
             self.first_refusal = self.first_refusal or str(error)
@@ -108,7 +98,6 @@ class Stream:
         stamp = stamp_of(values)
         self.logged.append(message.log_ns)
         self.stamped.append(NO_STAMP if stamp is None else stamp)
-        self.sums.append(checksum)
 
     def malformed(self, problem: str) -> None:
         """Count a message that cannot be used."""
@@ -147,14 +136,14 @@ class Stream:
         return self.reader.names if self.reader else ()
 
     @property
-    def quaternions(self) -> tuple[int, ...]:
-        """First element of each x, y, z, w group."""
-        return self.reader.quaternions if self.reader else ()
-
-    @property
     def unit(self) -> Unit:
         """Unit of the feature; "" for cameras."""
         return (self.part.to or self.part.unit) if isinstance(self.part, Source) else ""
+
+    @property
+    def are_keyframes(self) -> NDArray[np.bool_]:
+        """(N,) whether each image can be decoded independently; empty except for cameras."""
+        return np.array([head.is_keyframe for head in self.heads], bool)
 
     @cached_property
     def values(self) -> NDArray[np.floating[Any]]:
@@ -181,18 +170,6 @@ def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
     if not source.joints or sum(other.topic == source.topic for other in sources) == 1:
         return feature
     return f"{feature} ({', '.join(source.joints[:2])}{', ...' if len(source.joints) > 2 else ''})"
-
-
-def _unnamed_joints(stream: Stream, reader: SourceReader) -> str:
-    """Advice for a source that takes all joints of its topic although they differ between messages."""
-    lists = " and one with ".join(
-        f"joints = [{', '.join(map(quoted, joints[:_SHOWN_JOINTS]))}{', ...' if len(joints) > _SHOWN_JOINTS else ''}]"
-        for joints in (reader.joints, list(reader.others))
-    )
-    return (
-        f"{stream.label} takes all joints of {stream.topic}, whose messages name different ones, as from two "
-        f"publishers: write a source with {lists}, or leave the latter out"
-    )
 
 
 class BagStreams:
@@ -257,9 +234,8 @@ class BagStreams:
             if topic in self.texts:
                 self._refused[topic] = describe_error(error)
             return
-        checksum = zlib.crc32(message.data)
         for stream in streams:
-            stream.add(number, message, values, checksum)
+            stream.add(number, message, values)
         if topic in self.texts:
             self._add_text(topic, message, values)
         if topic in self._info_topics:
@@ -275,10 +251,6 @@ class BagStreams:
         value = value.item() if isinstance(value, np.generic) else value
         if not isinstance(value, str | bool | int | float):
             self._refused[topic] = f"the field {self._fields[topic]!r} is not a text, number or boolean"
-            return
-        limit = _MAX_URDF if topic == self._mapping.robot.urdf_topic else _MAX_TEXT
-        if isinstance(value, str) and len(value) > limit:
-            self._refused[topic] = f"a text has {len(value):,} characters, at most {limit:,} are supported"
             return
         stamp = stamp_of(values) if self._mapping.clock.stamp == "header" else None
         self.texts[topic].append(Text(message.log_ns if stamp is None else stamp, value, stamp is not None))
@@ -300,34 +272,16 @@ class BagStreams:
             if stream.topic in self._counts and stream.topic not in self._refused and not len(stream):
                 reason = stream.first_problem or stream.first_refusal
                 problems.append(f"{stream.label} cannot be taken from {stream.topic} ({stream.type}): {reason}")
-            if stream.reader is not None and stream.reader.others:
-                problems.append(_unnamed_joints(stream, stream.reader))
-        problems += self._double_names()
         for stream in self.all.values():
             if stream.part.stamp == "header" and len(stream) and max(stream.stamped) <= 0:
                 problems.append(
                     f'{stream.label} has stamp = "header", but the headers of {stream.topic} have no time: write "log"'
                 )
-            if stream.heads and not stream.heads.are_keyframes.any():
+            if stream.heads and not stream.are_keyframes.any():
                 reason = stream.first_problem or "it has no keyframe with its parameter sets"
                 problems.append(f"{stream.topic} cannot be decoded: {reason}")
         if problems:
             raise BagError(f"The mapping does not fit the bag: {listed(problems)}: {bag.path}")
-
-    def _double_names(self) -> Iterator[str]:
-        seen: dict[tuple[str, str], str] = {}
-        for key, stream in self.all.items():
-            if isinstance(key, str):
-                continue
-            feature, _ = key
-            for label in stream.names:
-                if (feature, label) in seen:
-                    yield (
-                        f"{feature} gets {label!r} from {seen[feature, label]} and from {stream.topic}: leave one out, "
-                        "or distinguish them by prefix or names"
-                    )
-                    break
-                seen[feature, label] = stream.topic
 
 
 def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:

@@ -1,4 +1,8 @@
-"""Suggest a mapping from a bag's content: it lists every topic with its type and maps the recognised ones."""
+"""Suggest a mapping from a bag's content: it lists every topic with its type and maps those of usual types and names.
+
+Recognised are joint positions (JointState and similar types, JointTrajectory, number arrays with joint names in the
+topic), a gripper's opening, and poses. A topic with a word such as leader or command is the action.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +11,7 @@ import math
 import re
 from array import array
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +20,11 @@ import numpy as np
 from demorec.episode.info import DEPTH_UNITS
 from demorec.extensions.imports.bag import Bag, TopicSummary, bags_in, open_bag
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.candidates import Candidate, Choice, candidates_of, choose_features, of_publishers
 from demorec.extensions.imports.clock import NS, SKEW_S
 from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
-from demorec.extensions.imports.fields import FieldError, follow, stamp_of
+from demorec.extensions.imports.fields import FieldError, follow, parse_path, reader_of, stamp_of
 from demorec.extensions.imports.image_messages import ImageHead, NoColorError, image_head
-from demorec.extensions.imports.mapping import MAX_FPS, Clock
+from demorec.extensions.imports.mapping import MAX_FPS, Clock, Source
 from demorec.extensions.imports.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
@@ -32,12 +35,110 @@ _MIN_GRID_RATIO = 0.995
 """Minimum rate of rows, relative to that of a stream of which they hold nearly every message."""
 _MAX_DECODED = 64
 """Maximum messages of a topic that are decoded."""
+_JOINT_FIELDS = ("position", "positions", "joints.position", "points[0].positions", "data")
+_POSE_FIELDS = ("pose", "pose.pose")
+_LEADER = re.compile(r"leader|master|gello|teleop|(?<![a-z])lead(?![a-z])")
+_COMMAND = re.compile(r"command|cmd|target|desired|goal|setpoint|jointtrajectory$|(?<![a-z])(?:actions?|ref)(?![a-z])")
+_JOINTS = re.compile(r"joint|follower|puppet|leader|master|(?<![a-z])(?:arm|qpos|q)(?![a-z])|command")
+_NO_JOINTS = re.compile(r"velocit|effort|torque|force|wrench|cartesian|(?<![a-z])(?:vel|pose|tcp)(?![a-z])")
+_GRIPPER = re.compile(r"gripper|finger|jaw|knuckle")
+_ROBOT_POSE = re.compile(r"end_effector|(?<![a-z])(ee|eef|tcp|tool\d*|flange|hand|current|robot|arm)(?![a-z])")
+_SIDE = re.compile(r"(?<![a-z])(left|right|l|r|\d+)(?![a-z])")
 _TASK = re.compile(r"(?<!sub)(?<!sub[_/-])task|instruction|prompt")
+_CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
 _LOG = 'stamp = "log"  # its headers have no time'
 _TIMES = ("header", "ts", "timestamp", "stamp")
-_CAMERA_WORD = re.compile(r"[^a-z0-9]+")
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Part:
+    """Numbers of a topic that a feature may take.
+
+    Attributes:
+        topic, field: Source of the numbers.
+        names: Names of the elements.
+        joints: Names in the messages; empty if they have none.
+        kind: joints, gripper or pose.
+        is_action: Whether the topic commands the robot, or belongs to a leader arm.
+    """
+
+    topic: str
+    field: str
+    names: tuple[str, ...]
+    joints: tuple[str, ...]
+    kind: str
+    is_action: bool
+
+    @property
+    def words(self) -> list[str]:
+        """Words in its topic."""
+        return [word for word in re.split(r"[^A-Za-z0-9]+", self.topic) if word]
+
+    @property
+    def is_robot_pose(self) -> bool:
+        """Whether a pose is the robot's own and not an object's or a tag's."""
+        return self.kind == "pose" and _ROBOT_POSE.search(self.topic.lower()) is not None
+
+    def is_same(self, other: _Part) -> bool:
+        """Whether both are probably the same joints published twice; left and right, 1 and 2 are two robots."""
+        if self.topic == other.topic or _SIDE.sub("", self.topic.lower()) == _SIDE.sub("", other.topic.lower()):
+            return False
+        if self.kind != other.kind:
+            return self.kind == "gripper" and any(_GRIPPER.search(name.lower()) for name in other.names)
+        return not self.joints or not other.joints or not {*self.joints}.isdisjoint(other.joints)
+
+
+def _parts_of(topic: str, type_name: str, values: Values) -> list[_Part]:
+    """Joints, a gripper or a pose in a message; empty if nothing is recognised."""
+    if "format" in values or "encoding" in values:
+        return []
+    lower = topic.lower()
+    is_action = bool(_LEADER.search(lower) or _COMMAND.search(lower) or _COMMAND.search(type_name.lower()))
+    for field_name in (*_JOINT_FIELDS, *_POSE_FIELDS):
+        try:
+            found = follow(values, parse_path(field_name))
+            reader = reader_of(Source(topic=topic, field=field_name), values)
+        except ValueError:
+            continue
+        part = _Part(
+            topic=topic, field=field_name, names=reader.names, joints=reader.joints, kind="", is_action=is_action
+        )
+        if isinstance(found, dict):
+            if field_name in _POSE_FIELDS and {*found} == {"position", "orientation"}:
+                return [replace(part, kind="pose")]
+        elif isinstance(found, float) or (isinstance(found, np.ndarray) and found.dtype.kind == "f"):
+            place = f"{lower} {type_name.lower()} {'' if field_name == 'data' else field_name}"
+            is_of_joints = isinstance(found, np.ndarray) and _JOINTS.search(place) and not _NO_JOINTS.search(lower)
+            if _are_gripper(reader.joints) or (not reader.joints and _GRIPPER.search(lower)):
+                is_named = isinstance(found, np.ndarray)
+                names = reader.names if is_named else ("_".join(part.words) or "data",)
+                return [replace(part, kind="gripper", names=names)]
+            if reader.joints or is_of_joints:
+                return [replace(part, kind="joints")]
+    return []
+
+
+def _are_gripper(joints: Sequence[str]) -> bool:
+    return bool(joints) and all(_GRIPPER.search(joint.lower()) for joint in joints)
+
+
+def _chosen(parts: Sequence[_Part]) -> list[_Part]:
+    """Sources of a feature: joints if there are any, otherwise poses; arms before grippers, each once.
+
+    A gripper alone is not an arm: the arm's topic was not recognised.
+    """
+    poses = [part for part in parts if part.kind == "pose"]
+    named = [part for part in poses if part.is_action or part.is_robot_pose]
+    arms = [part for part in parts if part.kind == "joints"] or named or (poses if len(poses) == 1 else [])
+    chosen: list[_Part] = []
+    found = [*arms, *(part for part in parts if part.kind == "gripper")] if arms else []
+    # A leader comes before a command, and named joints before others.
+    for part in sorted(found, key=lambda one: (one.kind == "gripper", not _LEADER.search(one.topic), not one.joints)):
+        if not any(part.is_same(other) for other in chosen):
+            chosen.append(part)
+    return sorted(chosen, key=found.index)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -47,8 +148,7 @@ class _Topic(TopicSummary):
     Attributes:
         first: First message; None if none can be read.
         head: Head of its first image; None if its messages are not images.
-        candidates: Numbers in it that may belong to a feature.
-        publishers: Joint names in its messages, each list once.
+        parts: Numbers in it that may belong to a feature, one for each set of joints in its messages.
         stamps_ns: Header times of the decoded messages.
         has_stamp: Whether headers have a time.
         skew_ns: Log time minus header time of the first message.
@@ -59,8 +159,7 @@ class _Topic(TopicSummary):
     name: str
     first: Values | None = None
     head: ImageHead | None = None
-    candidates: list[Candidate] = field(default_factory=list)
-    publishers: dict[tuple[str, ...], None] = field(default_factory=dict)
+    parts: list[_Part] = field(default_factory=list)
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
     has_stamp: bool = True
     skew_ns: int = 0
@@ -81,6 +180,34 @@ class _Topic(TopicSummary):
         usual = steps[np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)]  # without pauses
         return NS / float(usual.mean()) if len(usual) else self.rate_hz
 
+    def look_into(self, message: ScannedMessage, decoder: BagDecoder) -> None:
+        """Examine one of the first messages."""
+        try:
+            values = decoder.values(message)
+        except UnknownEncodingError as error:
+            self.problem = str(error)
+            return
+        except (ValueError, RecursionError, OverflowError, TypeError):
+            return
+        stamp = stamp_of(values)
+        self.has_stamp = bool(stamp or self.stamps_ns)  # simulated time begins with 0, which looks like a missing time
+        if stamp and 0 < stamp < 2**63:
+            self.skew_ns = self.skew_ns or message.log_ns - stamp
+            self.stamps_ns.append(stamp)
+        if self.first is None:
+            self.first = values
+            try:
+                self.head = image_head(values)
+            except NoColorError as error:
+                self.problem = str(error)
+            except FieldError:
+                pass  # not an image
+        if self.head is None and not self.problem:
+            known = {joint for part in self.parts for joint in part.joints}
+            for part in _parts_of(self.name, self.type, values):
+                if not self.parts or (part.joints and known.isdisjoint(part.joints)):
+                    self.parts.append(part)
+
 
 def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     """Return the lines of a mapping for a bag, with comments about its content.
@@ -100,19 +227,14 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     if not topics:
         raise BagError(f"The bag holds no messages{f' ({problems[0]})' if problems else ''}: {path}")
     cameras = _cameras(topics)
-    choice = choose_features(
-        [
-            candidate
-            for _, topic in sorted(topics.items())
-            for found in topic.candidates
-            for candidate in of_publishers(found, list(topic.publishers))
-        ]
-    )
+    parts = [part for _, topic in sorted(topics.items()) for part in topic.parts]
+    state = _chosen([part for part in parts if not part.is_action])
+    action = _chosen([part for part in parts if part.is_action])
     lines = [f"# A mapping for {path.name}, suggested from its content; docs/import.md explains every key.", "#"]
-    if not choice.state:
+    if not state:
         warning = (
-            "No topic was recognised as the state of an arm or a base: write its source from the topics that the "
-            "mapping lists; the import refuses the mapping as it is."
+            "No topic was recognised as the state of an arm: write its source from the topics that the mapping lists; "
+            "the import refuses the mapping as it is."
         )
         tell(warning)
         lines += [f"# ATTENTION: {warning}", "#"]
@@ -124,15 +246,19 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
-    parts = [*choice.state, *choice.action]
-    is_mixed = _set_stamps(topics, {*cameras.values(), *(part.topic for part in parts)})
-    lines += ["", "[clock]", *_clock(topics, cameras, parts, is_mixed=is_mixed)]
-    lines += [*_subtasks(topics), *_features(choice, topics)]
-    for camera, topic in cameras.items():
-        lines += ["", f"[cameras.{camera}]", f"topic = {quoted(topic)}"]
-        info = topic.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0] + "/camera_info"
+    is_mixed = _set_stamps(topics, {*cameras.values(), *(part.topic for part in (*state, *action))})
+    lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action], is_mixed=is_mixed)]
+    lines += [*_subtasks(topics), *_sources("observation.state", state, topics), *_sources("action", action, topics)]
+    if not action:
+        lines += ["", "# No recognised topic is the command of this state, so the next state is the action."]
+        lines += ["[[features.action]]", 'next = "observation.state"']
+    poses = [part for part in parts if part.is_robot_pose and not part.is_action and part not in state]
+    lines += _sources("observation.ee_pose", poses if state and len(poses) == 1 else [], topics)
+    for camera, name in cameras.items():
+        lines += ["", f"[cameras.{camera}]", f"topic = {quoted(name)}"]
+        info = name.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0] + "/camera_info"
         lines += [f"info_topic = {quoted(info)}"] if info in topics else []
-        lines += [] if topics[topic].has_stamp else [_LOG]
+        lines += [] if topics[name].has_stamp else [_LOG]
     return lines
 
 
@@ -141,60 +267,12 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
     topics: dict[str, _Topic] = {}
     decoder = BagDecoder()
     for message in bag.messages(problems):
-        name, type_name = message.channel.topic, message.channel.type
-        topic = topics.setdefault(name, _Topic(name=name, type=type_name))
+        name = message.channel.topic
+        topic = topics.setdefault(name, _Topic(name=name, type=message.channel.type))
         topic.add(message.log_ns)
         if topic.count <= _MAX_DECODED and not topic.problem:
-            _look_into(topic, message, decoder)
+            topic.look_into(message, decoder)
     return topics
-
-
-def _look_into(topic: _Topic, message: ScannedMessage, decoder: BagDecoder) -> None:
-    try:
-        values = decoder.values(message)
-    except UnknownEncodingError as error:
-        topic.problem = str(error)
-        return
-    except (ValueError, RecursionError, OverflowError, TypeError):
-        return
-    stamp = stamp_of(values)
-    topic.has_stamp = bool(stamp or topic.stamps_ns)  # simulated time begins with 0, which looks like a missing time
-    if stamp and 0 < stamp < 2**63:
-        topic.skew_ns = topic.skew_ns or message.log_ns - stamp
-        topic.stamps_ns.append(stamp)
-    if topic.first is None:
-        try:
-            topic.first, topic.head = values, _head(values)
-        except NoColorError as error:
-            topic.problem = str(error)
-            return
-    if topic.head is None:
-        topic.candidates = topic.candidates or candidates_of(topic.name, topic.type, values)
-        for candidate in topic.candidates:
-            topic.publishers |= dict.fromkeys([_names(candidate, values)])
-
-
-def _names(candidate: Candidate, values: Values) -> tuple[str, ...]:
-    """Joint names in a message; () if it has none, or not one per number."""
-    steps = candidate.reader.names_steps
-    if steps is None:
-        return ()
-    try:
-        names, count = follow(values, steps), np.size(follow(values, candidate.reader.steps))
-    except ValueError:
-        return ()
-    are_texts = isinstance(names, list) and all(isinstance(name, str) for name in names)
-    return tuple(names) if are_texts and len(names) == count == len(set(names)) else ()
-
-
-def _head(values: Values) -> ImageHead | None:
-    """Head of an image; None for a message without one, NoColorError for an image without colour."""
-    try:
-        return image_head(values)
-    except NoColorError:
-        raise
-    except FieldError:
-        return None
 
 
 def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
@@ -270,64 +348,44 @@ def _set_stamps(topics: Mapping[str, _Topic], mapped: Collection[str]) -> bool:
 
 
 def _clock(
-    topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[Candidate], *, is_mixed: bool
-) -> list[str]:
-    rates = {topic: topics[topic].row_rate_hz for topic in cameras.values() if topics[topic].rate_hz}
-    heads = {topic: topics[topic].head for topic in rates}
-    colour = {
-        topic: rate for topic, rate in rates.items() if (head := heads[topic]) and head.encoding not in DEPTH_UNITS
-    }
-    colour = colour or rates
-    slowest = min(colour, key=lambda topic: colour[topic], default="")
-    part_rates = {part.topic: hz for part in parts if (hz := topics[part.topic].row_rate_hz)}
-    rate = colour[slowest] if slowest else min(part_rates.values(), default=_USUAL_FPS)
-    fps = max(1, round(rate))
-    if not slowest:  # rows are on a grid, which loses no message if it is as fast
+    topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[_Part], *, is_mixed: bool
+) -> Iterator[str]:
+    rates = {name: topics[name].row_rate_hz for name in cameras.values() if topics[name].rate_hz}
+    colour = [name for name in rates if (head := topics[name].head) and head.encoding not in DEPTH_UNITS]
+    slowest = min(colour or rates, key=lambda name: rates[name], default="")
+    if slowest:
+        yield f"fps = {max(1, round(rates[slowest]))}"
+        yield f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic'
+    else:  # rows are on a grid, which loses no message if it is as fast
+        part_rates = {part.topic: hz for part in parts if (hz := topics[part.topic].row_rate_hz)}
+        rate = min(part_rates.values(), default=_USUAL_FPS)
+        fps = max(1, round(rate))
         fps = min(fps + (fps < _MIN_GRID_RATIO * rate), MAX_FPS)
-    lines = [f"fps = {fps}"]
-    if not slowest:
-        for topic, hz in part_rates.items():
+        yield f"fps = {fps}"
+        for name, hz in part_rates.items():
             if fps < _MIN_GRID_RATIO * hz:
                 unused = f"{100 * (1 - fps / hz):.3g} % of its messages are in no row"
-                lines.append(f"# {quoted(topic)} comes {hz:.1f} times a second: {unused}")
-    if slowest:
-        lines += [f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic']
+                yield f"# {quoted(name)} comes {hz:.1f} times a second: {unused}"
     if is_mixed:
-        lines += ['stamp = "log"  # not all headers have a time, and those that do are of another clock']
-    return [*lines, 'when_old = "error"  # or "drop_episode"']
+        yield 'stamp = "log"  # not all headers have a time, and those that do are of another clock'
+    yield 'when_old = "error"  # or "drop_episode"'
 
 
-def _features(choice: Choice, topics: Mapping[str, _Topic]) -> Iterator[str]:
-    yield from _chosen("observation.state", choice.state, topics)
-    yield from _chosen("action", choice.action, topics)
-    if not choice.action:
-        yield from ("", "# No recognised topic is the command of this state, so the next state is the action.")
-        yield from ("[[features.action]]", 'next = "observation.state"')
-    for pose in choice.poses:
-        yield from _source("observation.ee_pose", pose, topics)
-
-
-def _chosen(feature: str, parts: Sequence[Candidate], topics: Mapping[str, _Topic]) -> Iterator[str]:
+def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic]) -> Iterator[str]:
     """Sources of a feature; if names clash, with prefixes from the words that distinguish their topics."""
     for number, part in enumerate(parts, 1):
-        rivals = [other for other in parts if other is not part and {*part.labels} & {*other.labels}]
+        rivals = [other for other in parts if other is not part and {*part.names} & {*other.names}]
         own = [word for word in part.words if not all(word in rival.words for rival in rivals)]
-        prefix = "_".join(own or [str(number)]) + "_" if rivals else ""
-        yield from _source(feature, part, topics, prefix=prefix)
-
-
-def _source(feature: str, part: Candidate, topics: Mapping[str, _Topic], *, prefix: str = "") -> Iterator[str]:
-    key = feature if "." not in feature else quoted(feature)
-    topic = topics[part.topic]
-    yield from ("", f"[[features.{key}]]", f"topic = {quoted(part.topic)}")
-    yield f"field = {quoted(part.reader.source.field)}"
-    if part.reader.joints:
-        yield f"joints = [{', '.join(map(quoted, part.reader.joints))}]"
-    if part.name:
-        yield f"names = [{quoted(part.name)}]"
-    if prefix or part.prefix:
-        yield f"prefix = {quoted(prefix + part.prefix)}"
-    if topic.row_rate_hz and (age_s := 2 / topic.row_rate_hz) > Clock(fps=1).max_age_s:
-        yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
-    if not topic.has_stamp:
-        yield _LOG
+        topic = topics[part.topic]
+        yield from ("", f"[[features.{feature if '.' not in feature else quoted(feature)}]]")
+        yield from (f"topic = {quoted(part.topic)}", f"field = {quoted(part.field)}")
+        if part.joints:
+            yield f"joints = [{', '.join(map(quoted, part.joints))}]"
+        elif part.kind == "gripper" and len(part.names) == 1:
+            yield f"names = [{quoted(part.names[0])}]"
+        if rivals:
+            yield f"prefix = {quoted('_'.join(own or [str(number)]) + '_')}"
+        if topic.row_rate_hz and (age_s := 2 / topic.row_rate_hz) > Clock(fps=1).max_age_s:
+            yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
+        if not topic.has_stamp:
+            yield _LOG
