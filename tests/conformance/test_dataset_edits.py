@@ -189,21 +189,6 @@ def test_idle_ends_are_cut_off(small: Path, tmp_path: Path, capsys: pytest.Captu
 
 
 @pytest.mark.slow
-def test_features_and_tasks(small: Path, tmp_path: Path) -> None:
-    before = items(small)
-    assert edit("rename", small, f"{TOP}=observation.images.front", "action=act", "--out", tmp_path / "a") == 0
-    assert edit("drop-features", tmp_path / "a", "act", "--out", tmp_path / "b") == 0
-    assert (
-        edit("set-task", tmp_path / "b", "--task", "push", "--where", "episode_index == 1", "--out", tmp_path / "c")
-        == 0
-    )
-    found = items(tmp_path / "c")
-    assert set(found[0][0]) == {"observation.state", "observation.images.front", "timestamp", "task"}
-    assert np.array_equal(found[2][3]["observation.images.front"], before[2][3][TOP])
-    assert [str(episode[0]["task"]) for episode in found[:3]] == ["put it there", "push", "put it there"]
-
-
-@pytest.mark.slow
 def test_all_differences_are_named_and_a_mapping_solves_them(
     small: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -188,7 +188,6 @@ def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
             yield f"robot_type = {_quoted(robots[0])}"
         if dropped := [name for name in features if name not in common]:
             yield f"drop = {_quoted(dropped)}"
-        yield from _other_names(plans[0], plan)
         for name in common:
             if not _fits(features[name], first[name]):
                 yield f"[dataset.feature.{_quoted(name)}]"
@@ -201,15 +200,6 @@ def _can_give(own: DatasetFeature | None, first: DatasetFeature) -> bool:
     if own is None or own.dtype != first.dtype:
         return False
     return _fits(own, first) or (_is_vector(own, first) and set(first.elements) <= set(own.elements))
-
-
-def _other_names(first: Plan, plan: Plan) -> Iterator[str]:
-    """Comments on features that may be renamed, which only the user can decide."""
-    there, here = first.info.features, plan.info.features
-    for name in [name for name in there if name not in here]:
-        for own in [own for own in here if own not in there and _fits(here[own], there[name])]:
-            yield f"# If {_quoted(own)} is {_quoted(name)} of the first one, drop neither, and add:"
-            yield from (f"# [dataset.feature.{_quoted(name)}]", f"# from = {_quoted(own)}")
 
 
 def _quoted(value: object) -> str:
