@@ -255,6 +255,32 @@ def test_raw_images_of_other_encodings(encoding: str, tmp_path: Path) -> None:
     assert np.abs(raw_image(values).astype(int) - expected).max() <= (5 if "bayer" in encoding else 0)
 
 
+@pytest.mark.parametrize(
+    ("encoding", "size"), [("bayer_rggb8", (63, 48)), ("bayer_bggr8", (64, 47)), ("uyvy", (63, 48))]
+)
+def test_encodings_of_pixel_pairs_need_even_sides(encoding: str, size: tuple[int, int]) -> None:
+    from demorec.extensions.imports.fields import FieldError
+    from demorec.extensions.imports.image_messages import image_head
+
+    width, height = size
+    values = {"encoding": encoding, "width": width, "height": height, "data": bytes(2 * width * height)}
+    with pytest.raises(FieldError, match=f"{encoding} image has {width}x{height} pixels, this encoding needs even"):
+        image_head(values)
+
+
+@pytest.mark.parametrize("encoding", ["uyvy", "yuyv"])
+def test_luma_and_colour_of_pixel_pairs(encoding: str) -> None:
+    """White, black and the primary colours of BT.601 by the formulas of ITU-R."""
+    from demorec.extensions.imports.image_messages import raw_image
+
+    colours = {(255, 255, 255): (235, 128, 128), (0, 0, 0): (16, 128, 128), (255, 0, 0): (81, 90, 240),
+               (0, 255, 0): (145, 54, 34), (0, 0, 255): (41, 240, 110)}  # fmt: skip
+    for rgb, (y, u, v) in colours.items():
+        pair = (u, y, v, y) if encoding == "uyvy" else (y, u, y, v)
+        values = {"encoding": encoding, "width": 16, "height": 8, "data": bytes(pair * 64)}
+        assert np.abs(raw_image(values).astype(int) - rgb).max() <= 4
+
+
 def test_an_undecodable_image_is_a_finding(tmp_path: Path) -> None:
     buffer = io.BytesIO()
     Image.fromarray(np.random.default_rng(0).integers(0, 255, (48, 64, 3), np.uint8)).save(buffer, format="PNG")

@@ -69,9 +69,11 @@ def raw_image(values: Values) -> NDArray[Any]:
 def _check_raw(values: Values) -> tuple[int, int]:
     """Bytes per row, with and without padding; FieldError if a message's bytes do not match its size."""
     encoding, width, height = str(values["encoding"]), whole(values, "width"), whole(values, "height")
-    is_odd = (width % 2 and "yu" in encoding) or (encoding.startswith("bayer") and (width % 2 or height % 2))
-    if encoding not in _PIXEL_BYTES or is_odd:
+    if encoding not in _PIXEL_BYTES:
         raise FieldError(f"its encoding {encoding[:40]!r} is not supported; {', '.join(_PIXEL_BYTES)} are")
+    is_bayer, is_paired = encoding.startswith("bayer"), _PIXELS.get(encoding, ("", 0))[0] == "yuyv422"
+    if (width % 2 and (is_bayer or is_paired)) or (height % 2 and is_bayer):
+        raise FieldError(f"its {encoding} image has {width}x{height} pixels, this encoding needs even sides")
     used = width * _PIXEL_BYTES[encoding]
     step = whole(values, "step") if values.get("step") and height > 1 else used
     data = values["data"]
