@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from itertools import chain
 from typing import Any
 
 from demorec.datasets.lerobot.episode_table import has_episode_table
@@ -54,7 +53,7 @@ def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
 
 
 def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
-    """Yield (episode_index, feature, its statistics in LeRobot's form) for entries with all ten values."""
+    """Yield (episode_index, feature, its available statistics in LeRobot's form)."""
     if folder.info.is_old:
         path = folder.root / OLD_STATS
         for line in read_json_lines(path) if path.exists() else ():
@@ -63,12 +62,11 @@ def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterat
                 yield from ((number, name, stats[name]) for name in features if isinstance(stats.get(name), dict))
         return
     for path in folder.episode_tables:
-        there = set(open_table(path).schema_arrow.names)
-        columns = {name: [f"stats/{name}/{key}" for key in NAMES] for name in features}
-        complete = {name: wanted for name, wanted in columns.items() if there.issuperset(wanted)}
-        for batch in table_batches(path, ["episode_index", *chain.from_iterable(complete.values())]):
+        there = open_table(path).schema_arrow.names
+        quantities = {name: [key for key in NAMES if f"stats/{name}/{key}" in there] for name in features}
+        columns = [f"stats/{name}/{key}" for name, keys in quantities.items() for key in keys]
+        for batch in table_batches(path, ["episode_index", *columns]):
             for row in batch.to_pylist():
-                for name, wanted in complete.items():
-                    values = [row[column] for column in wanted]
-                    if None not in values:
-                        yield row["episode_index"], name, dict(zip(NAMES, values, strict=True))
+                for name, keys in quantities.items():
+                    if keys:
+                        yield row["episode_index"], name, {key: row[f"stats/{name}/{key}"] for key in keys}

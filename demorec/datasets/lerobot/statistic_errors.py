@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
 from demorec.datasets.lerobot.episode_records import OLD_STATS, episode_statistics
-from demorec.datasets.lerobot.files import open_table, rows_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
@@ -33,8 +32,6 @@ FLOAT32_SUM = 0.25
 """Error of a float32 sum of N equal values, in N roundings of its result: rounding is uniform while the sum grows."""
 FLOAT32_VARIANCE = 3 * FLOAT32_SUM
 """Error of a variance of N rows, in N roundings of the squared mean: of the mean square, and twice of the mean."""
-Entries = Mapping[int, Mapping[str, Mapping[str, Any]]]
-"""Episode -> feature -> quantity -> its numbers."""
 Ranges = Array
 """(2, Q, D) minimum and maximum allowed value of each quantile."""
 
@@ -90,7 +87,9 @@ def statistic_errors(
 def _of_episodes(
     folder: LeRobotFolder, episodes: Mapping[int, Mapping[str, NDArray[Any]]], names: Sequence[str]
 ) -> Iterator[StatisticError]:
-    entries = _old_entries(folder, names) if folder.info.is_old else _table_entries(folder, names)
+    entries: dict[int, dict[str, Mapping[str, Any]]] = {}
+    for number, name, entry in episode_statistics(folder, names):
+        entries.setdefault(number, {})[name] = entry
     place = OLD_STATS if folder.info.is_old else "the table of episodes"
     for number, rows in episodes.items():
         stored = entries.get(number, {})
@@ -105,31 +104,6 @@ def _of_episodes(
                 if error > MAX_ERROR:
                     yield StatisticError(number, place, name, quantity, error)
                     break
-
-
-def _old_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
-    """Read the statistics of the episodes before v3.0."""
-    found: dict[int, dict[str, Mapping[str, Any]]] = {}
-    for number, name, stored in episode_statistics(folder, names):
-        found.setdefault(number, {})[name] = stored
-    return found
-
-
-def _table_entries(folder: LeRobotFolder, names: Sequence[str]) -> Entries:
-    """Read the available statistics in the table of episodes."""
-    tables = folder.episode_tables
-    there = set(open_table(tables[0]).schema_arrow.names) if tables else set()
-    columns = {name: [q for q in NAMES if f"stats/{name}/{q}" in there] for name in names}
-    known = [f"stats/{name}/{quantity}" for name, quantities in columns.items() for quantity in quantities]
-    rows = rows_in(folder.root, "meta/episodes", known) if known else ()
-    return {
-        place.episode_index: {
-            name: {quantity: row[f"stats/{name}/{quantity}"] for quantity in quantities}
-            for name, quantities in columns.items()
-            if quantities
-        }
-        for place, row in zip(folder.listed, rows, strict=False)
-    }
 
 
 def _vectors(folder: LeRobotFolder, name: str, rows: Any) -> Array:
