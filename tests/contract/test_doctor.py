@@ -265,6 +265,18 @@ def test_a_velocity_may_change_within_a_frame(sound: Evidence) -> None:
     assert found(diagnose(replace(spoilt(sound, brake), roles=roles)), "state_jumps") == set()
 
 
+def test_numbered_elements_of_different_counts_have_nothing_in_common(sound: Evidence) -> None:
+    """The state is a pose that rests, the action has joints."""
+    states = Column("float32", tuple(map(str, range(4))))
+    roles = find_roles({"observation.state": states, "action": Column("float32", tuple("01234"))}, NO_NAMES)
+    episodes = [
+        episode(each.number, np.full((each.length, 4), 0.3) + np.eye(4)[3] * each.state[:, :1], each.action)
+        for each in sound.episodes
+        if each.state is not None and each.action is not None
+    ]
+    assert found(diagnose(replace(sound, roles=roles, episodes=episodes, cameras={})), "frozen_state") == set()
+
+
 def test_slow_motion_is_no_idle_end(sound: Evidence) -> None:
     """The arm moves on by less than a degree a frame, or its reading stays where it is."""
 
@@ -297,7 +309,7 @@ def test_a_joint_that_hardly_moves_although_its_action_does_is_dead(sound: Evide
         for each in diagnose(replace(sound, episodes=episodes, cameras={})).findings
         if each.check == "frozen_state"
     ]
-    assert messages == [("broken", "wrist.pos never changes although its action does")]
+    assert messages == [("broken", "wrist.pos: the state never changes although the action does")]
 
 
 def test_measured_velocities_as_actions_are_worth_a_look(sound: Evidence) -> None:
@@ -361,6 +373,18 @@ def test_a_fault_of_images_is_found_in_its_episode(name: str, sound: Evidence) -
     diagnosis = diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)}))
     assert found(diagnosis, check) == {BAD}
     assert {each.episode for each in diagnosis.findings} == {BAD}
+
+
+@pytest.mark.parametrize("speed", [0, 4])
+def test_slow_motion_in_one_corner_is_not_frozen(speed: int, sound: Evidence) -> None:
+    """A hand that comes into view darkens one cell by a few levels an image, while all others stay as they are."""
+    shown = dict(sound.cameras["top"].episodes)
+    thumbnails = shown[BAD].thumbnails.copy()
+    thumbnails[60:90] = thumbnails[60]
+    thumbnails[60:90, 15, 0] = 130 - speed * np.arange(30)
+    shown[BAD] = as_images(thumbnails)
+    diagnosis = diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)}))
+    assert found(diagnosis, "frozen_images") == (set() if speed else {BAD})
 
 
 def test_keyframes_do_not_hide_a_camera_at_a_third_of_the_rate() -> None:

@@ -5,6 +5,7 @@ All bases and faults: `benchmarks/doctor_faults.py`.
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -69,6 +70,18 @@ def test_a_codec_that_info_json_misnames_is_one_finding(small: Path) -> None:
     (finding,) = findings_of(check(small))
     assert finding["check"] == "video_format"
     assert "episode_000000.mp4 and 3 more is h264" in finding["message"]
+
+
+def test_channels_may_come_first(small: Path) -> None:
+    path = small / "meta/info.json"
+    info = json.loads(path.read_text())
+    for feature in info["features"].values():
+        if feature["dtype"] == "video":
+            height, width, channels = feature["shape"]
+            feature |= {"shape": [channels, height, width], "names": None}
+            feature["info"] = {**feature.get("info", {}), "video.channels": channels}
+    path.write_text(json.dumps(info))
+    assert findings_of(check(small)) == []
 
 
 def test_tables_that_are_missing_are_to_be_downloaded(small: Path) -> None:

@@ -121,9 +121,17 @@ class DatasetFeature:
     @property
     def image_size(self) -> tuple[int, int]:
         """(width, height) of a camera's images, also for v2's channels-first order."""
-        is_channels_first = self.shape[0] in _NUM_CHANNELS and self.shape[-1] not in _NUM_CHANNELS
-        height, width = self.shape[1:3] if is_channels_first else self.shape[:2]
+        height, width = self.shape[1:3] if self._is_channels_first else self.shape[:2]
         return width, height
+
+    @property
+    def num_channels(self) -> int:
+        """Number of channels of a camera's images."""
+        return self.shape[0] if self._is_channels_first else self.shape[2]
+
+    @property
+    def _is_channels_first(self) -> bool:
+        return self.shape[0] in _NUM_CHANNELS and self.shape[-1] not in _NUM_CHANNELS
 
     @property
     def is_depth(self) -> bool:

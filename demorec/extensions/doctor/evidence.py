@@ -28,7 +28,7 @@ DROP = "demorec dataset drop {path} --episodes {episode} --out NEW"
 """Advice for one bad episode."""
 REPAIR = "demorec dataset repair {path} --out NEW"
 """Advice for tables, counts and statistics that contradict the rows."""
-_INCREMENT = re.compile("^delta_")
+_INCREMENT = "delta_"
 """Prefix of an action's element that is the change of the state's element, as LeRobot names them."""
 _HAND = re.compile(
     "thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm|hand.*(?:joint|index|middle)", re.IGNORECASE
@@ -144,7 +144,11 @@ class Evidence:
         """Index in the action of each element of the state, "delta_x" for "x" too; None if missing."""
         if not (self.roles.state and self.roles.action):
             return [None] * len(self.elements)
-        increments = {_INCREMENT.sub("", name): place for place, name in enumerate(self.action_elements)}
+        increments = {
+            name.removeprefix(_INCREMENT): place
+            for place, name in enumerate(self.action_elements)
+            if name.startswith(_INCREMENT)
+        }
         matched = self.roles.in_state(self.roles.action)
         return [
             increments.get(joint_of(name)) if place is None else place

@@ -324,11 +324,10 @@ def _found_format(path: Path, folder: LeRobotFolder) -> dict[str, Any]:
 
 def _info_against_itself(key: str, feature: DatasetFeature, folder: LeRobotFolder) -> Iterator[Fault]:
     info, (width, height) = feature.info or {}, feature.image_size
-    if feature.is_depth and feature.shape[2] != 1:
-        yield Fault(
-            severity="broken", message=f"{key} is a depth map of {feature.shape[2]} channels in info.json", do=_BY_HAND
-        )
-    for quantity, value in (("height", height), ("width", width), ("channels", feature.shape[2])):
+    if feature.is_depth and feature.num_channels != 1:
+        message = f"{key} is a depth map of {feature.num_channels} channels in info.json"
+        yield Fault(severity="broken", message=message, do=_BY_HAND)
+    for quantity, value in (("height", height), ("width", width), ("channels", feature.num_channels)):
         if info.get(f"video.{quantity}", value) != value:
             yield Fault(
                 severity="look",

@@ -83,16 +83,19 @@ def _never_moving(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, 
     usual_span = float(np.median(spans[spans > 0])) if (spans > 0).any() else 0.0
     commanded = [element for element, column in enumerate(evidence.action_of) if column is not None]
     usual_range = float(np.median(evidence.ranges[commanded])) if commanded else 0.0
+    names = []
     for element, column in enumerate(evidence.action_of):
         if column is None or evidence.is_gripper[element] or evidence.ranges[element] > MAX_FLICKER * usual_range:
             continue
         if spans[column] > MIN_COMMANDED_RANGE * usual_span > 0:
-            yield Fault(
-                severity="broken",
-                value="0",
-                message=f"{element_name(evidence, element)} never changes although its action does",
-                do="record the joint's own position",
-            )
+            names.append(element_name(evidence, element))
+    if names:
+        yield Fault(
+            severity="broken",
+            value="0",
+            message=f"{', '.join(names)}: the state never changes although the action does",
+            do="record the joint's own position",
+        )
 
 
 def _never_acting(evidence: Evidence, episodes: Sequence[tuple[EpisodeEvidence, Array]]) -> Iterator[Fault]:

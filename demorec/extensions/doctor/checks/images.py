@@ -28,6 +28,9 @@ FROZEN_RATIO = 0.08
 """Maximum change of a repeated image, relative to the usual change while the robot moves."""
 MIN_MISSING_CHANGE = 4.0
 """Minimum change expected from the joints' motion while images repeat, in multiples of an image's usual change."""
+MAX_FROZEN_STEP = 8
+"""Maximum change of a cell of the thumbnails, of 255, over a run of repeats: small motion adds up, a codec's errors do
+not."""
 MIN_FROZEN_FRAMES = 3
 MIN_EQUAL = 0.5
 """Minimum ratio of images that repeat every pixel: videos of a low rate skip small changes, but seldom all."""
@@ -197,7 +200,10 @@ def frozen_images(evidence: Evidence) -> Iterator[Fault]:
 def _rests(
     evidence: Evidence, number: int, images: EpisodeThumbnails, camera: CameraThumbnails
 ) -> list[tuple[float, int, int, float]]:
-    """Find (missing change, in images; first frame, last frame, ratio of equal images) of each run of repeats."""
+    """Find (missing change, in images; first frame, last frame, ratio of equal images) of each run of repeats.
+
+    The first and the last image must be alike, too.
+    """
     visible = evidence.once(visible_motion, camera)
     episode = evidence.by_number.get(number)
     if visible is None or episode is None or episode.state is None or len(images.frames) < 2:
@@ -212,6 +218,7 @@ def _rests(
             float(np.mean(images.change[first + 1 : end + 1] == 0)),
         )
         for first, end in runs(same)
+        if np.ptp(images.thumbnails[[first, end]].astype(np.int16), axis=0).max() <= MAX_FROZEN_STEP
     ]
 
 

@@ -168,7 +168,8 @@ def _action_units(evidence: Evidence) -> Iterator[Fault]:
     measures="jumps of the state within one frame",
     unit="% of the range",
     why="No arm jumps: frames are missing, a reading failed, or two episodes were written as one.",
-    do="look at it: demorec view {path} --episodes {episode}; then cut or drop it: " + DROP,
+    do="look at it: demorec view {path} --episodes {episode}; then cut it: demorec dataset cut {path} --jumps "
+    "--out NEW, or drop it: " + DROP,
 )
 def state_jumps(evidence: Evidence) -> Iterator[Fault]:
     """Find steps several times as large as the largest usual one and as the steps before and after them.

@@ -216,7 +216,6 @@ def held_samples(evidence: Evidence) -> Iterator[Fault]:
             episode=number,
             value=f"{period} frames",
             message=f"its state changes only once in {period} frames",
-            do=DROP,
         )
 
 
