@@ -146,8 +146,8 @@ def test_a_merge_prints_a_mapping_that_can_be_saved(cups: Path, capsys: pytest.C
     Path("m.toml").write_text(printed.out)
     assert exit_code(*merged) == 0
     assert "action" not in json.loads(Path("both/meta/info.json").read_text())["features"]
-    chosen = printed.out.replace('drop = ["action"]\n', "").replace('drop = ["act"]\n', "").replace("# [", "[")
-    Path("m.toml").write_text(chosen.replace("# from", "from"))
+    chosen = printed.out.replace('drop = ["action"]\n', "").replace('drop = ["act"]\n', "")
+    Path("m.toml").write_text(chosen + '[dataset.feature.action]\nfrom = "act"\n')
     assert exit_code(*merged, "--overwrite") == 0
     assert "action" in json.loads(Path("both/meta/info.json").read_text())["features"]
 
