@@ -197,6 +197,22 @@ def test_a_fast_start_of_the_whole_arm_is_not_a_jump(is_whole: bool, sound: Evid
     assert found(diagnose(spoilt(sound, start)), "state_jumps") == (set() if is_whole else {BAD})
 
 
+def test_a_stale_first_reading_of_a_joint_that_rests_is_worth_a_look(sound: Evidence) -> None:
+    """The joint has another position in each episode, and hardly moves within one."""
+    episodes = []
+    for each in sound.episodes:
+        assert each.state is not None
+        assert each.action is not None
+        state = each.state.copy()
+        state[:, 3] = 10 * each.number + np.random.default_rng(each.number).normal(0, 0.001, len(state))
+        state[0, 3] += 30 * (each.number == BAD)
+        episodes.append(episode(each.number, state, each.action))
+    findings = diagnose(replace(sound, episodes=episodes, cameras={})).findings
+    assert [(f.episode, f.severity, f.value) for f in findings if f.check == "state_jumps"] == [
+        (BAD, "look", "27% of its range")
+    ]
+
+
 def with_second_arm(sound: Evidence, change: Callable[[int, Array], tuple[Array, Array]]) -> Evidence:
     """Add a second arm with the state and action (T, 3) that `change` computes from number and state."""
     names = (*NAMES, *(f"left.joint_{number}.pos" for number in range(3)))

@@ -107,8 +107,8 @@ def _gripper_units(evidence: Evidence) -> Iterator[Fault]:
         sizes = np.array([np.abs(state[:, element]).max() for _, state in episodes])
         spans = np.array([np.ptp(state[:, element]) for _, state in episodes])
         usual_size, usual_span = np.median(sizes), np.median(spans)
-        for (episode, _), size, span in zip(episodes, sizes, spans, strict=True):
-            ratio = float(span / usual_span) if usual_span > 0 else 0.0
+        for (episode, _), size, span in zip(episodes, sizes, spans, strict=True) if usual_span > 0 else ():
+            ratio = float(span / usual_span)
             if min(ratio, size / usual_size) > MIN_UNIT_RATIO and not _confusion(ratio).startswith("another"):
                 yield Fault(
                     severity="broken",
@@ -202,7 +202,7 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
         frames = np.flatnonzero(jumps.any(axis=1))
         places = np.unravel_index(int(np.argmax(np.where(jumps, sizes / np.maximum(limit, 1e-12), 0))), sizes.shape)
         frame, element = int(places[0]), int(places[1])
-        share = sizes[frame, element] / max(evidence.ranges[element], 1e-12)
+        share = sizes[frame, element] / max(evidence.ranges[element], highest[element] - lowest[element], 1e-12)
         count = f" and {len(frames) - 1} more" if len(frames) > 1 else ""
         yield Fault(
             severity="broken" if moves[element] and (len(frames) > 1 or share > 0.5) else "look",
