@@ -22,7 +22,7 @@ from demorec.core.geometry import Array
 from demorec.extensions.doctor.evidence import Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import NORMAL
-from demorec.extensions.doctor.units import MIN_OTHERS, moving_elements
+from demorec.extensions.doctor.units import MIN_OTHERS, moving_elements, other_units
 
 MIN_EPISODES = 12
 """Minimum number of episodes with one instruction to compare them with each other; fewer are compared with the whole
@@ -90,9 +90,10 @@ class ArmMotion(NamedTuple):
 
 
 def score_episodes(evidence: Evidence) -> dict[int, EpisodeScore]:
-    """Compute episode number -> its score: 1 if nothing is unusual; 0 if it is unreadable or too short."""
+    """Compute episode number -> its score: 1 if nothing is unusual; 0 if unreadable, too short or in another unit."""
     flaws = dict.fromkeys(evidence.unreadable, "cannot be read")
     flaws |= {e.number: f"has {e.length} frames" for e in evidence.episodes if e.length < _MIN_FRAMES}
+    flaws |= dict.fromkeys(evidence.once(other_units), "has another unit than the other episodes")
     readings = measure(evidence)
     reasons: dict[int, list[Reason]] = {each.number: [] for each in evidence.episodes}
     for number, flaw in flaws.items():
@@ -138,11 +139,16 @@ def _judged(name: str, readings: Mapping[int, QuantityReading]) -> Iterator[tupl
 
 
 def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
-    """Compute episode number -> quantity -> its number, for episodes that are long enough; empty without a state."""
+    """Compute episode number -> quantity -> its number; empty without a state.
+
+    Episodes that are too short, or in another unit, are left out: they would change what is usual.
+    """
     columns = [column for column in evidence.action_of if column is not None]
     has_action = len(columns) == len(evidence.elements) > 0
     motions: dict[int, ArmMotion] = {}
     for episode, state in evidence.with_state(_MIN_FRAMES):
+        if episode.number in evidence.once(other_units):
+            continue
         acted = state if episode.action is None or not has_action else episode.action[:, columns]
         motions[episode.number] = ArmMotion(state, acted)
     known = list(motions.values())
@@ -150,7 +156,8 @@ def measure(evidence: Evidence) -> dict[int, dict[str, QuantityReading]]:
     arm = ~evidence.is_gripper & evidence.once(moving_elements) if known else ~evidence.is_gripper
     found = {n: _readings(motion, ranges, arm, evidence.is_gripper, evidence.fps) for n, motion in motions.items()}
     for number, lag in _lags(evidence).items():
-        found[number]["lag"] = QuantityReading(lag, 0, len(motions[number].state) - 1)
+        if number in found:
+            found[number]["lag"] = QuantityReading(lag, 0, len(motions[number].state) - 1)
     return found
 
 
@@ -166,8 +173,8 @@ def _range(values: Sequence[Array]) -> Array:
     """Return the minimum and maximum value (2, D) of all episodes, excluding the outermost tenth of them."""
     if not values:
         return np.zeros((2, 0))
-    low = np.quantile([part.min(axis=0) for part in values], 0.1, axis=0)
-    high = np.quantile([part.max(axis=0) for part in values], 0.9, axis=0)
+    low = np.quantile([part.min(axis=0) for part in values], 0.1, axis=0, method="higher")
+    high = np.quantile([part.max(axis=0) for part in values], 0.9, axis=0, method="lower")
     return np.stack([low, high])
 
 

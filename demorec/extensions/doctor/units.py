@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -27,7 +27,8 @@ def other_units(evidence: Evidence) -> dict[int, dict[str, float]]:
     for role in ("state", "action"):
         values = {e.number: v for e in evidence.episodes if (v := getattr(e, role)) is not None and len(v)}
         if len(values) > MIN_OTHERS:
-            for number, ratio in _other_sizes(values).items():
+            positions = _positions(evidence.elements) if role == "state" else []
+            for number, ratio in _other_sizes(values, positions).items():
                 found.setdefault(number, {})[role] = ratio
     return found
 
@@ -54,19 +55,27 @@ def moving_elements(evidence: Evidence) -> Flags:
     return np.asarray(evidence.is_position & (evidence.ranges > MIN_MOTION_TICKS * evidence.once(element_ticks)))
 
 
-def _other_sizes(values: Mapping[int, Array]) -> dict[int, float]:
-    """Find episode -> ratio of its magnitude to that of the others, if most of its elements agree on a large one."""
+def _positions(names: Sequence[str]) -> list[list[int]]:
+    """Find the elements of each position in space: three in a row that are called x, y and z."""
+    words = [name.rpartition(".")[2].rpartition("_")[2].lower() for name in names]
+    return [[i, i + 1, i + 2] for i in range(len(words) - 2) if words[i : i + 3] == ["x", "y", "z"]]
+
+
+def _other_sizes(values: Mapping[int, Array], positions: Sequence[list[int]]) -> dict[int, float]:
+    """Find episode -> ratio of its magnitude to that of the others, if most elements or a whole position agree."""
     sizes = {number: np.sqrt((each**2).mean(axis=0)) for number, each in values.items()}
     spans = {number: np.ptp(each, axis=0) for number, each in values.items()}
     usual_size, usual_span = (np.median(np.stack(list(part.values())), axis=0) for part in (sizes, spans))
-    alive = (usual_size > 0) & (usual_span > 0)
+    alive = np.flatnonzero((usual_size > 0) & (usual_span > 0))
+    wholes = [(alive, 0.6), *((np.array(each), 1.0) for each in positions if np.isin(each, alive).all())]
     found: dict[int, float] = {}
-    for number in values if alive.any() else ():
-        with np.errstate(divide="ignore"):
-            by_size = np.log(sizes[number][alive] / usual_size[alive])
-            by_span = np.log(spans[number][alive] / usual_span[alive])
-        for sign in (1.0, -1.0):
-            agreed = np.minimum(sign * by_size, sign * by_span) > math.log(MIN_UNIT_RATIO)
-            if agreed.mean() > 0.6 and (sign > 0 or np.isfinite(by_span[agreed]).all()):
-                found[number] = float(np.exp(np.median(by_size[agreed])))
+    for number in values:
+        for elements, least in wholes:
+            with np.errstate(divide="ignore"):
+                by_size = np.log(sizes[number][elements] / usual_size[elements])
+                by_span = np.log(spans[number][elements] / usual_span[elements])
+            for sign in (1.0, -1.0):
+                agreed = np.minimum(sign * by_size, sign * by_span) > math.log(MIN_UNIT_RATIO)
+                if len(elements) and agreed.mean() >= least and (sign > 0 or np.isfinite(by_span[agreed]).all()):
+                    found.setdefault(number, float(np.exp(np.median(by_size[agreed]))))
     return found

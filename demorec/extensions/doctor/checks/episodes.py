@@ -18,8 +18,10 @@ from demorec.extensions.doctor.units import moving_elements, other_units
 
 MIN_OTHERS = 7
 """Minimum number of episodes to compare one with: with fewer, "usual" means little."""
+MAX_UNUSUAL_SCORE = 0.05
+"""Score below which an episode is worth a look: one quantity at nine usual spreads, or two at seven or eight."""
 MAX_UNUSUAL_SPREADS = 10.0
-"""Minimum number of usual spreads at which a quantity of an episode is worth a look."""
+"""Number of usual spreads from which a quantity is far from the usual one."""
 MAX_UNUSUAL_SHARE = 0.1
 """Maximum ratio of episodes with a quantity far from the median: more are another way to do the task."""
 MIN_END_SPEED = 0.8
@@ -193,21 +195,23 @@ def idle_ends(evidence: Evidence) -> Iterator[Fault]:
 def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
     """Compare duration, pauses, detours, shaking and switches of the gripper with those of the other episodes.
 
-    These are the reasons of the score; one is worth a look at ten usual spreads or more.
+    These are the reasons of the score; an episode with a score below 0.05 is worth a look.
     """
     evidence.need_state(8)
     if len(evidence.episodes) <= MIN_OTHERS:
         raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
-    scores = evidence.once(score_episodes)
+    others = evidence.once(other_units)
+    scores = {number: score for number, score in evidence.once(score_episodes).items() if number not in others}
     far = Counter(r.kind for score in scores.values() for r in score.reasons if r.spreads > MAX_UNUSUAL_SPREADS)
-    rare = {kind for kind, count in far.items() if count <= max(1, MAX_UNUSUAL_SHARE * len(scores))}
+    common = {kind for kind, count in far.items() if count > max(1, MAX_UNUSUAL_SHARE * len(scores))}
     for number, score in scores.items():
-        for reason in score.reasons if number not in evidence.once(other_units) else ():
-            if reason.kind in rare - {"flaw", "lag"} and reason.spreads > MAX_UNUSUAL_SPREADS:
-                yield Fault(
-                    severity="look",
-                    episode=number,
-                    frames=(reason.first, reason.last),
-                    value=f"{reason.spreads:.0f} spreads",
-                    message=f"it {reason.text}" if not reason.text.startswith("the ") else reason.text,
-                )
+        reasons = [reason for reason in score.reasons if reason.kind not in common | {"flaw", "lag"}]
+        if math.prod(reason.factor for reason in reasons) < MAX_UNUSUAL_SCORE:
+            worst = reasons[0]
+            yield Fault(
+                severity="look",
+                episode=number,
+                frames=(worst.first, worst.last),
+                value=f"{worst.spreads:.0f} spreads",
+                message=f"it {worst.text}" if not worst.text.startswith("the ") else worst.text,
+            )
