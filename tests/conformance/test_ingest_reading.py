@@ -95,26 +95,51 @@ def test_a_folder_of_ros_1_bags(notes: bags.Notes, tmp_path: Path) -> None:
         _assert_same(notes, _read(open_bag(path))[0])
 
 
-@pytest.mark.parametrize("damage", ["no index", "cut off"])
-def test_an_unfinished_bag_of_ros_1(damage: str, notes: bags.Notes, tmp_path: Path) -> None:
-    path = bags.write_ros1(notes, tmp_path / "bag.bag")
+@pytest.mark.parametrize(
+    ("damage", "compression"),
+    [
+        ("no index", None),
+        ("no index", Ros1Writer.CompressionFormat.BZ2),
+        ("cut off", Ros1Writer.CompressionFormat.LZ4),
+        ("half a chunk", Ros1Writer.CompressionFormat.BZ2),
+        ("half a chunk", Ros1Writer.CompressionFormat.LZ4),
+        ("half a file", None),
+        ("half a file", Ros1Writer.CompressionFormat.LZ4),
+    ],
+)
+def test_an_unfinished_bag_of_ros_1(
+    damage: str, compression: Ros1Writer.CompressionFormat | None, notes: bags.Notes, tmp_path: Path
+) -> None:
+    """An unfinished bag is read as far as it lasts, record by record where the index is missing."""
+    path = bags.write_ros1(notes, tmp_path / "bag.bag", compression=compression)
     whole = path.read_bytes()
     place = whole.index(b"index_pos=") + len(b"index_pos=")
     index = int.from_bytes(whole[place : place + 8], "little")
     assert 0 < index < len(whole)
-    path.write_bytes(whole[: index - 10] if damage == "cut off" else whole[:place] + bytes(8) + whole[place + 8 :])
-    with pytest.raises(BagError, match=r"The bag has no whole index, rosbag reindex adds it \("):
-        list(open_bag(path).messages([]))
-
-
-def test_a_damaged_chunk_of_ros_1_is_reported(notes: bags.Notes, tmp_path: Path) -> None:
-    path = bags.write_ros1(notes, tmp_path / "bag.bag", compression=Ros1Writer.CompressionFormat.LZ4)
-    data = bytearray(path.read_bytes())
-    data[len(data) // 4 : len(data) // 4 + 50] = bytes(50)
+    data = {
+        "no index": whole[:place] + bytes(8) + whole[place + 8 :],
+        "cut off": whole[: index - 10],
+        "half a chunk": whole[: index // 2] + bytes(50) + whole[index // 2 + 50 :],
+        "half a file": whole[: index // 2],
+    }[damage]
+    assert data != whole
     path.write_bytes(data)
-    problems: list[str] = []
-    assert len(list(open_bag(path).messages(problems))) < len(notes)
-    assert problems[0].startswith("bag.bag: it is damaged")
+    if damage == "half a chunk":
+        problems: list[str] = []
+        assert len(list(open_bag(path).messages(problems))) < len(notes)
+        assert problems[0].startswith("bag.bag: it is damaged")
+        return
+    found, problems = _read(open_bag(path))
+    assert "bag.bag: it was not finished" in problems[0]
+    if damage == "no index":
+        assert len(problems) == 1
+    if damage == "half a file":
+        assert len(found) < len(notes)
+        assert bool(found) == (compression is None)  # one chunk holds all; half of it cannot be unpacked
+        assert "cut off" in problems[1]
+    else:
+        assert len(found) == len(notes)
+    _assert_same(notes[: len(found)], found)
 
 
 def test_protobuf_of_another_writer(tmp_path: Path) -> None:

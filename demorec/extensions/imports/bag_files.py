@@ -48,28 +48,39 @@ def read_sqlite(path: Path, topics: Topics, report: Report) -> Iterator[ScannedM
     if journal.is_file() and journal.stat().st_size:
         report(f"messages in {journal.name} are not read: open a copy of the bag with sqlite3, which takes them in")
     reader = Sqlite3Reader(Path(quote(str(path.resolve()))))  # which becomes a URI
-    yield from _rosbags_messages(reader, topics, report, "The bag is damaged", path)
-
-
-def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
-    """Read a ROS 1 bag in the order of log times; BagError if it was not finished."""
-    from rosbags.rosbag1 import Reader
-
-    yield from _rosbags_messages(
-        Reader(path), topics, report, "The bag has no whole index, rosbag reindex adds it", path
-    )
-
-
-def _rosbags_messages(
-    reader: Any, topics: Topics, report: Report, unreadable: str, path: Path
-) -> Iterator[ScannedMessage]:
-    """Read the messages of a `rosbags` reader; BagError, which begins with `unreadable`, if it cannot be opened."""
     try:
         reader.open()
     except (MemoryError, OSError):
         raise
     except Exception as error:  # its own errors, and unforeseen ones
-        raise BagError(f"{unreadable} ({describe_error(error).rstrip('.')}): {path}") from error
+        raise BagError(f"The bag is damaged ({describe_error(error).rstrip('.')}): {path}") from error
+    yield from _rosbags_messages(reader, topics, report)
+
+
+def read_ros1(path: Path, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read a ROS 1 bag in the order of log times, or in file order if its index is missing."""
+    from rosbags.rosbag1 import Reader
+
+    reader = Reader(path)
+    try:
+        reader.open()
+    except (MemoryError, OSError):
+        raise
+    except Exception as error:  # its own errors, and unforeseen ones
+        report(f"it was not finished ({describe_error(error).rstrip('.')}), so it is read without its index")
+        from demorec.extensions.imports.ros1_scan import scan_ros1
+
+        channels: dict[int, ScannedChannel] = {}
+        for connection, time_ns, data in scan_ros1(path, report):
+            if topics is None or connection.topic in topics:
+                channel = channels.get(connection.id) or channels.setdefault(connection.id, _channel(connection))
+                yield ScannedMessage(channel, time_ns, data)
+        return
+    yield from _rosbags_messages(reader, topics, report)
+
+
+def _rosbags_messages(reader: Any, topics: Topics, report: Report) -> Iterator[ScannedMessage]:
+    """Read the messages of an open `rosbags` reader, and close it."""
     try:
         wanted = [connection for connection in reader.connections if topics is None or connection.topic in topics]
         channels = {connection.id: _channel(connection) for connection in wanted}
