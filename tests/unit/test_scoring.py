@@ -208,9 +208,9 @@ def test_good_episodes_are_selected(late: Path, tmp_path: Path, capsys: pytest.C
 def test_the_worst_is_shown_first(late: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     flags = ("--episodes", "3:7", "--save", str(tmp_path / "v.rrd"))
     assert exit_code("view", str(late), "--rank", "score", *flags) == 0
-    assert f"episode {BAD}: its state follows" in capsys.readouterr().err
+    assert f"episode {BAD}: its action is" in capsys.readouterr().err
     assert exit_code("report", str(late), "--out", str(tmp_path / "page.html")) == 0
     page = (tmp_path / "page.html").read_text()
     first = page.partition('<section id="episodes">')[2].partition("<article")[2].partition("</article>")[0]
     assert f"episode {BAD}<" in first
-    assert "its state follows the action by" in first
+    assert "the state follows it by" in first

@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 Flags = NDArray[np.bool_]
 DROP = "demorec dataset drop {path} --episodes {episode} --out NEW"
 """Advice for one bad episode."""
+LOOK_OR_DROP = "look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP
+"""Advice for one unusual episode."""
 REPAIR = "demorec dataset repair {path} --out NEW"
 """Advice for tables, counts and statistics that contradict the rows."""
 _INCREMENT = "delta_"

@@ -144,6 +144,10 @@ def lines_of(diagnosis: Diagnosis, *, everything: bool = False) -> Iterator[str]
     if len(folded) > MAX_FINDINGS and not everything:
         yield f"and {counted(len(folded) - MAX_FINDINGS, 'more finding')} (--all prints them)"
     yield from _episodes(diagnosis, everything=everything)
+    commands = {finding.do for finding in diagnosis.findings if "--out NEW" in finding.do}
+    if len(commands) > 1:
+        repair = ", dataset repair first" if any("dataset repair" in each for each in commands) else ""
+        yield f"Run one command{repair}, then check NEW: its episodes have new numbers."
 
 
 def _taken(diagnosis: Diagnosis) -> str:

@@ -83,12 +83,14 @@ def action_lag(evidence: Evidence) -> Iterator[Fault]:
     _, spread = usual([episode.lag for episode in relation.episodes.values()], floor=0.1)
     for number, episode in relation.episodes.items():
         shift = episode.lag - usual_lag
+        side = "late" if shift < 0 else "early"
         if abs(shift) > max(MIN_SHIFT, 6 * spread) and _prefers(episode, relation, shift):
             yield Fault(
                 severity="broken",
                 episode=number,
                 value=f"{shift:+.1f} frames",
-                message=f"its state follows the action by {episode.lag:+.1f} frames (others: {usual_lag:+.1f})",
+                message=f"its action is {abs(shift):.1f} frames {side}: the state follows it by {episode.lag:+.1f} "
+                f"frames (others: {usual_lag:+.1f})",
             )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
+from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, EpisodeEvidence, Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.scores import score_episodes
@@ -49,7 +49,7 @@ MIN_LENGTH_TIMES = 3.0
     measures="episodes that are cut off",
     unit="% of usual speed",
     why="The end of the task is missing: the policy does not learn to finish.",
-    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+    do=LOOK_OR_DROP,
 )
 def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
     """Find episodes that end during a motion, where nearly all others end at rest.
@@ -190,7 +190,7 @@ def idle_ends(evidence: Evidence) -> Iterator[Fault]:
     measures="episodes unlike the others of their task",
     unit="usual spreads",
     why="Detours, pauses and shaking are learned like everything else.",
-    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+    do=LOOK_OR_DROP,
 )
 def unusual_motion(evidence: Evidence) -> Iterator[Fault]:
     """Compare duration, pauses, detours, shaking and switches of the gripper with those of the other episodes.

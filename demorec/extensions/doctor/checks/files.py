@@ -64,7 +64,8 @@ def unreadable_episodes(evidence: Evidence) -> Iterator[Fault]:
         severity: Severity = "broken" if number == 0 and folder.is_found_by_rows else "look"
         remedy = REPAIR if "dataset repair" in note else _LEAVE_CAMERA_OUT
         yield Fault(severity=severity, message=note, do=remedy)
-    if missing := folder.missing:
+    are_all_read = len(evidence.episodes) == folder.info.total_episodes  # then only a counter is wrong
+    if (missing := folder.missing) and not are_all_read:
         yield Fault(
             severity="broken", message=missing.partition(": /")[0], do=f"complete it, or keep the intact part: {REPAIR}"
         )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.evidence import DROP, Evidence
+from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
 from demorec.extensions.doctor.robust import held_period, runs
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
 from demorec.extensions.doctor.visible_motion import visible_motion
@@ -133,7 +133,7 @@ def _bounds(flags: NDArray[np.bool_]) -> tuple[int, int]:
     measures="a camera that is temporarily covered",
     unit="s",
     why="The policy acts without seeing in these frames.",
-    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+    do=LOOK_OR_DROP,
 )
 def covered_camera(evidence: Evidence) -> Iterator[Fault]:
     """Find segments with far lower contrast than the camera's other images, without being blank."""

@@ -70,7 +70,8 @@ def missing_numbers(evidence: Evidence) -> Iterator[Fault]:
                 episode=episode.number,
                 frames=(min(frames), max(frames)),
                 value=f"{sum(counts.values())} numbers",
-                message=f"NaN or infinite numbers in {', '.join(counts)}",
+                message=f"{', '.join(counts)} {'has' if len(counts) == 1 else 'have'} NaN or infinite numbers: "
+                f"{sum(counts.values())}, the first in frame {min(frames)}",
             )
 
 

@@ -14,6 +14,8 @@ from demorec.extensions.doctor.units import MIN_MOTION_TICKS, element_ticks
 
 MAX_GAP_PERIODS = 2.5
 """Maximum periods between two frames without missing ones; one late frame takes two."""
+NEIGHBOURS = 5
+"""Number of frames on each side of a gap that show the speed of the state there."""
 MAX_RATE_ERROR = 0.1
 """Maximum relative error of the measured rate; above it motion has a wrong speed."""
 MIN_FRAMES = 5
@@ -47,14 +49,28 @@ def time_gaps(evidence: Evidence) -> Iterator[Fault]:
         gaps = np.flatnonzero(steps * evidence.fps > MAX_GAP_PERIODS)
         if len(gaps):
             longest = int(gaps[np.argmax(steps[gaps])])
+            more = f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""
+            seconds = float(steps[longest])
+            moves_on = _moves_on(evidence, episode, longest, seconds * evidence.fps)
+            what = "the state moves on as usual, but its clock jumps by {} s" if moves_on else "{} s are missing"
             yield Fault(
                 severity="broken",
                 episode=episode.number,
                 frames=(int(gaps[0]) + 1, int(gaps[-1]) + 1),
-                value=f"{steps[longest]:.2f} s",
-                message=f"{steps[longest]:.2f} s are missing before frame {longest + 1}"
-                + (f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""),
+                value=f"{seconds:.2f} s",
+                message=f"{what.format(f'{seconds:.2f}')} before frame {longest + 1}{more}",
+                do="write frame_index / fps as the timestamp, and convert it again" if moves_on else "",
             )
+
+
+def _moves_on(evidence: Evidence, episode: EpisodeEvidence, frame: int, periods: float) -> bool:
+    """Check whether the state after a gap, at a known frame, is where it would be one frame later."""
+    if episode.state is None:
+        return False
+    alive = evidence.ranges > 0
+    steps = (np.abs(np.diff(episode.state[:, alive], axis=0)) / evidence.ranges[alive]).max(axis=1, initial=0.0)
+    around = np.delete(steps[max(frame - NEIGHBOURS, 0) : frame + NEIGHBOURS + 1], min(frame, NEIGHBOURS))
+    return bool(steps[frame] < float(np.median(around)) * periods / 4)
 
 
 def _is_of_other_rate(steps: Array, fps: float) -> bool:

@@ -11,7 +11,7 @@ from collections.abc import Iterator, Mapping
 import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, check
-from demorec.extensions.doctor.evidence import DROP, Evidence
+from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.view_fit import MAX_UNRELATED_RATIO, MIN_EPISODES, MIN_FRAMES, ViewFit, view_fits
 
@@ -46,6 +46,9 @@ def image_lag(evidence: Evidence) -> Iterator[Fault]:
     for camera, fits in _judged(evidence, MIN_EPISODES):
         lags = {number: fit.lag for number, fit in fits.items()}
         usual_lag, spread = usual(list(lags.values()), floor=0.2)
+        images = evidence.cameras[camera].episodes
+        changed = {number: float(np.mean(images[number].change != 0)) for number in fits}
+        usual_changed = float(np.median(list(changed.values())))
         if abs(usual_lag) > max(MAX_SET_LAG_S * evidence.fps, 2.0):
             yield Fault(
                 severity="look",
@@ -55,6 +58,8 @@ def image_lag(evidence: Evidence) -> Iterator[Fault]:
             )
         for number, fit in fits.items():
             shift = lags[number] - usual_lag
+            if changed[number] < usual_changed / 2:
+                continue  # another check reports images that stand still
             if abs(shift) > max(MIN_SHIFT, 6 * spread) and _gain(fit, usual_lag) > MIN_GAIN:
                 yield Fault(
                     severity="broken",
@@ -75,7 +80,7 @@ def _gain(fit: ViewFit, usual_lag: float) -> float:
     measures="images of another recording",
     unit="% explained",
     why="The policy learns actions that do not belong to the images.",
-    do="look at it: demorec view {path} --episodes {episode}; then drop it: " + DROP,
+    do=LOOK_OR_DROP,
 )
 def image_take(evidence: Evidence) -> Iterator[Fault]:
     """Find episodes with images that the state of another episode explains far better than their own, at any lag.
