@@ -99,6 +99,9 @@ class ExportReport:
     url: str = ""
 
 
+_OPEN_END = 2**62
+
+
 def parse_episodes(text: str) -> Callable[[int], bool]:
     """Parse "0:100", "::2", "7" and lists of them into a test of episode numbers; "" accepts all.
 
@@ -117,22 +120,22 @@ def select_episodes[E](episodes: Sequence[E], text: str, option: str = "episodes
     """
     chosen: list[E] = []
     for word, part in _ranges(text, option):
-        numbers = range(part.start, min(part.stop, len(episodes)), part.step)
-        if not numbers:
+        numbers = range(part.start, len(episodes) if part.stop == _OPEN_END else part.stop, part.step)
+        if not numbers or numbers[-1] >= len(episodes):
             raise ConfigError(f"--{option} {word} is out of range: choose from 0 to {len(episodes) - 1}.")
         chosen += [episodes[number] for number in numbers]
     return chosen if text.strip() else list(episodes)
 
 
 def _ranges(text: str, option: str) -> list[tuple[str, range]]:
-    """Split a list at commas and spaces into its words and their numbers; an open end is 2**62."""
+    """Split a list at commas and spaces into its words and their numbers; an open end is `_OPEN_END`."""
     found = []
     for word in text.replace(",", " ").split():
         match = re.fullmatch(r"(\d*)(?:(:)(\d*)(?::(\d*))?)?", word)
         if match is None or (not match[2] and not match[1]) or match[4] == "0":
             raise OptionError(option, f"is {text!r}, expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")
         first = int(match[1] or 0)
-        last = int(match[3] or 2**62) if match[2] else first + 1
+        last = int(match[3] or _OPEN_END) if match[2] else first + 1
         part = range(first, last, int(match[4] or 1))
         if not part:
             raise OptionError(option, f"is {text!r}, but {word} ends before it begins.")

@@ -324,7 +324,8 @@ def test_chosen_episodes_are_imported(
 
 @pytest.mark.parametrize(
     ("words", "told"),
-    [("9", "--episodes 9 is out of range: choose from 0 to 3."), ("2:1", "2:1 ends before it begins"),
+    [("9", "--episodes 9 is out of range: choose from 0 to 3."), ("2:9", "2:9 is out of range"),
+     ("2:1", "2:1 ends before it begins"),
      ("first", "expected numbers and ranges such as 0:100, ::2 or 3,5,8:10.")],
 )  # fmt: skip
 def test_missing_episodes_are_one_sentence(
