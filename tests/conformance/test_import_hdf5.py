@@ -457,7 +457,7 @@ def test_the_state_of_isaac_lab_is_the_absolute_one(robot: str, tmp_path: Path) 
             assert names["observation.ee_pose"][3:] == ("qw", "qx", "qy", "qz")
 
 
-@pytest.mark.parametrize("layout", ["isaac", "aloha", "unknown"])
+@pytest.mark.parametrize("layout", ["isaac", "root", "aloha", "unknown"])
 def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "demo.hdf5"
     if layout == "unknown":
@@ -465,10 +465,10 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
             file["log/values"] = np.zeros((3, 2))
     else:
         writers: dict[str, Callable[[Path], Path]]
-        writers = {"isaac": write_isaac, "aloha": write_aloha}
+        writers = {"isaac": write_isaac, "root": write_groups_at_root, "aloha": write_aloha}
         writers[layout](path)
     with h5py.File(path) as file:
-        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "aloha": ("/", 1, 8),
+        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "root": ("demo_0", 3, 15), "aloha": ("/", 1, 8),
                               "unknown": ("/", None, 0)}[layout]  # fmt: skip
         expected: dict[str, list[int]] = {}
         file[first].visititems(
@@ -484,19 +484,23 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
     )
 
 
-def test_episodes_that_are_groups_at_the_root(tmp_path: Path) -> None:
-    demos = ("ep-3", "0", "Trial 4")
-    file = write_groups_at_root(tmp_path / "demo.hdf5", demos)
-    mapping = tmp_path / "robot.toml"
-    mapping.write_text(
-        '[robot]\nname = "arm"\n[task]\ntext = "push"\n[clock]\nfps = 20\n[episodes]\ngroup = "/"\n'
-        '[[features."observation.state"]]\ndataset = "observation"\n[[features.action]]\ndataset = "action"\n'
-        '[[features."observation.tip"]]\ndataset = "tip/pose"\n'
-    )
-    assert import_hdf5([file], mapping, tmp_path / "run").num_episodes == len(demos)
+@pytest.mark.parametrize(
+    ("action", "state", "demos"),
+    [
+        ("action", "observation", ("demo_0", "demo_2", "demo_10")),
+        ("actions", "obs", ("Trial 4", "ep-3", "x")),
+        ("action", "state", ("0", "7")),
+        ("actions", "qpos", ("x",)),
+    ],
+)
+def test_episodes_that_are_groups_at_the_root(action: str, state: str, demos: tuple[str, ...], tmp_path: Path) -> None:
+    others = ("contact 2", "force", "tip/pose")
+    file = write_groups_at_root(tmp_path / "demo.hdf5", action=action, state=state, others=others, demos=demos)
+    result, run = imported(file, changes={"# fps = 20 ": "fps = 20 "})
+    assert result.num_episodes == len(demos)
     with h5py.File(file) as source:
-        for demo, path in zip(("Trial 4", "ep-3", "0"), recordings(tmp_path / "run"), strict=True):
+        for demo, path in zip(demos, recordings(run), strict=True):
             with Recording(path) as recording:
                 held = {values.tobytes() for values in recording.table().features.values()}
-            for name in ("action", "observation", "tip/pose"):
+            for name in (action, state, *others):
                 assert source[f"{demo}/{name}"][:].tobytes() in held, name

@@ -126,11 +126,20 @@ def write_isaac(
     return path
 
 
-def write_groups_at_root(path: Path, demos: tuple[str, ...]) -> Path:
+def write_groups_at_root(
+    path: Path,
+    *,
+    action: str = "action",
+    state: str = "observation",
+    others: tuple[str, ...] = (),
+    count: int = 5,
+    demos: tuple[str, ...] = ("demo_0", "demo_2", "demo_10"),
+) -> Path:
     """Write a file whose groups at the root are the episodes."""
     rng = np.random.default_rng(3)
     with h5py.File(path, "w") as file:
         for name in demos:
-            for key, width in (("action", 2), ("observation", 4), ("tip/pose", 7)):
-                file[f"{name}/{key}"] = rng.normal(size=(5, width)).astype(np.float32)
+            file[f"{name}/{action}"] = rng.normal(size=(count, 2)).astype(np.float32)
+            for key in (state, *others):
+                file[f"{name}/{key}"] = rng.normal(size=(count, 4)).astype(np.float32)
     return path

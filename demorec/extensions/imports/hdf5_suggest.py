@@ -1,7 +1,7 @@
 """A mapping suggested from the contents of an HDF5 file: every dataset listed, every number placed.
 
-Supports the layouts of robomimic, Isaac Lab (robomimic's, with the simulator's state) and ALOHA. Settings that neither
-the file nor the layout specifies are commented out.
+Supports the layouts of robomimic, Isaac Lab (robomimic's, with the simulator's state), ALOHA, and groups at the root
+that are episodes. Settings that neither the file nor the layout specifies are commented out.
 """
 
 from __future__ import annotations
@@ -45,18 +45,26 @@ class _Layout:
     Attributes:
         group: Value of `episodes.group`.
         actions: Names of datasets that belong to the action.
-        folder: Prefix of observations.
+        folder: Prefix of observations; "" if every other dataset is one.
+        states: Names of datasets that are the state, if their feature does not follow from the name's end.
         is_aloha: Whether the file is one episode of ALOHA's recorder.
     """
 
     group: str
     actions: tuple[str, ...]
     folder: str
+    states: tuple[str, ...] = ()
     is_aloha: bool = False
 
 
 _ALOHA = _Layout(group="", actions=("action", "base_action"), folder="observations/", is_aloha=True)
 _LAYOUT_OF_ROBOMIMIC = _Layout(group=_ROBOMIMIC, actions=("actions",), folder="obs/")
+_GROUPS_AT_ROOT = _Layout(
+    group="/",
+    actions=("action", "actions"),
+    folder="",
+    states=("state", "states", "observation", "observations", "obs", "qpos"),
+)
 
 
 def _layout_of(file: ForeignFile) -> _Layout | None:
@@ -65,7 +73,9 @@ def _layout_of(file: ForeignFile) -> _Layout | None:
         return _ALOHA
     if file.is_group(_ROBOMIMIC):
         return _LAYOUT_OF_ROBOMIMIC
-    return None
+    groups = [name for name, kind in file.children("").items() if kind == "group"]
+    has_actions = [any(file.has(f"{group}/{name}") for name in _GROUPS_AT_ROOT.actions) for group in groups]
+    return _GROUPS_AT_ROOT if groups and all(has_actions) else None
 
 
 class _Contents:
@@ -149,8 +159,9 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
         if layout is None:
             held = ", ".join(list(file.children(""))[:SHOWN]) or "nothing"
             raise Hdf5Error(
-                "The layout is not robomimic's or Isaac Lab's (data/demo_0/actions) nor ALOHA's (action, "
-                f"observations/qpos); the file holds {held}: write the mapping by hand (docs/import.md): {path}"
+                "The layout is not robomimic's or Isaac Lab's (data/demo_0/actions), ALOHA's (action, "
+                "observations/qpos), nor one with a group with actions for each episode; the file holds "
+                f"{held}: write the mapping by hand (docs/import.md): {path}"
             )
         places = episode_places(file, Episodes(group=layout.group))
         contents = _Contents(file, places[0])
@@ -241,7 +252,7 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
     for name in (name for name in vectors if _is_observed(name, layout)):
         last = name.removeprefix(layout.folder)
         known = (feature for end, feature in HDF5_PARTS.items() if last == end or last.endswith(f"_{end}"))
-        feature = next(known, f"observation.{_word(last)}")
+        feature = STATE if last in layout.states else next(known, f"observation.{_word(last)}")
         if absolute and feature == STATE:
             feature = f"observation.{_word(last)}"
         observed.setdefault(feature, []).append(name)
