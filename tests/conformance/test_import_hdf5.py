@@ -179,6 +179,22 @@ def test_jpeg_of_variable_length_stays_as_it_is(tmp_path: Path) -> None:
         import_hdf5([file], mapping, tmp_path / "other")
 
 
+def test_pixels_with_colours_before_the_height_give_the_same_recording(tmp_path: Path) -> None:
+    found = []
+    for folder in ("usual", "other"):
+        file = write_aloha(tmp_path / folder / "episode_0.hdf5")
+        with h5py.File(file, "r+") as opened:
+            for camera in ALOHA_CAMERAS if folder == "other" else ():
+                images = opened[f"observations/images/{camera}"][:]
+                del opened[f"observations/images/{camera}"]
+                opened[f"observations/images/{camera}"] = images.transpose(0, 3, 1, 2)
+        result, run = imported(file)
+        assert all(words.startswith("64x48, pixels") for words in result.cameras.values())
+        with Recording(recordings(run)[0]) as recording:
+            found.append([[packet.data for packet in recording.packets(camera)] for camera in ALOHA_CAMERAS])
+    assert found[0] == found[1]
+
+
 def _one_observation_more(file: Path) -> None:
     """Add a row to every observation, like recorders that observe both before and after each action."""
     with h5py.File(file, "r+") as opened:

@@ -139,12 +139,13 @@ class StoredCamera:
             self.kept = "16UC1" if array.dtype.itemsize == 2 else "32FC1"
             self.description = f"distances ({self.kept}) passed through as they are"
         elif self._form == "pixels":
-            self.height, self.width = array.shape[1:3]
+            self.height, self.width = array.shape[1:3] if array.shape[3] == 3 else array.shape[2:]
             self.description = "pixels"
         else:
             raise FieldError(
                 f"{array.place} is {array.dtype.name} of {'x'.join(map(str, array.shape))}, images are uint8 of rows, "
-                "height, width and 3 colours, or rows of JPEG, distances uint16 or float32 of rows, height, width"
+                "height, width and 3 colours, or of rows, 3 colours, height and width, or rows of JPEG, distances "
+                "uint16 or float32 of rows, height, width"
             )
         if not self.kept:
             self.description += f"{'' if camera.colors == 'rgb' else ' with red and blue exchanged'}, encoded once"
@@ -168,6 +169,8 @@ class StoredCamera:
                 yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
                 continue
             image: Image = row
+            if self._form == "pixels" and row.shape[2] != 3:
+                image = np.ascontiguousarray(row.transpose(1, 2, 0))
             if self._form == "jpeg":
                 image, width, height = self._file(row, number)
                 if (width, height) != (self.width, self.height):
@@ -213,7 +216,7 @@ def image_form(array: StoredArray) -> Literal["pixels", "jpeg", "depth"] | None:
     shape, kind = array.shape, array.dtype
     if array.is_ragged or (kind == np.uint8 and len(shape) == 2):
         return "jpeg"
-    if len(shape) == 4 and kind == np.uint8 and shape[3] == 3:
+    if len(shape) == 4 and kind == np.uint8 and 3 in (shape[1], shape[3]):
         return "pixels"
     is_flat = len(shape) == 3 or (len(shape) == 4 and shape[3] == 1)
     return "depth" if is_flat and (kind.kind, kind.itemsize) in (("u", 2), ("f", 4)) else None

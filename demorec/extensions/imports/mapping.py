@@ -98,9 +98,9 @@ class CameraSource:
         stamp: As `Clock.stamp`, for this camera.
         sample: As `Clock.sample`, for this camera.
         max_age_s: As `Clock.max_age_s`, for this camera.
-        dataset: Dataset of an HDF5 file below the episode's group: (T, H, W, 3) or (T, 3, H, W), uint8 or floats from 0
-        to 1 or to 255; or a JPEG file in each row, (T, N) uint8 padded with zeros or (T,) of variable length; for a
-        depth camera (T, H, W) or (T, H, W, 1), uint16 mm or float32 m.
+        dataset: Dataset of an HDF5 file below the episode's group: (T, H, W, 3) or (T, 3, H, W) uint8; or a JPEG file
+        in each row, (T, N) uint8 padded with zeros or (T,) of variable length; for a depth camera (T, H, W) or
+        (T, H, W, 1), uint16 mm or float32 m.
         colors: Order of the colours; JPEG files are RGB by their format, but recorders may pass RGB pixels to OpenCV,
         which expects BGR.
     """
