@@ -1,4 +1,4 @@
-"""Imports of many bags: an unreadable bag does not stop the others, and an interrupt does not change the result."""
+"""Imports of many bags: an unreadable bag does not stop the others; workers and interrupts do not change the result."""
 
 from __future__ import annotations
 
@@ -157,14 +157,15 @@ def test_bad_bags_are_skipped_and_listed(
     assert "run_1.mcap: The bag is empty" in judged.message
 
 
-def test_progress_and_reports_are_in_order(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
+def test_the_run_is_the_same_for_any_number_of_workers(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     done: list[tuple[int, int]] = []
     told: list[BagReport] = []
     result = import_bags(
-        [batch[0]], batch[1], tmp_path / "run", skip_bad=True, tell=told.append,
+        [batch[0]], batch[1], tmp_path / "run", workers=3, skip_bad=True, tell=told.append,
         progress=lambda *counts: done.append(counts),
     )  # fmt: skip
     assert _content(tmp_path / "run") == _content(alone)
+    assert load_any_run_file(tmp_path / "run").digest == load_any_run_file(alone).digest
     assert tuple(told) == result.reports
     assert done == [(count, 2 * len(BAD)) for count in range(2 * len(BAD) + 1)]
 
@@ -178,7 +179,7 @@ def test_a_bag_that_was_repaired_is_imported_and_one_that_was_not_is_listed_agai
     assert (again.num_new, len(again.skipped)) == (0, len(BAD))
     assert _content(run) == before
     _bag(folder / "run_1.mcap", 1.3)
-    result = import_bags([folder], mapping, run, skip_bad=True)
+    result = import_bags([folder], mapping, run, skip_bad=True, workers=2)
     assert (result.num_new, len(result.skipped)) == (1, len(BAD) - 1)
     assert folder / "run_1.mcap" not in result.skipped
     after = _content(run)
@@ -249,9 +250,26 @@ def test_only_bags_and_episodes_of_datasets_are_skipped(tmp_path: Path, capsys: 
     assert "--skip-bad: only for datasets" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("word", ["hdf5", "lerobot"])
+def test_only_bags_have_workers(word: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code("import", word, "x", "--workers", "2", "--out", tmp_path / "run") == 2
+    assert "--workers: only for bags" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("workers", [1, 2])
+def test_bags_before_a_bad_one_are_imported(workers: int, tmp_path: Path) -> None:
+    good = [_bag(tmp_path / f"{number}.mcap", 0.5 + 0.1 * number) for number in range(3)]
+    good[1].write_bytes(b"")
+    mapping, run = bag_mappings.write_mapping(DROPPING, tmp_path / "robot.toml"), tmp_path / "run"
+    with pytest.raises(BagError, match="The bag is empty"):
+        import_bags(good, mapping, run, workers=workers)
+    assert [path.name for path in run.glob("episodes/*")] == ["episode_000000.mcap"]
+    assert len(load_any_run_file(run).attempts) == 1
+
+
 def test_a_killed_import_continues_to_the_same_run(batch: tuple[Path, Path], alone: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
-    words = ["import", *map(str, (batch[0], "--mapping", batch[1], "--out", run)), "--skip-bad"]
+    words = ["import", *map(str, (batch[0], "--mapping", batch[1], "--out", run)), "--skip-bad", "--workers", "2"]
     with subprocess.Popen([sys.executable, "-m", "demorec", *words], stdout=subprocess.DEVNULL) as program:
         while not list(run.glob("episodes/*.mcap")) and program.poll() is None:
             time.sleep(0.001)

@@ -10,23 +10,31 @@ from pathlib import Path
 
 import psutil
 import pytest
+from support import bag_mappings, bags
 from support.commands import workers_of
 from support.export import make_run
 
 pytestmark = pytest.mark.slow
 
-COMMANDS = ["export", *(pytest.param(name, marks=pytest.mark.long) for name in ("check", "render"))]
+COMMANDS = ["export", "import", *(pytest.param(name, marks=pytest.mark.long) for name in ("check", "render"))]
 
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return make_run(tmp_path_factory.mktemp("orphans") / "run", [30] * 12)
+    """A run and, next to it, bags to be imported."""
+    run = make_run(tmp_path_factory.mktemp("orphans") / "run", [30] * 12)
+    bag_mappings.write_mapping(bag_mappings.SO101, run.with_name("robot.toml"))
+    run.with_name("bags").mkdir()
+    for number in range(8):
+        bags.write_mcap(bags.in_order(bags.so101(1.6)), run.with_name("bags") / f"{number}.mcap")
+    return run
 
 
 def command(run: Path, out: Path, name: str) -> list[str]:
     arguments = {
         "export": ["export", "lerobot", run, "--out", out / "d"],
         "check": ["check", run],
+        "import": ["import", run.with_name("bags"), "--mapping", run.with_name("robot.toml"), "--out", out / "i"],
         "render": ["render", run, "--out", out / "r"],
     }[name]
     return [sys.executable, "-c", "from demorec.cli import main; main()", *map(str, arguments), "--workers", "2"]

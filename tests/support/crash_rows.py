@@ -151,6 +151,7 @@ ROWS = {
     "import lerobot": _run("lerobot SOURCES/dataset"),
     "import hdf5": _run("hdf5 SOURCES/demo.hdf5 --mapping SOURCES/hdf5.toml", needs=(HDF5,)),
     "import bags": _run("SOURCES/bags --mapping SOURCES/bags.toml", needs=(BAGS,)),
+    "import bags with processes": _run("SOURCES/bags --mapping SOURCES/bags.toml --workers 2", needs=(BAGS,)),
     "select": _edit("select SOURCES/dataset --episodes 0:2"),
     "drop": _edit("drop SOURCES/dataset --episodes 0"),
     "trim": _edit("trim SOURCES/dataset --head 1"),

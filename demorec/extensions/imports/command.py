@@ -14,7 +14,7 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.cli.shared.progress import ProgressBar
 from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
 from demorec.core.config import VideoConfig
-from demorec.core.errors import ConfigError
+from demorec.core.errors import ConfigError, check_option
 from demorec.core.extension import ReaderRow
 from demorec.core.extensions import reader_rows
 from demorec.core.registry import nearest_match
@@ -68,6 +68,8 @@ class Import:
     """Leave out bags that cannot be read, or do not fit the mapping or the other bags, and unreadable episodes of a
     dataset; list them at the end and exit with 1. Otherwise the first of them ends the import.
     """
+    workers: int = 1
+    """Processes that read and write bags; the recordings are the same for any number."""
     suggest: bool = False
     """Write a mapping for the first bag or file to standard output instead of importing."""
     motors: MotorsByFlags = field(default_factory=MotorFlags)
@@ -81,6 +83,7 @@ class Import:
             raise ConfigError("No bag is given: name one, e.g. demorec import --suggest monday.mcap.")
         if self.out is not None:
             refuse_inside([self.out])
+        check_option("workers", self.workers, 1, 1024)
         word = str(self.bags[0])
         form = _FORMATS.get(word, BAGS)
         self._check_flags(form)
@@ -123,6 +126,8 @@ class Import:
             "--episodes": self.episodes,
             "--skip-bad": form is not BAGS and self.skip_bad,
         }
+        if form is not BAGS and self.workers > 1:
+            raise ConfigError("--workers: only for bags, leave it out.")
         for flag, value in of_datasets.items():
             if form.suggester and value:
                 raise ConfigError(
@@ -152,6 +157,7 @@ class Import:
                 mapping,
                 out,
                 video=self.video,
+                workers=self.workers,
                 skip_bad=self.skip_bad,
                 tell=lambda report: say(*_report_lines(report), ""),
                 progress=bar.set,

@@ -1,18 +1,24 @@
 """Import of bags to a run: every bag is read and judged as a whole, and only then written, episode by episode.
 
-The same command continues: bags in import.json are not imported again, existing episodes are not written again.
+The same command continues: bags in import.json are not imported again, existing episodes are not written again. Several
+processes may read and write; bags are numbered and added to the run in order.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections import deque
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, DemorecError, resource_error, without_path
 from demorec.core.plain import to_plain
+from demorec.core.processes import process_pool
 from demorec.extensions.imports.bag import Files, bags_in, open_bag
 from demorec.extensions.imports.bag_images import write_bag
 from demorec.extensions.imports.description import urdf_text
@@ -20,7 +26,9 @@ from demorec.extensions.imports.import_file import BagReport, ImportFile, Skippe
 from demorec.extensions.imports.mapping_file import read_mapping
 from demorec.extensions.imports.planning import ImportSettings, PlannedBag, plan_bag
 from demorec.runs.external import ExternalFolder, differences, open_external_run
+from demorec.runs.run_file import Attempt
 
+_Read = Callable[[], tuple[Files, PlannedBag | None]]
 _MAX_REASON = 1000
 """Maximum characters: an error may quote a bag's content."""
 
@@ -56,36 +64,41 @@ class BagsImport:
         """Describe dropped parts and findings."""
         yield from (f"{report.name}: {line}" for report in self.reports for line in report.dropped_lines())
 
-    def plan(self, path: Path, folder: ExternalFolder, settings: ImportSettings) -> PlannedBag | None:
-        """Read and judge a bag; None if one with the same bytes is in the run.
+    def accepted(
+        self, bags: Iterable[tuple[Path, _Read]], folder: ExternalFolder, *, skip_bad: bool
+    ) -> Iterator[PlannedBag | None]:
+        """Yield each bag with the numbers of its episodes; None for one that is in the run or is skipped.
 
         Raises:
             BagError, ConfigError: It cannot be read, or does not fit the mapping or the run.
         """
-        bag = open_bag(path)
-        files = bag.sha256s()
-        if any(report.files == files for report in self.known.bags):
-            self.files[path] = files
-            return None
-        planned = plan_bag(bag, files, settings, self.known.num_episodes)
-        kind = folder.kind()
-        if planned.episodes and kind and (different := differences(kind, planned.episodes[0].info)):
-            raise ConfigError(
-                f"The run's episodes differ from the bag's ({'; '.join(different)}): import it into another folder: "
-                f"{path}"
-            )
-        return planned
+        kind, next_index = folder.kind(), self.known.num_episodes
+        for path, read in bags:
+            new = None
+            try:
+                files, planned = read()
+                new = planned.numbered(next_index) if planned and files not in self.files.values() else None
+                if new and new.episodes:
+                    kind = kind or new.episodes[0].info
+                    if different := differences(kind, new.episodes[0].info):
+                        raise ConfigError(
+                            f"The run's episodes differ from the bag's ({'; '.join(different)}): import it into "
+                            f"another folder: {path}"
+                        )
+                self.files[path] = files
+            except Exception as error:
+                new = None
+                self.skipped[path] = _why_skipped(path, error, is_allowed=skip_bad)
+            if new and new.episodes:
+                folder.begin(new.episodes[0].info)
+                next_index += len(new.episodes)
+            yield new
 
-    def write(self, planned: PlannedBag, folder: ExternalFolder, settings: ImportSettings) -> None:
-        """Add a bag to the run; run.json, which marks it as done, is written last."""
-        for episode in planned.episodes[:1]:
-            folder.begin(episode.info)
-        lines = write_bag(planned, [one for one in planned.episodes if not folder.has(one.info)], folder.path, settings)
-        self.known = replace(self.known, bags=(*self.known.bags, planned.report))
+    def add(self, report: BagReport, lines: Sequence[Attempt], folder: ExternalFolder) -> None:
+        """Add a written bag to the run; run.json, which marks it as done, is written last."""
+        self.known = replace(self.known, bags=(*self.known.bags, report))
         save_import_file(self.known, folder.path)
-        folder.planned = folder.planned[1:]
         folder.extend(lines)
-        self.files[planned.bag.path] = planned.report.files
         self.num_new += 1
 
     def save(self, folder: ExternalFolder, given: Sequence[Path]) -> None:
@@ -103,6 +116,7 @@ def import_bags(
     out: Path,
     *,
     video: VideoConfig | None = None,
+    workers: int = 1,
     skip_bad: bool = False,
     tell: Callable[[BagReport], None] = lambda report: None,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -114,6 +128,7 @@ def import_bags(
         mapping_path: Path of the mapping.
         out: The run's folder; a run started with the same mapping is continued.
         video: Encoding of images that arrive as pixels.
+        workers: Number of processes that read and write; the recordings do not depend on it.
         skip_bad: Whether to leave out bags that cannot be read, or do not fit the mapping or the other bags. Otherwise
         the first of them ends the import before any of it is written.
         tell: Called with the report of each newly read bag, in order.
@@ -123,6 +138,7 @@ def import_bags(
         ConfigError: The mapping is impossible, or the folder holds other files.
         BagError: A bag cannot be read, does not fit the mapping, or would yield an incomplete episode.
         RecordingError: The disk is full or gone.
+        ResourceError: A process of the import was killed.
     """
     mapping = read_mapping(mapping_path)
     urdf = urdf_text(mapping, mapping_path)
@@ -136,22 +152,59 @@ def import_bags(
         if not os.path.lexists(path):  # a mistyped name is not a bad bag
             open_bag(path)
     batch, settings = BagsImport(known=known), ImportSettings(mapping=mapping, urdf=urdf, video=video or VideoConfig())
+    done = {report.files for report in known.bags}
     progress(0, len(given))
-    with open_external_run(out, recovers=False) as folder:
-        for number, path in enumerate(given):
-            folder.planned = [other.name for other in given[number:]]
-            planned = None
-            try:
-                planned = batch.plan(path, folder, settings)
-            except Exception as error:
-                batch.skipped[path] = _why_skipped(path, error, is_allowed=skip_bad)
+    with open_external_run(out, recovers=False) as folder, _processes(workers) as start:
+        folder.planned = [path.name for path in given]
+
+        def write(planned: PlannedBag | None) -> Callable[[], list[Attempt]]:
+            missing = [one for one in planned.episodes if not folder.has(one.info)] if planned else []
+            return start(write_bag, planned, missing, folder.path, settings) if planned else list
+
+        read = _in_order(lambda path: start(_read, path, done, settings), given, workers)
+        accepted = batch.accepted(read, folder, skip_bad=skip_bad)
+        for number, (planned, written) in enumerate(_in_order(write, accepted, workers), 1):
+            lines = written()
+            folder.planned = folder.planned[1:]
             if planned is not None:
-                batch.write(planned, folder, settings)
+                batch.add(planned.report, lines, folder)
                 tell(planned.report)
-            progress(number + 1, len(given))
-        folder.planned = []
+            progress(number, len(given))
         batch.save(folder, given)
     return batch
+
+
+def _read(path: Path, done: Collection[Files], settings: ImportSettings) -> tuple[Files, PlannedBag | None]:
+    """Read and judge a bag, unless one with the same bytes is in the run."""
+    bag = open_bag(path)
+    files = bag.sha256s()
+    return files, None if files in done else plan_bag(bag, files, settings)
+
+
+@contextmanager
+def _processes(workers: int) -> Iterator[Callable[..., Callable[[], Any]]]:
+    """Yield a function that starts a call and returns a getter of its result; a single worker is this process."""
+    if workers == 1:
+        yield partial
+        return
+    with process_pool(workers) as pool:
+        yield lambda *call: pool.submit(*call).result
+
+
+def _in_order[Item, Result](
+    start: Callable[[Item], Result], items: Iterable[Item], ahead: int
+) -> Iterator[tuple[Item, Result]]:
+    """Yield each item with its started call, up to `ahead` at a time; items before an error come before it."""
+    waiting: deque[tuple[Item, Result]] = deque()
+    try:
+        for item in items:
+            waiting.append((item, start(item)))
+            if len(waiting) >= ahead:
+                yield waiting.popleft()
+    except Exception:
+        yield from waiting
+        raise
+    yield from waiting
 
 
 def _why_skipped(path: Path, error: Exception, *, is_allowed: bool) -> str:

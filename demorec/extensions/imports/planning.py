@@ -55,6 +55,18 @@ class PlannedBag:
     report: BagReport
     episodes: tuple[PlannedEpisode, ...]
 
+    def numbered(self, first: int) -> PlannedBag:
+        """Renumber the episodes for a run."""
+        reports = (
+            replace(row, episode_index=None if row.episode_index is None else row.episode_index + first)
+            for row in self.report.episodes
+        )
+        episodes = (
+            replace(episode, info=replace(episode.info, episode_index=episode.info.episode_index + first))
+            for episode in self.episodes
+        )
+        return replace(self, report=replace(self.report, episodes=tuple(reports)), episodes=tuple(episodes))
+
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
@@ -71,14 +83,13 @@ class ImportSettings:
     video: VideoConfig
 
 
-def plan_bag(bag: Bag, files: Files, settings: ImportSettings, first_index: int) -> PlannedBag:
-    """Read and judge a bag.
+def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
+    """Read and judge a bag; its episodes are numbered from 0.
 
     Args:
         bag: Bag to read.
         files: Digests of its files.
         settings: Settings of the import.
-        first_index: Number of its first episode in the run.
 
     Raises:
         BagError: It cannot be read, does not fit the mapping, or would yield an incomplete episode.
@@ -97,7 +108,7 @@ def plan_bag(bag: Bag, files: Files, settings: ImportSettings, first_index: int)
             try:
                 if not window.discarded:
                     rows = lines.rows(window)
-                    episode = _episode(bag, files, lines, rows, settings, first_index + len(episodes))
+                    episode = _episode(bag, files, lines, rows, settings, len(episodes))
                     episodes.append(episode)
             except NoRowsError as error:
                 if mapping.clock.when_old == "error":
