@@ -88,7 +88,7 @@ def test_an_unrecognised_arm_is_reported(tmp_path: Path, capsys: pytest.CaptureF
 
 
 def test_joints_that_stop_sending_are_a_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    late, lost = bags.EPOCH_NS + 9 * bags.NS // 10, "robotiq_85_left_knuckle_joint"
+    late, lost = bags.EPOCH_NS + bags.NS, "robotiq_85_left_knuckle_joint"
     notes = [
         note
         for note in LAYOUTS["two publishers"].notes()
@@ -100,5 +100,5 @@ def test_joints_that_stop_sending_are_a_finding(tmp_path: Path, capsys: pytest.C
     mapping.write_text(capsys.readouterr().out)
     assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
     told = capsys.readouterr().out
-    assert f"early_end: observation.state ({lost}): /joint_states: ends 0." in told
+    assert f"early_end: observation.state ({lost}): /joint_states: '{lost}' stop" in told
     assert "No findings." not in told

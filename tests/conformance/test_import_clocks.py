@@ -275,6 +275,15 @@ def test_a_bag_in_which_nothing_moves(size: float, imports: Imports) -> None:
     assert "nothing moves" in line
 
 
+def test_numbers_slower_than_rows_are_a_note(imports: Imports) -> None:
+    """A gripper at 10 Hz next to joints at 100 Hz: each row repeats the latest opening."""
+    slow = [note for k, note in enumerate(note for note in real(3.0) if note.topic == GRIPPER) if k % 10 == 0]
+    notes = bags.in_order([note for note in real(3.0) if note.topic != GRIPPER] + slow)
+    _, told, _ = imports(notes, _with_gripper(stamp="log", max_age_s="XX").replace('"XX"', "0.3"))
+    (line,) = [line for line in told.splitlines() if "comes 10.0 times a second and rows 30 times" in line]
+    assert line.startswith("  note: ")
+
+
 def test_an_action_of_the_next_state_and_a_gripper_command(imports: Imports, tmp_path: Path) -> None:
     """Joint actions are the next state; gripper actions are the latest command of a separate topic, row by row."""
     notes = real(3.0)

@@ -25,6 +25,8 @@ _MOVED_S = 0.05
 """Minimum change of a clock in a bag that is reported."""
 _SHORTER_S = 0.5
 """Minimum time by which a stream must begin later or end earlier than others."""
+_SLOW = 1.15
+"""Minimum ratio of a stream's period to the rows' period for a slow stream."""
 _EARLY_S = 0.05
 """Maximum time by which a header may be later than its log time: clocks set by NTP differ by less."""
 _MAX_ENCODER_NOISE = 1e-3
@@ -180,7 +182,7 @@ def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Impor
 
 
 def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
-    """Streams that begin later or end earlier than most."""
+    """Streams that begin later or end earlier than most, and joints that end before others of their topic."""
     regular = [line for line in lines if line.is_regular]
     begin = float(np.median([line.times_ns[0] for line in regular] or [0]))
     end = float(np.median([line.times_ns[-1] for line in regular] or [0]))
@@ -188,7 +190,14 @@ def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
         late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
         if late > _SHORTER_S:
             yield _of(line, "late_start", f"begins {late:.2f} s late")
-        if early > _SHORTER_S:
+        joints = line.stream.reader.joints if line.stream.reader else ()
+        topic = (line.stream.topic, line.is_header)
+        last = max(int(one.times_ns[-1]) for one in regular if (one.stream.topic, one.is_header) == topic)
+        before_ns = last - int(line.times_ns[-1])
+        if joints and before_ns > _GAP * line.period_ns:
+            names = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
+            yield _of(line, "early_end", f"{names} stop {before_ns / NS:.2f} s before other joints of the topic")
+        elif early > _SHORTER_S:
             yield _of(line, "early_end", f"ends {early:.2f} s early")
 
 
@@ -221,8 +230,9 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
             text = f"rows follow its messages, {rate:.1f} a second, but fps is {fps}"
             yield ImportFinding(kind="fps", stream=follows, text=text)
     for line in lines.lines.values():
-        # Cameras, if any, decide the rows.
-        if line.stream.heads or (line.is_regular and not lines.mapping.cameras):
+        # Cameras, if any, decide the rows, which use few of the messages of a faster stream.
+        is_slow = line.period_ns * fps > _SLOW * NS
+        if line.stream.heads or (line.is_regular and (is_slow or not lines.mapping.cameras)):
             yield from _use_findings(line, episodes, fps, follows)
 
 
