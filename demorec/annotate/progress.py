@@ -48,13 +48,12 @@ class StageRun:
 
 
 def dense_stages(num_goals: int, runs: Sequence[StageRun]) -> tuple[str, ...]:
-    """Return all stages of an episode with this number of goals, in order; a script that drops objects has fewer."""
+    """Return all stages of an episode with this number of goals, in order, without those that a script leaves out."""
     if runs[0].stage == WHOLE_TASK:
         return (WHOLE_TASK,)
     done = {run.stage.partition(": ")[2] for run in runs}
-    is_dropped = "release" in done and "lower" not in done
-    left_out = ("lower", "retreat") if is_dropped else ()
-    stages = [stage for stage in _STAGES if stage not in left_out]
+    is_whole = "release" in done  # otherwise the episode failed before the last stages
+    stages = [stage for stage in _STAGES if stage in done or not is_whole]
     return tuple(f"goal {goal}: {stage}" for goal in range(1, num_goals + 1) for stage in stages)
 
 

@@ -48,9 +48,10 @@ class ReaderRow:
         plural: Plural noun: "HDF5 files".
         advice: Action for the user if a recording was expected: "convert it to a run (demorec import)".
         word: Word after `demorec import` for this kind; "" if none is needed.
-        suffixes: File suffixes, for a kind that the core does not know.
+        suffixes: File suffixes, for a kind that the core does not know. Folders are not recognised by it.
         example: Example of the arguments after `demorec import` and the word.
-        importer: "module:function" of (paths, mapping, out), which creates or continues the run `out`.
+        importer: "module:function" of (paths, mapping, out, *, video=None), which creates or continues the run `out`;
+        for a format without `suggester` also of motors, named, episodes and skip_bad, as in `dataset_import`.
         suggester: "module:function" of (path, tell) that returns the lines of a mapping; it calls `tell` with each open
         decision. "" for a format that needs no mapping.
         reviewer: "module:function" of a mapping's path: its features and cameras in words; ConfigError if a decision is

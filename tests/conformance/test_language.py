@@ -130,6 +130,7 @@ def test_subtasks_name_the_lifted_object_and_its_final_place(runs: list[Path], d
     for run, frames in zip(runs, language_of(dataset), strict=True):
         with _recording(run) as recording:
             trajectory, scene, fps = recording.trajectory(), recording.info.simulated.scene, recording.info.fps
+            has_lift = "lift" in recording.phases
         lifts = 0
         subtasks = [row for row in frames[0][0] if row["style"] == "subtask"]
         for row, after in itertools.pairwise(subtasks):
@@ -148,7 +149,7 @@ def test_subtasks_name_the_lifted_object_and_its_final_place(runs: list[Path], d
                 for name, poses in bodies.items():
                     where = scene.body(name).world_from_body.position if poses is None else poses[last]
                     assert np.abs(tcp[:2] - where[:2]).max() < 0.5 * max(scene.body(name).shape.extents)
-        assert lifts >= len(scene.goals)
+        assert lifts >= len(scene.goals) or not has_lift
 
 
 def test_every_wording_means_the_task_and_nothing_else(runs: list[Path], dataset: Path) -> None:

@@ -75,8 +75,8 @@ def statistic_errors(
         return
     for name in names:
         values = [_vectors(folder, name, rows[name]) for rows in episodes.values() if name in rows]
-        if not values or any(not np.isfinite(each).all() for each in values):
-            continue  # without these numbers a comparison is impossible, and another check reports them
+        if not values:
+            continue
         ranges = [_quantile_ranges(each) for each in values]
         count = sum(len(rows[name]) for rows in episodes.values())
         [(error, quantity)] = _largest_errors([stats.get(name)], [np.concatenate(values)], [count], ranges)
@@ -94,7 +94,6 @@ def _of_episodes(
     for number, rows in episodes.items():
         stored = entries.get(number, {})
         values = {name: _vectors(folder, name, rows[name]) for name in stored if name in rows}
-        values = {name: each for name, each in values.items() if np.isfinite(each).all()}
         for length in {len(each) for each in values.values()}:
             same = [name for name, each in values.items() if len(each) == length]
             errors = _largest_errors(
@@ -139,17 +138,19 @@ def _largest_errors(
         [np.concatenate([_stored(e, name, w) for e, w in zip(entries, widths, strict=True)]) for name in _MEASURED]
     )
     rows = np.hstack(values)
+    known = np.isfinite(rows).all(axis=0)  # another check reports the others
+    rows = np.where(known, rows, 0.0)
     std = rows.std(axis=0)
     low, high = _bounds(rows, std, episodes)
     errors = np.maximum(np.maximum(low - found, found - high), 0.0) / np.maximum(std, MIN_DEVIATION)
-    errors = np.where(np.isfinite(errors), errors, math.inf)
+    errors = np.where(known, np.where(np.isfinite(errors), errors, math.inf), 0.0)
     largest = []
     for entry, part, count in zip(entries, np.split(errors, np.cumsum(widths)[:-1], axis=1), counts, strict=True):
         of_quantity = dict(zip(_MEASURED, part.max(axis=1).tolist(), strict=True))
         counted = numbers_of(entry.get("count"))
         of_quantity["count"] = float(np.abs(counted - count).max()) if len(counted) else math.inf
-        known = [name for name in NAMES if name in entry or name not in QUANTILES]  # older writers have no quantiles
-        worst = max(known, key=of_quantity.__getitem__)
+        needed = [name for name in NAMES if name in entry or name not in QUANTILES]  # older writers have no quantiles
+        worst = max(needed, key=of_quantity.__getitem__)
         largest.append((of_quantity[worst], worst))
     return largest
 
