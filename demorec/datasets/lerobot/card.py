@@ -9,7 +9,7 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
@@ -78,6 +78,29 @@ _RECORDED_ROWS = (
 )
 
 
+class _Origin(NamedTuple):
+    """What a card says of the episodes' origin: licence, tags, sentences, and feature -> meaning."""
+
+    licence: str | None
+    tags: tuple[str, ...]
+    demonstrations: str
+    made: str
+    packets: str
+    meaning: Mapping[str, str]
+    rows: str
+
+
+_RECORDED = _Origin(
+    licence=None,
+    tags=(),
+    demonstrations="demonstration{plural} of {robot}",
+    made="Exported by demorec",
+    packets="unchanged",
+    meaning={},
+    rows=_RECORDED_ROWS,
+)
+
+
 def write_card(
     root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
 ) -> None:
@@ -110,18 +133,18 @@ def _card(
     configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
     seeds = rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"])  # null in recordings of other robots
     is_simulated = bool(configs) and all(row["root_seed"] is not None for row in seeds)
+    origin = _simulated(options) if is_simulated else _RECORDED
     sensed = {name: markdown(source) for name, source in meanings.items() if source}
-    meaning = {**_MEANING, **sensed, **(_simulated_meaning(options) if is_simulated else {})}
+    meaning = {**_MEANING, **sensed, **origin.meaning}
     tasks = read_tasks(root)
-    licence = options.license or (_OWN_LICENCE if is_simulated else None)
+    licence = options.license or origin.licence
     yield "---"
     if licence is not None:
         yield f"license: {licence}"
     yield from ("task_categories:", "- robotics", "tags:", "- LeRobot", "- demorec")
-    if is_simulated:
-        yield "- simulation"
+    yield from origin.tags
     yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
-    yield from (f"# {options.repo_id}", "", _summary(info, is_simulated=is_simulated, is_transcoded=is_transcoded))
+    yield from (f"# {options.repo_id}", "", _summary(info, origin, is_transcoded=is_transcoded))
     yield from (_success(root), "", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]))
     if len(tasks) > _MAX_TASKS:
         yield f"- and {len(tasks) - _MAX_TASKS} more"
@@ -132,7 +155,7 @@ def _card(
     for key, item in info.features.items():
         name = f"`{key}`" if markdown(key) == key else markdown(key)
         yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_feature_meaning(key, item, meaning)} |"
-    yield from ("", _SIMULATED_ROWS if is_simulated else _RECORDED_ROWS, "")
+    yield from ("", origin.rows, "")
     yield f"`meta/info.json` names all elements. `{SIDECAR_DIR}/` holds data without a column in LeRobot's format."
     is_one_run = len(configs) == 1 and not options.append
     if is_one_run and not any(row["origin"] for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["origin"])):
@@ -143,27 +166,33 @@ def _card(
         yield from ("", "```sh", "generate-dataset --config path/of/this/folder --out copy", "```", "")
 
 
-def _summary(info: DatasetInfo, *, is_simulated: bool, is_transcoded: bool) -> str:
+def _summary(info: DatasetInfo, origin: _Origin, *, is_transcoded: bool) -> str:
     """Describe the dataset's content and origin in one paragraph."""
-    robot, plural = markdown(str(info.robot_type)), "" if info.total_episodes == 1 else "s"
+    demonstrations = origin.demonstrations.format(
+        plural="" if info.total_episodes == 1 else "s", robot=markdown(str(info.robot_type))
+    )
     minutes = info.total_frames / info.fps / 60
-    demonstrations, origin, images = f"demonstration{plural} of {robot}", "Exported by demorec", "unchanged"
-    if is_simulated:
-        demonstrations = f"scripted demonstration{plural} by a simulated {robot} arm in PyBullet"
-        origin, images = "Recorded and exported by demorec", "stored as recorded"
+    images = "some images were encoded again" if is_transcoded else f"video packets are {origin.packets}"
     return (
         f"{info.total_episodes} {demonstrations}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
-        f"in the LeRobot v3.0 format. {origin}; "
-        f"{'some images were encoded again' if is_transcoded else f'video packets are {images}'}."
+        f"in the LeRobot v3.0 format. {origin.made}; {images}."
     )
 
 
-def _simulated_meaning(options: ExportOptions) -> dict[str, str]:
-    """Return feature -> meaning in a dataset of simulated episodes."""
+def _simulated(options: ExportOptions) -> _Origin:
+    """Return the words for a dataset of episodes that demorec simulated."""
     meaning = {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
     if options.state == "joint_ee":
         meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
-    return meaning
+    return _Origin(
+        licence=_OWN_LICENCE,
+        tags=("- simulation",),
+        demonstrations="scripted demonstration{plural} by a simulated {robot} arm in PyBullet",
+        made="Recorded and exported by demorec",
+        packets="stored as recorded",
+        meaning=meaning,
+        rows=_SIMULATED_ROWS,
+    )
 
 
 def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str]) -> str:

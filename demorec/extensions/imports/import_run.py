@@ -23,6 +23,7 @@ from demorec.extensions.imports.bag import Files, bags_in, open_bag
 from demorec.extensions.imports.bag_images import write_bag
 from demorec.extensions.imports.description import urdf_text
 from demorec.extensions.imports.import_file import BagReport, ImportFile, SkippedBag, load_import_file, save_import_file
+from demorec.extensions.imports.mapping import SourceMapping
 from demorec.extensions.imports.mapping_file import read_mapping
 from demorec.extensions.imports.planning import ImportSettings, PlannedBag, plan_bag
 from demorec.runs.external import ExternalFolder, differences, open_external_run
@@ -142,11 +143,7 @@ def import_bags(
     """
     mapping = read_mapping(mapping_path)
     urdf = urdf_text(mapping, mapping_path)
-    known = load_import_file(out)
-    if known is None or not known.bags:
-        known = ImportFile(mapping=to_plain(mapping), mapping_digest=mapping.digest)
-    if known.mapping_digest != mapping.digest:
-        raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
+    known = _known(out, mapping)
     given = list(dict.fromkeys(bag for path in paths for bag in bags_in(path)))
     for path in given:
         if not os.path.lexists(path):  # a mistyped name is not a bad bag
@@ -172,6 +169,16 @@ def import_bags(
             progress(number, len(given))
         batch.save(folder, given)
     return batch
+
+
+def _known(out: Path, mapping: SourceMapping) -> ImportFile:
+    """Read what was imported before. Raises ConfigError if it was by another mapping."""
+    known = load_import_file(out)
+    if known is None or not known.bags:
+        return ImportFile(mapping=to_plain(mapping), mapping_digest=mapping.digest)
+    if known.mapping_digest != mapping.digest:
+        raise ConfigError(f"The run was imported by another mapping: choose another --out: {out}")
+    return known
 
 
 def _read(path: Path, done: Collection[Files], settings: ImportSettings) -> tuple[Files, PlannedBag | None]:
