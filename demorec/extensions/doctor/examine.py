@@ -147,7 +147,7 @@ def lines_of(diagnosis: Diagnosis, *, everything: bool = False) -> Iterator[str]
     commands = {finding.do for finding in diagnosis.findings if "--out NEW" in finding.do}
     if len(commands) > 1:
         repair = ", dataset repair first" if any("dataset repair" in each for each in commands) else ""
-        yield f"Run one command{repair}, then check NEW: its episodes have new numbers."
+        yield f"Run one command at a time{repair}, and check NEW: dropping renumbers the episodes."
 
 
 def _taken(diagnosis: Diagnosis) -> str:
