@@ -84,6 +84,7 @@ def test_a_text_file_is_not_mcap(command: str, tmp_path: Path, capsys: pytest.Ca
     printed = capsys.readouterr()
     assert "not an MCAP file" in printed.out + printed.err
     assert "demorec made" not in printed.out + printed.err
+    assert "cannot be computed" not in printed.out
 
 
 def test_the_only_file_of_a_bag_is_read_under_another_name(

@@ -45,8 +45,9 @@ def state_bounds(evidence: Evidence) -> tuple[Array, Array]:
 
 def element_ticks(evidence: Evidence) -> Array:
     """Compute the (D,) smallest difference between two frames of each element: at most its encoder's resolution."""
-    steps = np.concatenate([np.abs(np.diff(state, axis=0)) for _, state in evidence.with_state()])
-    smallest = np.where(steps > 0, steps, np.inf).min(axis=0)
+    none = np.zeros((0, len(evidence.elements)))
+    steps = np.concatenate([none, *(np.abs(np.diff(state, axis=0)) for _, state in evidence.with_state())])
+    smallest = np.where(steps > 0, steps, np.inf).min(axis=0, initial=np.inf)
     return np.where(np.isfinite(smallest), smallest, 0.0)
 
 
