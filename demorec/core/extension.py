@@ -6,8 +6,9 @@ takes no longer with twenty extensions than with none.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal, get_args
 
 Group = Literal["make", "look", "judge", "edit", "learn", "repair"]
@@ -48,7 +49,7 @@ class ReaderRow:
         plural: Plural noun: "HDF5 files".
         advice: Action for the user if a recording was expected: "convert it to a run (demorec import)".
         word: Word after `demorec import` for this kind; "" if none is needed.
-        suffixes: File suffixes, for a kind that the core does not know. Folders are not recognised by it.
+        suffixes: File suffixes, for a kind that the core does not know; a folder stands for its files with them.
         example: Example of the arguments after `demorec import` and the word.
         importer: "module:function" of (paths, mapping, out, *, video=None), which creates or continues the run `out`;
         for a format without `suggester` also of motors, named, episodes and skip_bad, as in `dataset_import`.
@@ -72,6 +73,16 @@ class ReaderRow:
     reviewer: str = ""
     describer: str = ""
     dropped: str = ""
+
+    def files(self, paths: Sequence[Path]) -> list[Path]:
+        """Replace folders by their files with one of the `suffixes`, if there are any, in the order of their names."""
+        found: list[Path] = []
+        for path in paths:
+            if self.suffixes and path.is_dir():
+                found += sorted(file for file in path.iterdir() if file.name.endswith(self.suffixes))
+            else:
+                found.append(path)
+        return found
 
     @property
     def command(self) -> str:

@@ -227,6 +227,8 @@ def _folder(path: Path) -> Found:
     here = _recordings_in(path) if kind is None else ()
     if kind is None and _holds_bags(path, here):
         return Found(path=path, kind="rosbag")
+    if kind is None and not here and (held := _held_kind(entries)) is not None:
+        return Found(path=path, kind=held)
     recordings, failed = (*here, *_recordings_in(path / EPISODES)), _recordings_in(path / FAILED)
     made = {file.stem for file in (*recordings, *failed)}
     places = [path, path / EPISODES]
@@ -246,6 +248,12 @@ def _folder(path: Path) -> Found:
 def exported_kind(folder: Path) -> PathKind | None:
     """Return the format of which a folder is an export, by its mark; None if it has none."""
     return next((name for name, row in exporter_rows().items() if row.mark and _is_there(folder / row.mark)), None)
+
+
+def _held_kind(entries: Sequence[str]) -> PathKind | None:
+    """Return the kind of an extension's reader whose files a folder holds, by their suffixes; None if none has them."""
+    rows = ((kind, row.suffixes) for kind, row in reader_rows().items() if row.suffixes)
+    return next((kind for kind, suffixes in rows if any(entry.endswith(suffixes) for entry in entries)), None)
 
 
 def _holds_bags(path: Path, recordings: Sequence[Path]) -> bool:

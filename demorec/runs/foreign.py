@@ -89,7 +89,7 @@ def _imported(path: Path, form: ReaderRow, mapping: Path | None, run: Path, tell
         mapping = None
     elif mapping is None:
         mapping = _suggested(path, form, run.with_suffix(".toml"), tell)
-    result: ImportResult = pkgutil.resolve_name(form.importer)([path], mapping, run)
+    result: ImportResult = pkgutil.resolve_name(form.importer)(form.files([path]), mapping, run)
     for line in result.left_out_lines():
         tell(line)
     if not result.num_episodes:

@@ -128,6 +128,13 @@ def test_a_package_brings_a_format_and_a_check(site: Path, run: Path, tmp_path: 
         np.testing.assert_allclose(rows[:, 1:], recording.table().features["observation.state"], atol=1e-11)
     demorec(site, "import", "labcsv", table, "--out", again)
     assert str(len(rows)) in demorec(site, "info", table).split()
+    tables = tmp_path / "tables"
+    tables.mkdir()
+    for name in ("a.labcsv", "b.labcsv"):
+        shutil.copy(table, tables / name)
+    (tables / "notes.txt").write_text("cups")
+    assert "2 episodes" in demorec(site, "import", "labcsv", tables, "--out", tmp_path / "both")
+    assert "2 episodes" in demorec(site, "check", tables, "--only", "late_start")
     rows[:5, 1:] = rows[0, 1:]
     late = tmp_path / "late.labcsv"
     late.write_text("time_s,q\n" + "\n".join(",".join(map(repr, row)) for row in rows.tolist()) + "\n")

@@ -141,7 +141,7 @@ class Import:
         if not form.suggester:
             options |= {"motors": self.motors.named, "named": self.roles.named}
             options |= {"episodes": self.episodes, "skip_bad": self.skip_bad}
-        result: FramesImport = pkgutil.resolve_name(form.importer)(paths, self.mapping, out, **options)
+        result: FramesImport = pkgutil.resolve_name(form.importer)(form.files(paths), self.mapping, out, **options)
         say(*(f"camera {name}: {text}" for name, text in result.cameras.items()), *result.left_out_lines())
         if there := result.num_episodes - result.num_new:
             tell(f"{there} of {counted(result.num_episodes, 'episode')} had been imported before.")
