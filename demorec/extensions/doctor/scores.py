@@ -195,7 +195,9 @@ def _readings(
     switches = [sorted({frame for command in commands.T for frame in _switches(command, *pair)}) for pair in _LEVELS]
     counts = [len(frames) for frames in switches]
     last = len(state) - 1
-    detours = [_detour(state, [0, *(frame for frame in frames if frame < last), last]) for frames in switches]
+    bounds = [(0, *(frame for frame in frames if frame < last), last) for frames in switches]
+    by_bounds = {each: _detour(state, each) for each in dict.fromkeys(bounds)}  # the levels usually agree
+    detours = [by_bounds[each] for each in bounds]
     return {
         "pause": _pause(state, openings, fps),
         "duration": QuantityReading(float(np.log(len(state) / fps)), 0, last),
