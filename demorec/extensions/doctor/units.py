@@ -15,6 +15,10 @@ MIN_OTHERS = 3
 MIN_UNIT_RATIO = 7.0
 """Minimum ratio of magnitudes of an episode in another unit: demonstrations of one task differ by a factor of two or
 three, the nearest confusion of units is 11."""
+MIN_AGREED = 0.6
+"""Minimum ratio of the elements that agree on another unit: a gripper and resting joints may keep theirs."""
+MIN_WHOLE = 0.9
+"""The same of the three elements of one position: all of them."""
 MIN_MOTION_TICKS = 10.0
 """Minimum motion in units of the element's smallest difference: a resting encoder flickers by a tick or two."""
 BOUND_QUANTILES = (0.005, 0.995)
@@ -68,7 +72,7 @@ def _other_sizes(values: Mapping[int, Array], positions: Sequence[list[int]]) ->
     spans = {number: np.ptp(each, axis=0) for number, each in values.items()}
     usual_size, usual_span = (np.median(np.stack(list(part.values())), axis=0) for part in (sizes, spans))
     alive = np.flatnonzero((usual_size > 0) & (usual_span > 0))
-    wholes = [(alive, 0.6), *((np.array(each), 1.0) for each in positions if np.isin(each, alive).all())]
+    wholes = [(alive, MIN_AGREED), *((np.array(each), MIN_WHOLE) for each in positions if np.isin(each, alive).all())]
     found: dict[int, float] = {}
     for number in values:
         for elements, least in wholes:
@@ -77,6 +81,6 @@ def _other_sizes(values: Mapping[int, Array], positions: Sequence[list[int]]) ->
                 by_span = np.log(spans[number][elements] / usual_span[elements])
             for sign in (1.0, -1.0):
                 agreed = np.minimum(sign * by_size, sign * by_span) > math.log(MIN_UNIT_RATIO)
-                if len(elements) and agreed.mean() >= least and (sign > 0 or np.isfinite(by_span[agreed]).all()):
+                if len(elements) and agreed.mean() > least and (sign > 0 or np.isfinite(by_span[agreed]).all()):
                     found.setdefault(number, float(np.exp(np.median(by_size[agreed]))))
     return found
