@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import counted, say, size_in_words
@@ -17,6 +17,9 @@ from demorec.core.replacing import REPORT
 from demorec.core.targets import Target
 from demorec.runs.find import EPISODE_FOLDERS, expect
 from demorec.runs.foreign import imported_kinds
+
+if TYPE_CHECKING:
+    from demorec.extensions.doctor.diagnosis import Diagnosis
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,26 +63,29 @@ class ReportCommand:
         if not self.out.absolute().parent.is_dir():
             raise ConfigError(f"--out: folder {self.out.parent} is missing.")
         refuse_inside([self.out])
-        from demorec.check.report import CheckOptions
-        from demorec.extensions.doctor.examine import examine
-        from demorec.extensions.doctor.from_dataset import ReadOptions
         from demorec.extensions.report.gather import gather
         from demorec.extensions.report.page import write_page
 
-        named = self.roles.named
-        checks = CheckOptions(images=self.images) if self.checks else None
         with atomic_write(self.out, REPORT, overwrite=self.overwrite, sources=places_read([self.path])) as part:
             with reading([self.path], self.mapping) as (path,), ProgressBar("reading", unit="item") as bar:
-                judged = examine(path, ReadOptions(images=self.images, named=named))[0] if self.checks else None
                 report = gather(
                     path,
                     camera=self.camera,
-                    checks=checks,
-                    judged=judged,
+                    diagnosis=self._diagnosis(path) if self.checks else None,
                     workers=self.workers,
-                    named=named,
+                    named=self.roles.named,
                     advance=bar.set,
                 )
             size = write_page(report, part)
         say(f"{counted(len(report.episodes), 'episode')}, {size_in_words(size)}: {self.out}")
         return 0
+
+    def _diagnosis(self, path: Path) -> Diagnosis:
+        """Run the checks of files, numbers and, if requested, images."""
+        from demorec.check.report import CheckOptions, check_subjects, find_subjects
+        from demorec.extensions.doctor.examine import examine
+        from demorec.extensions.doctor.from_dataset import ReadOptions
+
+        options = CheckOptions(images=self.images, colours=False, workers=self.workers)
+        reports = list(check_subjects(find_subjects([path]), options))
+        return examine(path, ReadOptions(images=self.images, named=self.roles.named), reports=reports)[0]

@@ -1,33 +1,36 @@
-"""Gather the content of a report: from recordings here, from datasets in `demorec.extensions.report.dataset`."""
+"""Gather the content of a report from recordings or a LeRobot dataset."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-from demorec.check.report import CheckOptions, Subject, SubjectReport, check_subject, find_subjects
-from demorec.core.errors import ConfigError, RecordingError, without_path
+from numpy.typing import NDArray
+
+from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, without_path
 from demorec.core.processes import in_turn
-from demorec.episode.episode import Outcome, consecutive_runs
+from demorec.core.replacing import shown
+from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import noted
+from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.episode.episode import Outcome, SuccessCheck, consecutive_runs
+from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
 from demorec.extensions.doctor.diagnosis import Diagnosis
 from demorec.extensions.report.content import (
-    CheckSummaries,
+    MAX_COMPONENTS,
     Components,
     Report,
     ReportedEpisode,
-    add_components,
-    broken_first,
-    common_facts,
-    few,
-    judged_episode,
-    motion_components,
-)  # fmt: skip
-from demorec.extensions.report.dataset import dataset_report
-from demorec.extensions.report.filmstrip import MAX_SHOWN, filmstrip, strip_budget
+    add_motion,
+    success_rate,
+)
+from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
 from demorec.mcap import Recording, open_recording
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import (
@@ -46,31 +49,35 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
-_Read = tuple[ReportedEpisode, Components, SubjectReport | None]
 _AHEAD = 2
 """Maximum episodes that a process may be ahead of the count."""
+_SUCCESS = "next.success"
+_SIDECAR_COLUMNS = (
+    "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
+    "failure_reason", "num_retries", "checks", "phases", "episode_info",
+)  # fmt: skip
+_Row = Mapping[str, Any]
+_Progress = Callable[[int, int], None]
 
 
 def gather(
     path: Path,
     *,
     camera: str = "",
-    checks: CheckOptions | None = None,
-    judged: Diagnosis | None = None,
+    diagnosis: Diagnosis | None = None,
     workers: int = 1,
     named: NamedRoles = NO_NAMES,
-    advance: Callable[[int, int], None] = lambda done, total: None,
+    advance: _Progress = lambda done, total: None,
 ) -> Report:
-    """The content of a page about a recording, a run, an evaluation, a folder of recordings or a dataset.
+    """Gather the content of a page about a recording, a run, an evaluation, a folder of recordings or a dataset.
 
     Args:
         path: Path of the source.
         camera: Camera of the filmstrips; "" for the first one.
-        checks: Selected checks of files; None for none.
-        judged: The doctor's diagnosis.
-        workers: Number of processes that read and check recordings.
+        diagnosis: Results of the checks; None if none were run.
+        workers: Number of processes that read recordings.
         named: Features whose role the user names, in data that demorec did not simulate.
-        advance: Called with the number of finished items and of all items.
+        advance: Called with the number of read episodes and of all.
 
     Raises:
         ConfigError: There is nothing to report on, or the camera does not exist.
@@ -78,95 +85,83 @@ def gather(
     """
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
-        return dataset_report(path, camera, checks, judged, named, advance)
-    return _recordings_report(found, camera, checks, judged, workers, named, advance)
+        report = _dataset_report(path, camera, diagnosis, named, advance)
+    else:
+        report = _recordings_report(found, camera, diagnosis, workers, named, advance)
+    unchecked = () if diagnosis is not None else ("No checks were run (--no-checks).",)
+    return replace(report, diagnosis=diagnosis, missing=(*report.missing, *unchecked))
+
+
+def _judged(episode: ReportedEpisode, number: int, diagnosis: Diagnosis | None) -> ReportedEpisode:
+    """Add the findings and the score of an episode."""
+    if diagnosis is None:
+        return episode
+    flags = [finding for finding in diagnosis.findings if finding.episode == number]
+    scores = [each.score for each in diagnosis.episodes if each.episode == number and each.verdict != "good"]
+    flags.sort(key=lambda finding: finding.severity != "broken")
+    return replace(episode, flags=tuple(flags), score=min(scores, default=1.0))
+
+
+def _common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) -> Iterator[tuple[str, str]]:
+    rate = success_rate(episodes)
+    if rate.trials:
+        yield "success", f"{rate}"
+    seconds = sum(episode.num_frames / episode.fps for episode in episodes)
+    unit, factor = ("h", 3600) if seconds >= 7200 else ("min", 60) if seconds >= 120 else ("s", 1)
+    rates = _few(f"{episode.fps} Hz" for episode in episodes if episode.num_frames)
+    yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds / factor:.1f} {unit} at {rates})"
+    size = sum(file.stat().st_size for file in files)
+    yield "size", f"{size / 1000:.0f} kB" if size < 1_000_000 else f"{size / 1e6:.1f} MB"
+
+
+def _few(values: Iterable[str]) -> str:
+    """The first three distinct values."""
+    return shown(list(dict.fromkeys(values)), 3) or "unknown"
 
 
 def _recordings_report(
-    found: Found,
-    camera: str,
-    checks: CheckOptions | None,
-    judged: Diagnosis | None,
-    workers: int,
-    named: NamedRoles,
-    advance: Callable[[int, int], None],
+    found: Found, camera: str, diagnosis: Diagnosis | None, workers: int, named: NamedRoles, advance: _Progress
 ) -> Report:
-    path = found.path
+    files = (*found.recordings, *found.failed)
+    expect_recordings(found, files)
     run, missing = _run_file(found)
-    later = set() if run is None else {path / attempt.file for attempt in run.beyond}
-    if later:
-        missing.append(f"{len(later)} recordings of episodes beyond the number last requested are left out.")
-    subjects = [
-        Subject(path=file, kind="recording") for file in (*found.recordings, *found.failed) if file not in later
-    ]
-    if not subjects:
-        expect_recordings(found, ())
-    folders = [s for s in find_subjects([path]) if s.kind != "recording"] if checks else []
-    summaries = CheckSummaries()
-    total = len(subjects) + len(folders)
+    stride = -(-len(files) // MAX_SHOWN)
+    budget = strip_budget(len(files))
+    strips = [0 if number % stride and file.parent.name != FAILED else budget for number, file in enumerate(files)]
+    read = partial(_read, found.path, camera, named)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for number, (episode, found_in, checked) in enumerate(_read_all(path, camera, checks, subjects, workers, named)):
-        episodes.append(judged_episode(episode, number, judged))
-        add_components(components, found_in)
-        if checked is not None:
-            summaries.add(checked.results, episode.name)
-        advance(len(episodes), total)
-    if checks is None:
-        missing.append("No checks were run (--no-checks).")
-    else:
-        for number, subject in enumerate(folders, len(subjects) + 1):
-            summaries.add(check_subject(subject, checks).results, f"the {subject.kind}")
-            advance(number, total)
-        summaries.add_judged(judged)
-        if not checks.images:
-            missing.append("The checks that decode all images were not run; --images runs them, too.")
+    for number, (episode, own) in enumerate(
+        in_turn(read, list(zip(files, strips, strict=True)), workers, ahead=_AHEAD)
+    ):
+        episodes.append(_judged(episode, number, diagnosis))
+        for key, samples in own.items():
+            components.setdefault(key, []).extend(samples)
+        advance(len(episodes), len(files))
     if run is not None:
         episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
     return Report(
-        title=path.resolve().name,
+        title=found.path.resolve().name,
         kind=_KINDS[found.kind],
-        facts=tuple(_facts(found, run, episodes)),
+        facts=tuple(_run_facts(found, run, episodes)),
         episodes=tuple(episodes),
         distributions=components,
-        has_units=all(episode.seed is not None for episode in episodes if episode.facts),
-        checks=summaries if checks else None,
-        missing=tuple(missing),
+        diagnosis=None,
+        missing=missing,
     )
 
 
-def _read_all(
-    root: Path,
-    camera: str,
-    checks: CheckOptions | None,
-    subjects: Sequence[Subject],
-    workers: int,
-    named: NamedRoles,
-) -> Iterator[_Read]:
-    stride = -(-len(subjects) // MAX_SHOWN)
-    budget = strip_budget(len(subjects))
-    strips = [0 if number % stride and s.path.parent.name != FAILED else budget for number, s in enumerate(subjects)]
-    return in_turn(
-        partial(_read, root, camera, checks, named), list(zip(subjects, strips, strict=True)), workers, ahead=_AHEAD
-    )
-
-
-def _read(root: Path, camera: str, checks: CheckOptions | None, named: NamedRoles, given: tuple[Subject, int]) -> _Read:
-    """Read and check a recording, in any process, with a size limit for its strip; a damaged one is reported as
-    damaged.
-    """
-    subject, strip_bytes = given
-    checked = None if checks is None else check_subject(subject, checks)
-    flags = broken_first(() if checked is None else checked.findings)
-    path = subject.path
-    source = path.name if path == root else path.relative_to(root).as_posix()
+def _read(root: Path, camera: str, named: NamedRoles, given: tuple[Path, int]) -> tuple[ReportedEpisode, Components]:
+    """Read a recording, in any process, with a size limit for its strip; a damaged one is reported as damaged."""
+    path, strip_bytes = given
+    components: Components = {}
     try:
         with open_recording(path) as recording:
             episode = _read_recording(recording, camera, strip_bytes)
-            components = motion_components(roles_of_recording(recording.info, named), recording.table().features)
+            add_motion(components, roles_of_recording(recording.info, named), recording.table().features)
     except RecordingError as error:
-        episode, components = ReportedEpisode(name=path.stem, problem=without_path(error, path)), {}
-    return replace(episode, source=source, flags=flags), components, checked
+        episode = ReportedEpisode(name=path.stem, problem=without_path(error, path))
+    return replace(episode, source=path.name if path == root else path.relative_to(root).as_posix()), components
 
 
 def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> ReportedEpisode:
@@ -175,11 +170,9 @@ def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> Repo
         there = ", ".join(recording.cameras) or "none"
         raise ConfigError(f"No camera {camera!r}, available are {there}: {recording.path}")
     strip = None
-    shown = next((name for name in recording.cameras if camera in ("", name) and recording.num_images(name)), None)
-    if strip_bytes and shown is not None:
-        strip = filmstrip(
-            shown, recording.num_frames, lambda frames: recording.images_at(shown, frames), max_bytes=strip_bytes
-        )
+    seen = next((name for name in recording.cameras if camera in ("", name) and recording.num_images(name)), None)
+    if strip_bytes and seen is not None:
+        strip = filmstrip(seen, recording.num_frames, partial(recording.images_at, seen), max_bytes=strip_bytes)
     is_failed = recording.path.parent.name == FAILED
     attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
     return ReportedEpisode(
@@ -208,41 +201,175 @@ def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "made with", f"demorec {info.versions.get('demorec', 'of an unknown version')}"
 
 
-def _run_file(found: Found) -> tuple[RunFile | None, list[str]]:
+def _run_file(found: Found) -> tuple[RunFile | None, tuple[str, ...]]:
     """run.json, if readable, and sentences about missing data."""
     if found.kind != "run":
-        return None, []
+        return None, ()
     try:
         run = load_any_run_file(found.path)
-        missing = [f"{run.unfinished}."] if run.unfinished else []
-        return (None if run.generation is None else run), missing
     except DamagedRunFileError as error:
-        return None, [
-            f"{without_path(error, found.path / RUN_NAME)}, so the requested number of episodes is not known."
-        ]
+        reason = without_path(error, found.path / RUN_NAME)
+        return None, (f"{reason}, so the requested number of episodes is not known.",)
+    return (None if run.generation is None else run), ((f"{run.unfinished}.",) if run.unfinished else ())
 
 
 def _without_recording(attempt: Attempt) -> ReportedEpisode:
     return ReportedEpisode(
         name=f"episode {attempt.episode_index}, attempt {attempt.attempt}",
         problem="Nothing was recorded, since no scene could be laid out.",
-        outcome=Outcome(
-            success=False, checks=(), failure_phase=attempt.phase, failure_reason=attempt.reason, num_frames=0
-        ),
+        outcome=_outcome({"success": False, "failure_phase": attempt.phase, "failure_reason": attempt.reason}),
         seed=attempt.seed,
     )
 
 
-def _facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
+def _run_facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
     if run is not None:
         yield "episodes", f"{len(run.successes)} of {run.num_episodes} asked"
     yield "attempts" if found.failed else "recordings", str(len(episodes))
-    yield from common_facts(episodes, (*found.recordings, *found.failed))
+    yield from _common_facts(episodes, (*found.recordings, *found.failed))
     facts = [fact for episode in episodes for fact in episode.facts]
     for name in dict.fromkeys(name for name, _ in facts):
-        yield name, few(value for of, value in facts if of == name)
+        yield name, _few(value for of, value in facts if of == name)
     if run is not None:
         yield "variation", run.config.variation
         yield "run digest", run.digest
     elif found.kind == "run" and is_external_run(found.path):
         yield "run digest", load_any_run_file(found.path).digest
+
+
+def _dataset_report(
+    root: Path, camera: str, diagnosis: Diagnosis | None, named: NamedRoles, advance: _Progress
+) -> Report:
+    folder = LeRobotFolder(root, named=named)
+    features, roles = folder.info.features, folder.roles
+    rows = {row["episode_index"]: row for row in folder.sidecar(_SIDECAR_COLUMNS)}
+    key = _camera_key(folder, camera)
+    wanted = dict.fromkeys((*roles.state, *roles.action))
+    if _SUCCESS in features and features[_SUCCESS].column.elements:
+        wanted[_SUCCESS] = None
+    reader = folder.rows(list(wanted)) if wanted else None
+    stride = max(1, -(-len(folder.places) // MAX_SHOWN))
+    flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
+    components: Components = {}
+    episodes: list[ReportedEpisode] = []
+    for number, place in enumerate(folder.places):
+        columns: Mapping[str, NDArray[Any]] = {}
+        strip: Filmstrip | None = None
+        problems: list[str] = []
+        with noted(problems, root):
+            columns = {} if reader is None else reader.numbers(place)
+            add_motion(components, roles, columns)
+            if key is not None and (place.episode_index in flagged or number % stride == 0):
+                strip = _strip(folder, key, place)
+        episode = _dataset_episode(place, int(folder.info.fps), columns, rows.get(place.episode_index))
+        episode = replace(episode, filmstrip=strip, problem="; ".join(problems))
+        episodes.append(_judged(episode, place.episode_index, diagnosis))
+        advance(len(episodes), len(folder.places))
+    episodes += [_left_out(row) for row in folder.attempts.failures]
+    return Report(
+        title=root.resolve().name,
+        kind="LeRobot dataset",
+        facts=tuple(_dataset_facts(folder, episodes)),
+        episodes=tuple(episodes),
+        distributions=components,
+        diagnosis=None,
+        missing=(*folder.notes, *_missing(folder, has_sidecar=bool(rows))),
+    )
+
+
+def _camera_key(folder: LeRobotFolder, camera: str) -> str | None:
+    """The feature whose images are shown; None for a dataset without color images.
+
+    Raises:
+        ConfigError: The camera does not exist.
+    """
+    keys = [key for key, feature in folder.info.features.items() if feature.is_camera and not feature.is_depth]
+    if not camera:
+        return keys[0] if keys else None
+    for key in keys:
+        if camera in (key, key.removeprefix(IMAGE_PREFIX)):
+            return key
+    there = ", ".join(key.removeprefix(IMAGE_PREFIX) for key in keys) or "none"
+    raise ConfigError(f"No camera {camera!r} with color images, available are {there}: {folder.root}")
+
+
+def _strip(folder: LeRobotFolder, key: str, place: EpisodePlace) -> Filmstrip | None:
+    is_video = folder.info.features[key].is_video
+    images_at = folder.video(key, place).images_at if is_video else partial(folder.stored_images[key].read, place)
+    max_bytes = strip_budget(len(folder.places))
+    return filmstrip(key.removeprefix(IMAGE_PREFIX), place.length, images_at, max_bytes=max_bytes)
+
+
+def _dataset_episode(
+    place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]], row: _Row | None
+) -> ReportedEpisode:
+    name = f"episode {place.episode_index}"
+    known = ReportedEpisode(name=name, instruction=", ".join(place.tasks), num_frames=place.length, fps=fps)
+    if row is None:
+        success = bool(columns[_SUCCESS][-1, 0]) if len(columns.get(_SUCCESS, ())) else None
+        return replace(known, outcome=_outcome({"success": success}))
+    try:
+        known = replace(known, source=str(row["source"]), outcome=_outcome(row))
+        if row["episode_info"] is None:  # without a scene there is no seed and no phase
+            return known
+        phases = tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"])
+        return replace(known, seed=row["root_seed"], phases=phases)
+    except (ValueError, KeyError, TypeError) as error:
+        raise ExportError(f"The sidecar's row of {name} cannot be used ({describe_error(error)})") from error
+
+
+def _outcome(row: _Row) -> Outcome | None:
+    """Outcome of an attempt, as far as a row records it."""
+    if row["success"] is None:
+        return None
+    return Outcome(
+        success=row["success"],
+        checks=tuple(SuccessCheck(**check) for check in row.get("checks") or ()),
+        failure_phase=row.get("failure_phase") or "",
+        failure_reason=row.get("failure_reason") or "",
+        num_frames=0,
+        num_retries=row.get("num_retries") or 0,
+    )
+
+
+def _left_out(row: _Row) -> ReportedEpisode:
+    return ReportedEpisode(
+        name=f"run's episode {row['run_episode_index']}, attempt {row['attempt']}",
+        problem="This attempt is not in the dataset; only its outcome is known.",
+        outcome=_outcome(row),
+    )
+
+
+def _missing(folder: LeRobotFolder, *, has_sidecar: bool) -> Iterator[str]:
+    """Sentences about data missing from the dataset."""
+    if not has_sidecar:
+        yield (
+            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
+            "and the conditions of success are not known."
+        )
+        if _SUCCESS not in folder.info.features:
+            yield f"Without a column {_SUCCESS}, the outcomes of the episodes are not known."
+    if _camera_key(folder, "") is None:
+        yield "It has no color images, so there are no filmstrips."
+    roles = folder.roles
+    yield from roles.notes()
+    for role, parts in (("state", roles.state), ("action", roles.action)):
+        if (count := len(roles.elements(parts))) > MAX_COMPONENTS:
+            yield f"Only the first {MAX_COMPONENTS} of the {count} components of the {role} are drawn."
+
+
+def _dataset_facts(folder: LeRobotFolder, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
+    yield "episodes", str(len(folder.places))
+    if left_out := len(episodes) - len(folder.places):
+        yield "attempts", f"{len(episodes)}, of which {left_out} are not in the dataset"
+    yield from _common_facts(episodes, (file for file in folder.root.rglob("*") if file.is_file()))
+    info = folder.info
+    yield "robot", info.robot_type or "unknown"
+    cameras = (
+        f"{key.removeprefix(IMAGE_PREFIX)} {'x'.join(str(n) for n in feature.shape[1::-1])}"
+        for key, feature in info.features.items()
+        if feature.is_camera
+    )
+    yield "cameras", ", ".join(cameras) or "none"
+    yield "tasks", str(info.total_tasks)
+    yield "format", f"LeRobot {info.version}"

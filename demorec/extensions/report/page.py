@@ -9,10 +9,11 @@ from __future__ import annotations
 import base64
 import hashlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -20,15 +21,19 @@ from jinja2.environment import TemplateStream
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from demorec.check.base import Finding
+from demorec.check.base import RANK, Finding
 from demorec.core.replacing import REPORT_MARK
 from demorec.core.text import printable
-from demorec.extensions.report import charts
-from demorec.extensions.report.charts import Chart, css_color
-from demorec.extensions.report.content import MAX_SAMPLES, VERDICTS, Report, ReportedEpisode, State, success_rate
+from demorec.extensions.doctor.diagnosis import Diagnosis
+from demorec.extensions.report.content import MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
 from demorec.extensions.report.filmstrip import MAX_SHOWN
 from demorec.view.style import phase_colors
 
+CHART_WIDTH = 220
+"""Width of a chart without its labels, in units of its SVG."""
+CHART_HEIGHT = 70
+"""Height of a chart without its labels, in the same units."""
+_BINS = 48
 _STATES: dict[State, str] = {
     "unreadable": "unreadable",
     "failed": "failed",
@@ -54,7 +59,7 @@ def page(report: Report) -> str:
 def _stream(report: Report) -> TemplateStream:
     shown = _shown(report.episodes)
     phases = (name for _, episode in shown if episode.filmstrip for name, _, _ in episode.phases)
-    colors = {name: css_color([channel / 255 for channel in rgb]) for name, rgb in phase_colors(phases).items()}
+    colors = {name: "#" + bytes(rgb[:3]).hex() for name, rgb in phase_colors(phases).items()}
     style, script = _own_text("page.css"), _own_text("page.js")
     template = _environment().get_template("page.html")
     return template.stream(
@@ -64,7 +69,7 @@ def _stream(report: Report) -> TemplateStream:
         script=script,
         policy=f"default-src 'none'; img-src data:; style-src {_digest(style)}; script-src {_digest(script)}",
         outcomes=_outcomes(report.episodes),
-        checks=report.checks if report.checks and report.checks.worst else None,
+        findings=[] if report.diagnosis is None else list(_findings(report.diagnosis)),
         rate=success_rate(report.episodes),
         distributions=list(_distributions(report)),
         shown=shown,
@@ -83,9 +88,11 @@ def _environment() -> Environment:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.globals.update(charts=charts, verdicts=VERDICTS[::-1], max_samples=MAX_SAMPLES, states=_STATES)
+    environment.globals.update(
+        max_samples=MAX_SAMPLES, states=_STATES, phase_bar=_phase_bar, width=CHART_WIDTH, height=CHART_HEIGHT
+    )
     environment.filters.update(
-        fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, place=place, words=_words
+        fmt=format, base64=lambda data: base64.b64encode(data).decode(), about=_about, place=_place
     )
     return environment
 
@@ -119,11 +126,9 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
     """(outcome, numbers of its episodes), failures first."""
     groups: dict[str, list[int]] = {}
     for number, episode in enumerate(episodes):
-        if episode.outcome is None:
-            outcome = "cannot be read" if episode.problem else "not recorded"
-        elif episode.outcome.success is None:
-            outcome = "not recorded"
-        elif not episode.outcome.success:
+        if episode.outcome is None or episode.success is None:
+            outcome = "cannot be read" if episode.outcome is None and episode.problem else "not recorded"
+        elif not episode.success:
             outcome = f"failed: {episode.failure}"
         else:
             outcome = _GOOD[episode.outcome.num_retries > 0]
@@ -131,7 +136,17 @@ def _outcomes(episodes: Sequence[ReportedEpisode]) -> list[tuple[str, list[int]]
     return sorted(groups.items(), key=lambda item: (item[0] in _GOOD, -len(item[1]), item[0]))
 
 
-def place(finding: Finding) -> str:
+def _findings(diagnosis: Diagnosis) -> Iterator[tuple[Finding, str]]:
+    """Yield the worst finding of each check, broken ones first, and the number of its findings by severity."""
+    groups: dict[str, list[Finding]] = {}
+    for finding in sorted(diagnosis.findings, key=lambda finding: -RANK[finding.severity]):
+        groups.setdefault(finding.check, []).append(finding)
+    for found in groups.values():
+        counts = Counter(finding.severity for finding in found)
+        yield found[0], ", ".join(f"{count} {severity}" for severity, count in counts.items())
+
+
+def _place(finding: Finding) -> str:
     """Frame and message of a finding."""
     return finding.message if finding.frames is None else f"frame {finding.frames[0]}: {finding.message}"
 
@@ -148,28 +163,62 @@ def _about(episode: ReportedEpisode) -> str:
     return ", ".join(filter(None, parts))
 
 
-def _words(episode: ReportedEpisode) -> str:
-    """Text that the page's filter searches."""
-    parts = [episode.name, episode.instruction, _about(episode), *(flag.check for flag in episode.flags)]
-    return " ".join([*parts, episode.failure]).lower()
+class Chart(NamedTuple):
+    """A small chart: areas and lines over a range of values.
+
+    Attributes:
+        title: The quantity.
+        paths: (CSS class, SVG path).
+        low, high, middle: Labels below its left end, its right end and its middle.
+        note: Text below the title.
+    """
+
+    title: str
+    paths: list[tuple[str, str]]
+    low: str
+    high: str
+    middle: str
+    note: str
+
+
+def distribution(title: str, series: Mapping[str, NDArray[np.float32]]) -> Chart:
+    """Draw the densities of one or two components over their common range; `series` is CSS class -> values."""
+    note = "mean: " + ", ".join(f"{name} {values.mean():.3g}" for name, values in series.items())
+    low = min(float(values.min()) for values in series.values())
+    high = max(float(values.max()) for values in series.values())
+    if low == high:  # the bin of a single value would be too narrow to see
+        bar = f"M{CHART_WIDTH / 2 - 2:g} 0h4v{CHART_HEIGHT}h-4z"
+        return Chart(title, [(next(iter(series)), bar)], "", "", f"{low:.3g}", note)
+    shares = {
+        name: np.histogram(values, bins=_BINS, range=(low, high))[0] / len(values) for name, values in series.items()
+    }
+    highest = max(float(found.max()) for found in shares.values())
+    paths = []
+    for name, found in shares.items():
+        steps = "".join(f"V{CHART_HEIGHT * (1 - share / highest):.1f}h{CHART_WIDTH / _BINS:.3f}" for share in found)
+        paths.append((name, f"M0 {CHART_HEIGHT}{steps}V{CHART_HEIGHT}"))
+    return Chart(title, paths, f"{low:.3g}", f"{high:.3g}", "", note)
 
 
 def _distributions(report: Report) -> Iterator[Chart]:
-    by_name: dict[str, list[tuple[str, NDArray[np.float32]]]] = {}
+    by_name: dict[str, dict[str, NDArray[np.float32]]] = {}
     for (role, name), parts in report.distributions.items():
-        by_name.setdefault(name, []).append((role, np.concatenate(parts)))
+        by_name.setdefault(name, {})[role] = np.concatenate(parts)
     for name, series in by_name.items():
-        unit = _unit(name) if report.has_units else ""
-        yield charts.distribution(f"{name} ({unit})" if unit else name, series)
+        yield distribution(name, series)
     seconds = [episode.num_frames / episode.fps for episode in report.episodes if episode.num_frames]
     if len(seconds) > 1:
-        lengths = charts.distribution("length of episodes (s)", [("state", np.array(seconds, np.float32))])
+        lengths = distribution("length of episodes (s)", {"state": np.array(seconds, np.float32)})
         yield lengths._replace(note=f"mean: {np.mean(seconds):.3g}")
 
 
-def _unit(name: str) -> str:
-    """Unit of a component, by its name in `demorec.episode.features`."""
-    part = name.rpartition(".")[2]
-    if part in ("pos", "delta", "rx", "ry", "rz"):
-        return "rad"
-    return "m" if part in ("width", "x", "y", "z", "dx", "dy", "dz") else ""
+def _phase_bar(episode: ReportedEpisode, colors: Mapping[str, str]) -> Iterator[tuple[str, str, str, str]]:
+    """Yield (title, left, width, color) of each phase, in units of one image of the filmstrip above.
+
+    The middle of each image is above its own moment.
+    """
+    assert episode.filmstrip is not None
+    last = max(episode.num_frames - 1, 1)
+    for name, first, end in episode.phases:
+        left, right = (0.5 + (episode.filmstrip.moments - 1) * min(frame, last) / last for frame in (first, end))
+        yield f"{name}, frames {first} to {end - 1}", f"{left:.6g}", f"{right - left:.6g}", colors[name]

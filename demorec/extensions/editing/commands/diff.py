@@ -15,9 +15,9 @@ from demorec.extensions.editing.commands.edit import MAX_SHOWN, dataset_at
 
 @dataclass(frozen=True, kw_only=True)
 class Diff:
-    """Report every difference between two datasets, in any order of their episodes.
+    """Compare features, rows and encoded images of two datasets, in any order of their episodes.
 
-    Exit code 0: none, 1: some, 2: unreadable.
+    Exit code 0: no difference, 1: some, 2: unreadable.
 
     Examples:
       demorec dataset diff cups sorted
@@ -32,7 +32,7 @@ class Diff:
     def run(self) -> int:
         """Compare and print the differences."""
         from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.extensions.editing.diff import LEVELS, diff
+        from demorec.extensions.editing.diff import diff
 
         leave_pandas_out()
         a, b = dataset_at(self.a), dataset_at(self.b)
@@ -41,15 +41,15 @@ class Diff:
                 found = diff(a, b, progress=bar.set)
         except ExportError as error:  # its exit code would mean that the datasets differ
             raise ConfigError(str(error)) from error
+        count = len(found.differences)
         if self.json:
             say_json(found.to_json())
-            return 0 if found.is_same else 1
-        for level in LEVELS:
-            lines = [item.line for item in found.differences if item.level == level]
-            say(*lines[:MAX_SHOWN])
-            if len(lines) > MAX_SHOWN:
-                say(f"{level}: {len(lines) - MAX_SHOWN} more (--json)")
+            return int(count > 0)
+        lines = list(found.lines())
+        say(*lines[:MAX_SHOWN])
+        if count > MAX_SHOWN:
+            say(f"{count - MAX_SHOWN} more (--json)")
         say(*found.notes)
         episodes = f"{found.num_same} of {found.num_episodes[0]} and {found.num_episodes[1]} episodes are the same"
-        say(f"{'No difference' if found.is_same else counted(len(found.differences), 'difference')}: {episodes}.")
-        return 0 if found.is_same else 1
+        say(f"{counted(count, 'difference') if count else 'No difference'}: {episodes}.")
+        return int(count > 0)
