@@ -93,6 +93,7 @@ class World(Closing):
         self._iterations = scene.physics.solver_iterations
         self._bodies: dict[str, int] = {}
         self._specs: dict[str, Body] = {body.name: body for body in scene.bodies}
+        self._quats: dict[str, Array] = {}
         for body in scene.fixed:
             self._bodies[body.name] = add_body(self.client, body)
         self.arm = Arm(self.client, self.robot, scene.robot, finger_stiffness=scene.physics.finger_stiffness)
@@ -230,9 +231,17 @@ class World(Closing):
         return body_poses(self.client)
 
     def pose(self, name: str) -> Pose:
-        """Read `world_from_body` of a body of the scene."""
-        position, quat = self.client.getBasePositionAndOrientation(self._bodies[name])
-        centre = Pose(position=np.array(position), quat_xyzw=np.array(quat))
+        """Read `world_from_body` of a body of the scene.
+
+        Bullet derives the quaternion from a matrix, so its sign would change as the body turns past 180 degrees. It
+        keeps the sign of the last reading since the reset instead.
+        """
+        position, read = self.client.getBasePositionAndOrientation(self._bodies[name])
+        quat = np.array(read)
+        if name in self._quats and float(quat @ self._quats[name]) < 0:
+            quat = -quat
+        self._quats[name] = quat
+        centre = Pose(position=np.array(position), quat_xyzw=quat)
         inertial = self.inertial_poses[name]
         if inertial == Pose():
             return centre

@@ -259,6 +259,37 @@ def test_a_state_that_is_a_second_late_is_found_beside_a_resting_arm(sound: Evid
     assert messages == ["the state follows its action by 0.70 s or more"]
 
 
+@pytest.mark.parametrize("form", ["delta_{}", "{}.delta"])
+def test_a_late_increment_is_found_in_both_notations(sound: Evidence, form: str) -> None:
+    names = (*(form.format(name.removesuffix(".pos")) for name in NAMES[:4]), NAMES[4])
+    columns = {"observation.state": Column("float32", NAMES), "action": Column("float32", names)}
+
+    def incremental(each: EpisodeEvidence) -> EpisodeEvidence:
+        assert each.state is not None
+        assert each.action is not None
+        steps = np.diff(each.action[:, :4], axis=0, append=each.action[-1:, :4])
+        late = 4 if each.number == BAD else 0
+        return episode(each.number, each.state, np.column_stack([np.roll(steps, late, axis=0), each.action[:, 4]]))
+
+    episodes = [incremental(each) for each in sound.episodes]
+    diagnosis = diagnose(replace(sound, roles=find_roles(columns, NO_NAMES), episodes=episodes, cameras={}))
+    assert found(diagnosis, "action_lag") == {BAD}
+    assert "its action is 4" in next(each.message for each in diagnosis.findings if each.check == "action_lag")
+
+
+def test_a_gripper_with_one_wrong_reading_is_not_of_another_unit(sound: Evidence) -> None:
+    def spiking(state: Array, action: Array) -> tuple[Array, Array]:
+        state[70, 4] = 57.3 * state[:, 4].max()
+        return state, action
+
+    assert found(diagnose(spoilt(sound, spiking)), "unit_mismatch") == set()
+
+    def in_degrees(state: Array, action: Array) -> tuple[Array, Array]:
+        return state * (1, 1, 1, 1, 57.3), action * (1, 1, 1, 1, 57.3)
+
+    assert found(diagnose(spoilt(sound, in_degrees)), "unit_mismatch") == {BAD}
+
+
 def test_a_hand_of_numbered_joints_may_snap(sound: Evidence) -> None:
     names = (*NAMES[:3], "right_hand.joint_1.pos", "kRightHandIndex")
     roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", names)}, NO_NAMES)

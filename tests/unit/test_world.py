@@ -103,6 +103,20 @@ def test_a_body_with_an_offset_centre_of_mass_has_the_scenes_pose(world: World, 
     assert np.allclose(world.pose("duck").vector(), pose.vector(), atol=1e-9)
 
 
+def test_the_quaternion_of_a_turning_body_keeps_its_sign(world: World, scene: Scene) -> None:
+    world.reset(scene)
+    cube = body_index(world, "red_cube")
+    quats = []
+    for angle in np.arange(0.0, 4 * np.pi, 0.3):
+        world.client.resetBasePositionAndOrientation(
+            cube, [0.5, 0.0, 0.3], world.client.getQuaternionFromEuler([0.0, 0.0, angle])
+        )
+        quats.append(world.pose("red_cube").quat_xyzw)
+        assert abs(abs(quats[-1] @ [0, 0, np.sin(angle / 2), np.cos(angle / 2)]) - 1) < 1e-9
+    assert min(np.sum(np.array(quats[1:]) * quats[:-1], axis=1)) > 0.98
+    assert np.sum(np.array(quats[0]) * quats[21]) < 0  # a full turn changes the sign
+
+
 @pytest.mark.slow
 def test_parameters_of_another_client_do_not_leak() -> None:
     prepared = episode(1)

@@ -30,8 +30,8 @@ LOOK_OR_DROP = "look at it: demorec view {path} --episodes {episode}; then drop 
 """Advice for one unusual episode."""
 REPAIR = "demorec dataset repair {path} --out NEW"
 """Advice for tables, counts and statistics that contradict the rows."""
-_INCREMENT = "delta_"
-"""Prefix of an action's element that is the change of the state's element, as LeRobot names them."""
+_INCREMENT = re.compile(r"^delta_|\.delta$")
+"""Mark of an action's element that is the change of the state's element: LeRobot's prefix, demorec's suffix."""
 _HAND = re.compile(
     "thumb|pinky|knuckle|proximal|index_|middle_|ring_|little_|palm|hand.*(?:joint|index|middle)", re.IGNORECASE
 )
@@ -143,13 +143,13 @@ class Evidence:
 
     @cached_property
     def action_of(self) -> list[int | None]:
-        """Index in the action of each element of the state, "delta_x" for "x" too; None if missing."""
+        """Index in the action of each element of the state, for "x" also "delta_x" or "x.delta"; None if missing."""
         if not (self.roles.state and self.roles.action):
             return [None] * len(self.elements)
         increments = {
-            name.removeprefix(_INCREMENT): place
+            _INCREMENT.sub("", name): place
             for place, name in enumerate(self.action_elements)
-            if name.startswith(_INCREMENT)
+            if _INCREMENT.search(name)
         }
         matched = self.roles.in_state(self.roles.action)
         return [

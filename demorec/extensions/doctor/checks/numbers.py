@@ -32,6 +32,8 @@ UNIT_FACTORS: Mapping[str, float] = {
     "encoder ticks instead of degrees": 4096 / 360,
 }
 """Confusion of units -> factor of the values."""
+GRIPPER_QUANTILES = (0.02, 0.98)
+"""Quantiles that bound a gripper in an episode: a few wrong readings are a jump, not another unit."""
 MIN_JUMP_RANGE = 0.15
 """Minimum size of a jump, as a ratio of an element's range."""
 MIN_JUMP_STEPS = 6.0
@@ -105,8 +107,9 @@ def _gripper_units(evidence: Evidence) -> Iterator[Fault]:
     """Find episodes in which a gripper's values and range are both larger by a known confusion of units."""
     episodes = [each for each in evidence.need_state() if each[0].number not in evidence.once(other_units)]
     for element in np.flatnonzero(evidence.is_gripper).tolist() if len(episodes) > MIN_OTHERS else ():
-        sizes = np.array([np.abs(state[:, element]).max() for _, state in episodes])
-        spans = np.array([np.ptp(state[:, element]) for _, state in episodes])
+        bounds = np.array([np.quantile(state[:, element], GRIPPER_QUANTILES) for _, state in episodes])
+        sizes = np.abs(bounds).max(axis=1)
+        spans = np.ptp(bounds, axis=1)
         usual_size, usual_span = np.median(sizes), np.median(spans)
         for (episode, _), size, span in zip(episodes, sizes, spans, strict=True) if usual_span > 0 else ():
             ratio = float(span / usual_span)
