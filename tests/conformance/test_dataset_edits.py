@@ -5,14 +5,11 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-import av
 import numpy as np
 import pytest
-from av.video.stream import VideoStream
 from lerobot_datasets import DEPTH, write_by_lerobot
 from support.check import checked
 from support.commands import exit_code
@@ -25,31 +22,6 @@ pytestmark = [
 ]
 LENGTHS = [12 + number for number in range(6)]
 edit = partial(exit_code, "dataset")
-
-
-def reordered(root: Path) -> Path:
-    """A dataset with B-frames: images are stored in a different order than they are shown."""
-    write_with_lerobot(root)
-    (path,) = root.glob(f"videos/{TOP}/*/*.mp4")
-    with av.open(str(path)) as container:
-        images = [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
-    begins = np.cumsum([0, *LENGTHS])
-    with av.open(str(path), "w") as out:
-        # One group of pictures an episode, as libx264 chooses it, with up to three B-frames in a row.
-        stream = out.add_stream("libx264", rate=10, options={"g": "250", "bf": "3", "qp": "12", "b-adapt": "0"})
-        assert isinstance(stream, VideoStream)
-        stream.height, stream.width, stream.pix_fmt = 64, 96, "yuv420p"
-        for number, image in enumerate(images):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts = number
-            if number in begins:
-                frame.pict_type = av.video.frame.PictureType.I
-            out.mux(stream.encode(frame))
-        out.mux(stream.encode(None))
-    with av.open(str(path)) as container:
-        packets = [packet for packet in container.demux(video=0) if packet.size]
-    assert any(a.pts > b.pts for a, b in pairwise(packets))  # type: ignore[operator]
-    return root
 
 
 def in_small_files(root: Path) -> Path:
@@ -68,7 +40,6 @@ KINDS: dict[str, Callable[[Path], Path]] = {
     "video": write_with_lerobot,
     "images": partial(write_with_lerobot, video=False),
     "streaming": partial(write_with_lerobot, streaming_encoding=True),
-    "reordered": reordered,
     "small files": in_small_files,
     "all types": of_all_types,
 }
@@ -119,19 +90,6 @@ def test_kept_data_is_bit_exact(dataset: Path, tmp_path: Path) -> None:
             assert same(episode, before[number][first:last], but=("timestamp",)), (command, number)
             assert [float(item["timestamp"]) for item in episode] == pytest.approx(np.arange(last - first) / fps)
         statistics_are_exact(out)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("dataset", ["reordered", "small files", "all types"], indirect=True)
-def test_in_another_order_and_in_parts(dataset: Path, tmp_path: Path) -> None:
-    before = items(dataset)
-    assert edit("reorder", dataset, "--order", "5,0,3,1,4,2", "--out", tmp_path / "r") == 0
-    assert edit("split", tmp_path / "r", "--shares", "a=0.5", "b=0.5", "--out", tmp_path / "s") == 0
-    assert edit("merge", tmp_path / "s/a", tmp_path / "s/b", "--out", tmp_path / "m") == 0
-    assert edit("drop", tmp_path / "m", "--where", "num_frames == 14", "--out", tmp_path / "d") == 0
-    found = {len(episode): episode for episode in items(tmp_path / "d")}
-    assert sorted(found) == [12, 13, 15, 16, 17]
-    assert all(same(found[len(was)], was) for was in before if len(was) != 14)
 
 
 @pytest.mark.slow

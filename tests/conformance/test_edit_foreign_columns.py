@@ -22,7 +22,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 from support.commands import exit_code
-from support.drawn_datasets import STATE, DrawnDataset, encoded, write_drawn
+from support.drawn_datasets import PLAIN, STATE, DrawnDataset, encoded, write_drawn
 from support.export import recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
@@ -183,13 +183,6 @@ def test_images_as_plain_bytes_are_read(kind: Any, tmp_path: Path) -> None:
         images.append(file.getvalue())
     source = foreign(tmp_path / "set", {"observation.images.top": pa.array(images, kind)})
     assert exit_code("view", source, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
-
-
-PLAIN = DrawnDataset(
-    version="v2.1", lengths=(5, 6), names="list", stored="float32", claimed="float32", is_variable=True, clock="grid",
-    time_type="float32", camera="h264", gop=3, is_fragmented=False, reference="", missing=(), num_files=1, extra=(),
-    has_unlisted=False,
-)  # fmt: skip
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,10 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
-from conformance.test_import_v21 import write_v21
 from support.check import change_table, checked, edit_json, edit_parquet
 from support.commands import exit_code
 from support.datasets import TOP, items, same, write_with_lerobot
+from support.drawn_datasets import write_v21
 from support.export import content_of
 
 pytestmark = [

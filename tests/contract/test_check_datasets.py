@@ -267,14 +267,6 @@ def test_a_sidecar_of_other_episodes(dataset: Path) -> None:
     )
 
 
-def test_an_episode_twice(run: Path, tmp_path: Path) -> None:
-    spoilt = copy(run, tmp_path / "run")
-    shutil.rmtree(spoilt / "dataset")
-    shutil.copy(spoilt / "episodes/episode_000001.mcap", spoilt / "episodes/episode_000009.mcap")
-    export_lerobot([spoilt], tmp_path / "ds", ExportOptions(verify=False))
-    assert verdict_of(tmp_path / "ds", "copied_episodes", "dataset") == "broken"
-
-
 def test_statistics_of_row_numbers_are_not_judged(dataset: Path) -> None:
     """LeRobot's delete and split renumber rows but keep the statistics of the old numbers."""
 

@@ -226,14 +226,6 @@ def test_a_recovered_recording_is_a_warning(share: float, good: Path, tmp_path: 
 # ------------------------------------------------------------------------------------------------- images
 
 
-@pytest.mark.slow
-def test_a_frozen_camera(filmed: Path, tmp_path: Path) -> None:
-    spoilt = Spoilt(filmed)
-    front = [images["front"].color for images in spoilt.images]
-    spoilt.image("front", lambda t, p: front[40] if 40 < t < 90 else p)
-    assert findings(spoilt.write(tmp_path / "spoilt.mcap")) == [("frozen_images", "broken")]
-
-
 def test_a_lost_packet(filmed: Path, tmp_path: Path) -> None:
     spoilt = rewrite_messages(filmed, tmp_path / "s.mcap", dropped(channels.video_topic("front", "h264"), 2 * SECOND))
     assert verdict_of(spoilt, "video_frames") == "broken"

@@ -23,11 +23,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
-from conformance.test_import_v21 import write_v21
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags, hdf5
 from support.check import edit_json
 from support.commands import ON_A_PATH, ON_EVERYTHING, exit_code
+from support.drawn_datasets import write_v21
 from support.export import export, make_run, without_verification
 from support.external import TOP, make_external, write_external
 from support.foreign_dataset import write_foreign

@@ -100,6 +100,13 @@ DRAWN = st.builds(
 )
 
 
+PLAIN = DrawnDataset(
+    version="v2.1", lengths=(5, 6), names="list", stored="float32", claimed="float32", is_variable=True, clock="grid",
+    time_type="float32", camera="h264", gop=3, is_fragmented=False, reference="", missing=(), num_files=1, extra=(),
+    has_unlisted=False,
+)  # fmt: skip
+
+
 def write_drawn(root: Path, drawn: DrawnDataset, seed: int = 0) -> Path:
     """Write the dataset; the first number of a row's state is unique among all datasets of a seed."""
     random = np.random.default_rng(seed)
@@ -247,6 +254,27 @@ def encoded(codec: str, length: int, gop: int, is_fragmented: bool, pixels: str 
             out.mux(stream.encode(frame))
         out.mux(stream.encode(None))
     return file.getvalue()
+
+
+def write_v21(root: Path) -> Path:
+    """Write two episodes of 5 and 6 frames in the format v2.1, with their statistics."""
+    write_drawn(root, replace(PLAIN, gop=1))  # images that an import keeps
+    lines = []
+    for number, length in enumerate(PLAIN.lengths):
+        table = pq.read_table(root / f"data/chunk-000/episode_{number:06d}.parquet")
+        stats: dict[str, Any] = {}
+        for name in table.column_names:
+            rows = np.array(table[name].to_pylist(), np.float64).reshape(length, -1)
+            moments = {"min": rows.min(0), "max": rows.max(0), "mean": rows.mean(0), "std": rows.std(0)}
+            stats[name] = {**{key: row.tolist() for key, row in moments.items()}, "count": [length]}
+        stats[TOP] = {**{key: [[[0.5]]] * 3 for key in ("min", "max", "mean", "std")}, "count": [length]}
+        lines.append(json.dumps({"episode_index": number, "stats": stats}) + "\n")
+    (root / "meta/episodes_stats.jsonl").write_text("".join(lines))
+    tasks = (root / "meta/tasks.jsonl").read_text().splitlines(keepends=True)
+    (root / "meta/tasks.jsonl").write_text("".join(tasks[: len(PLAIN.lengths)]))  # those in use
+    info = root / "meta/info.json"
+    info.write_text(info.read_text().replace(f'"total_tasks": {len(TASKS)}', '"total_tasks": 2'))
+    return root
 
 
 def like(drawn: DrawnDataset) -> DrawnDataset:

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from support.check import flip_bits
 from support.commands import exit_code
-from support.export import export, make_run
+from support.export import make_run
 from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
@@ -35,18 +35,6 @@ def test_a_flipped_bit_is_one_finding(damaged: Path, capsys: pytest.CaptureFixtu
     assert "inf" not in text
     report = check_subject(Subject(path=damaged, kind="recording"), CheckOptions())
     assert [finding.check for finding in report.findings] == ["checksums"]
-
-
-def test_faults_of_a_dataset_are_described_without_pythons_messages(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    recording = write_episode(tmp_path / "e.mcap", num_frames=10, cameras=())
-    export([recording], tmp_path / "d")
-    (tmp_path / "d" / "meta" / "stats.json").unlink()
-    code, text = check(tmp_path / "d", capsys, "--no-images")
-    assert code == 1
-    (line,) = (line for line in text.splitlines() if "missing_statistics" in line)
-    assert line.strip() == "broken  missing_statistics  meta/stats.json is missing"
 
 
 def test_damaged_parts_are_listed_and_good_ones_are_not(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:

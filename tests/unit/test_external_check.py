@@ -10,11 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import checked, verdict_of
+from support.check import checked
 from support.commands import exit_code
 from support.external import FORCE, TOP, Episode, make_external, write_external
 
-from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.episode.episode import Sample, SampledFrame
 from demorec.runs.external import episode_path, open_external_run
 
@@ -171,22 +170,3 @@ def test_a_run_is_recognised_and_checked(external_run: Path, capsys: pytest.Capt
     assert (plain["kind"], plain["frames"], plain["robot"]) == ("external recording", 20, "two_joints")
     code, told = run(capsys, "info", external_run / "episodes")
     assert (code, told.count("(external)")) == (0, 2)
-
-
-def test_a_run_of_other_files_is_a_failure(external_run: Path, tmp_path: Path) -> None:
-    (tmp_path / "episodes").mkdir()
-    (tmp_path / "run.json").write_bytes((external_run / "run.json").read_bytes())
-    write_external(tmp_path / "episodes" / "episode_000001.mcap", steady(num_frames=9, episode_index=1))
-    report = check_subject(Subject(path=tmp_path, kind="run"), CheckOptions())
-    told = next(result for result in report.results if result.check == "run_files")
-    assert (told.verdict, told.findings[0].value) == ("broken", "2")
-    assert "episode_000000.mcap is missing" in told.message
-
-
-def test_an_episode_twice_in_a_run(tmp_path: Path) -> None:
-    with open_external_run(tmp_path / "run") as opened:
-        for index in range(2):
-            episode = steady(num_frames=20)
-            episode = replace(episode, info=replace(episode.info, episode_index=index))
-            opened.add(write_external(episode_path(opened.path, index), episode))
-    assert verdict_of(tmp_path / "run", "copied_episodes", "run") == "broken"

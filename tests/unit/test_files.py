@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from demorec.core.files import open_regular, read_json_limited, read_text_limited
+from demorec.core.files import open_regular, read_text_limited
 
 
 def open_files() -> list[int]:
@@ -32,17 +32,3 @@ def test_a_file_beyond_the_limit_is_refused_whatever_its_size_claims(tmp_path: P
     assert read_text_limited(tmp_path / "file", 5) == "12345"
     with pytest.raises(OSError, match="larger than 4 bytes"):
         read_text_limited(tmp_path / "file", 4)
-
-
-@pytest.mark.parametrize("text", ["[" * 100_000, '{"a":' * 100_000, '[{"a":' * 5000 + "1" + "}]" * 5000])
-def test_json_nested_deeply_is_an_ordinary_error(tmp_path: Path, text: str) -> None:
-    (tmp_path / "file").write_text(text)
-    with pytest.raises(ValueError, match="nested too deeply"):
-        read_json_limited(tmp_path / "file")
-
-
-@pytest.mark.parametrize("data", [b"", b"\xff", b"{", b"1" * 5000])
-def test_invalid_json_is_an_ordinary_error(tmp_path: Path, data: bytes) -> None:
-    (tmp_path / "file").write_bytes(data)
-    with pytest.raises(ValueError):
-        read_json_limited(tmp_path / "file")

@@ -180,6 +180,14 @@ BAD: dict[str, tuple[Act, str]] = {
     "tuple": (lambda e: e.write([0.0, 1.0], images={"top": (PIXELS,)}), "must be .pixels, stamp in ns"),
     "still": (lambda e: e.write([0.0, 1.0], time_ns=1_000_000_000), "stamps must not repeat"),
     "stamp": (lambda e: e.write([0.0, 1.0], stamps={"acton": 5}), "unknown feature 'acton'"),
+    "nan": (lambda e: e.write([0.0, np.nan]), "is nan in its element 'b'"),
+    "negative time": (lambda e: e.write([0.0, 1.0], time_ns=-1), "the range is 0 to"),
+    "float time": (lambda e: e.write([0.0, 1.0], time_ns=1.5), "must be a whole number of nanoseconds"),
+    "feature goes back": (lambda e: e.write([0.0, 1.0], stamps={"observation.state": 5}), "the stamp 5 ns"),
+    "size": (lambda e: e.write([0.0, 1.0], images={"top": PIXELS[:-1]}), r"uint8 of shape \(47, 64, 3\), it must be"),
+    "float image": (lambda e: e.write([0.0, 1.0], images={"top": PIXELS / 255}), "is float64 of shape"),
+    "bytes": (lambda e: e.write([0.0, 1.0], images={"top": b"x"}), "is bytes, it must be uint8"),
+    "image goes back": (lambda e: e.write([0.0, 1.0], images={"top": (PIXELS, 5)}), "has the stamp 5 ns, the one"),
     "after the end": (lambda e: (e.finish(), e.write([0.0, 1.0])), "The episode has ended"),
 }  # fmt: skip
 

@@ -156,15 +156,3 @@ def test_an_external_recording_works_in_notebooks(tmp_path: Path) -> None:
             next(iter(recording))
     with pytest.raises(RecordingError, match=f"needs the scene of an episode that demorec simulated.*: {tmp_path}"):
         open_simulated(tmp_path / "episode.mcap")
-
-
-def test_a_simulated_recording_lists_the_image_of_each_frame(path: Path) -> None:
-    with open_simulated(path) as recording:
-        table, info = recording.table(), recording.info
-        for camera in info.cameras:
-            assert table.images[camera.name].tolist() == list(range(NUM_FRAMES))
-            assert not table.image_age_ns(camera.name).any()
-        assert [camera.name for camera in info.cameras] == list(recording.cameras)
-        assert np.array_equal(
-            np.reshape(present(info.cameras[0].intrinsics), (3, 3)), info.simulated.scene.cameras[0].intrinsics
-        )
