@@ -108,6 +108,10 @@ NUMBERS: dict[str, tuple[Change, str]] = {
     "an action two frames late": (lambda s, a: (s, np.vstack([a[:1], a[:1], a[:-2]])), "action_lag"),
     "an action that is the state": (lambda s, a: (s, s.copy()), "action_equals_state"),
     "exchanged actions": (lambda s, a: (s, a[:, [1, 0, 2, 3, 4]]), "swapped_elements"),
+    "a gripper's action ten frames late": (
+        lambda s, a: (s, np.column_stack([a[:, :4], np.repeat(a[:1, 4], 10).tolist() + a[:-10, 4].tolist()])),
+        "gripper_action",
+    ),
     "an inverted gripper": (lambda s, a: (s, np.column_stack([a[:, :4], 40 - a[:, 4]])), "gripper_action"),
     "a frozen elbow": (frozen_elbow, "frozen_state"),
     "a jump": (jumping, "state_jumps"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -19,6 +19,10 @@ MIN_SHIFT = 0.7
 """Minimum difference, frames, of an episode's lag: frames are lost or doubled as a whole, not in part."""
 MIN_GAIN = 0.7
 """Minimum natural logarithm of the factor by which an episode's own lag reduces the unexplained variance: two."""
+MIN_GRIPPER_SHIFT = 4.0
+"""Minimum difference, frames, of the lag of a gripper, which moves seldom and may be held open by an object."""
+MIN_GRIPPER_GAIN = 1.4
+"""As MIN_GAIN, for a gripper: a factor of four."""
 MIN_LEAD = 0.25
 """Minimum lead, frames, of the state over its action that indicates misalignment: a command is never late."""
 MAX_LAG_S = 0.35
@@ -224,7 +228,7 @@ def _swaps(matrix: Array) -> list[tuple[int, int]]:
 @check(
     family="alignment",
     needs="gripper, action",
-    measures="grippers that ignore or invert their action",
+    measures="grippers that ignore, invert, lead or lag their action",
     unit="correlation",
     why="A policy learns to open the hand when it must close it, or that commands have no effect.",
     do=DROP,
@@ -248,6 +252,7 @@ def gripper_action(evidence: Evidence) -> Iterator[Fault]:
 
 def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[Fault]:
     followed: dict[int, float] = {}
+    lags: dict[int, tuple[int, Array]] = {}
     ignored: dict[int, float] = {}
     commanded = usual([np.ptp(e.action[:, column]) for e, _ in evidence.with_state() if e.action is not None])[0]
     for episode, state in evidence.with_state(10):
@@ -259,7 +264,11 @@ def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[F
         if np.ptp(opening) < 0.02 * evidence.ranges[element] or np.ptp(opening) == 0:
             ignored[episode.number] = float(np.ptp(command))
         else:
-            followed[episode.number] = _best_correlation(opening, command, max(3, round(0.7 * evidence.fps)))
+            reach = max(3, round(0.7 * evidence.fps))
+            followed[episode.number] = _best_correlation(opening, command, reach)
+            if len(opening) > 3 * reach:
+                curve = np.abs(lagged_correlations(opening[:, None], command[:, None], -reach, reach)[:, 0])
+                lags[episode.number] = int(np.argmax(curve)) - reach, curve
     name = evidence.elements[element]
     if ignored and not followed:
         yield Fault(
@@ -291,6 +300,28 @@ def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[F
                 value=f"{correlation:+.2f}",
                 message=f"{name} moves against its action (correlation {correlation:+.2f}, usual "
                 f"{usual_correlation:+.2f})",
+            )
+    yield from _gripper_lags(name, lags)
+
+
+def _gripper_lags(name: str, lags: Mapping[int, tuple[int, Array]]) -> Iterator[Fault]:
+    """Find episodes in which a gripper follows its action much earlier or later than in the others."""
+    if len(lags) <= MIN_OTHERS:
+        return
+    usual_lag, spread = usual([lag for lag, _ in lags.values()], floor=0.5)
+    for number, (lag, curve) in lags.items():
+        shift = lag - usual_lag
+        if abs(shift) < max(MIN_GRIPPER_SHIFT, 6 * spread):
+            continue
+        unexplained = 1 - np.minimum(curve, 1 - 1e-9) ** 2
+        usual_place = round(len(curve) // 2 + usual_lag)
+        if np.log(unexplained[usual_place] / unexplained.min()) > MIN_GRIPPER_GAIN:
+            yield Fault(
+                severity="broken",
+                episode=number,
+                value=f"{shift:+.0f} frames",
+                message=f"the action of {name} is {abs(shift):.0f} frames {'late' if shift < 0 else 'early'}: the "
+                f"gripper follows it by {lag:+d} frames (others: {usual_lag:+.0f})",
             )
 
 
