@@ -9,13 +9,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from demorec.cli.shared import role_lines
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
 from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
 from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.core.extensions import reader_rows
 from demorec.datasets.lerobot.paths import INFO_PATH
+from demorec.episode.element_names import is_numbered
 from demorec.episode.features import IMAGE_PREFIX
 from demorec.episode.simulated import simulation_facts
 from demorec.runs.find import Found, expect, find
@@ -26,8 +26,12 @@ if TYPE_CHECKING:
     from demorec.episode.roles import NamedRoles, Roles
     from demorec.runs.run_file import RunFile
 
+Described = tuple[dict[str, Any], list[str]]
+"""Plain data for --json, and lines for the terminal."""
 _MOST_PROBLEMS = 5
-"""Maximum problems of a dataset that are listed one by one."""
+_MOST_ELEMENTS = 4
+"""Maximum problems of a dataset, and names of a vector's elements, that are listed one by one."""
+_NO_ROLE = "no role"
 _SUCCESS_WORDS = {None: "unknown", True: "success", False: "failure"}
 
 
@@ -54,29 +58,25 @@ class Info:
         described = {} if self.mapping is not None or named else _described(self.paths)
         others = [path for path in self.paths if path not in described]
         with reading(others, self.mapping) as read:
-            places = dict(zip(others, read, strict=True))
-            self._show([_describe(places[path], named) if path in places else described[path] for path in self.paths])
+            described |= {path: _describe(place, named) for path, place in zip(others, read, strict=True)}
+            found = [described[path] for path in self.paths]
+            if self.json:
+                plain = [item for item, _ in found]
+                say_json(plain[0] if len(plain) == 1 else plain)
+            else:
+                for number, (_, lines) in enumerate(found):
+                    say(*([""] if number else []), *lines)
         return 0
 
-    def _show(self, found: Sequence[tuple[dict[str, Any], list[str]]]) -> None:
-        if self.json:
-            plain = [item for item, _ in found]
-            say_json(plain[0] if len(plain) == 1 else plain)
-        else:
-            for number, (_, lines) in enumerate(found):
-                say(*([""] if number else []), *lines)
 
-
-def _described(paths: Sequence[Path]) -> dict[Path, tuple[dict[str, Any], list[str]]]:
+def _described(paths: Sequence[Path]) -> dict[Path, Described]:
     """Describe foreign files that need no import for it."""
-    forms = reader_rows()
-    kinds = {path: find(path).kind for path in paths}
-    hooks = {path: forms[kind].describer for path, kind in kinds.items() if kind in forms}
-    return {path: pkgutil.resolve_name(hook)(path) for path, hook in hooks.items() if hook}
+    rows = reader_rows()
+    found = {path: rows.get(find(path).kind) for path in paths}
+    return {path: pkgutil.resolve_name(row.describer)(path) for path, row in found.items() if row and row.describer}
 
 
-def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
-    """Plain data for --json, and lines for the terminal."""
+def _describe(path: Path, named: NamedRoles) -> Described:
     found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
     describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
     if describe is None and named:
@@ -88,7 +88,7 @@ def _describe(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]
     return plain, lines
 
 
-def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
+def _recording(path: Path, named: NamedRoles) -> Described:
     from demorec.mcap.summary import summarize
 
     plain = summarize(path, named)
@@ -100,20 +100,23 @@ def _recording(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]
         ("recording", f"{path} ({size_in_words(plain['bytes'])}, {form})"),
         ("instruction", plain["instruction"]),
         ("episode", _episode(plain)),
-        ("outcome", _outcome(plain)),
+        ("outcome", "unknown: recovered after a crash" if plain["is_recovered"] else _outcome_of(plain)),
         ("length", f"{plain['frames']} frames, {plain['seconds']:.2f} s{rate}"),
         ("robot", plain["robot"] + (" (URDF known)" if plain["has_urdf"] else "")),
     ]
     if plain["task"] is not None:
         facts.append(("objects", ", ".join(plain["objects"]) or "none"))
     if origin := plain["origin"]:
-        facts.append(("origin", origin if isinstance(origin, str) else _origin(origin)))
-    facts += role_lines.recording_features(plain["features"])
+        is_text = isinstance(origin, str)
+        facts.append(
+            ("origin", origin if is_text else " ".join([origin["kind"], *(f["name"] for f in origin["files"])]))
+        )
+    facts += _recording_features(plain["features"])
     facts += [(f"camera {camera['name']}", ", ".join(_camera(camera))) for camera in plain["cameras"]]
     facts += [(f"dropped {what}", str(count)) for what, count in plain["drops"].items()]
     for check in plain["checks"]:
-        verdict = "passed" if check["passed"] else "FAILED"
         value = f"{check['value']:.4g} {check['unit']}".rstrip()
+        verdict = "passed" if check["passed"] else "FAILED"
         facts.append((f"check {check['name']}", f"{verdict}: {value} (limit {check['limit']:.4g})"))
     facts.append(("digest", plain["digest"][:16]))
     versions = ", ".join(f"{name} {version}" for name, version in plain["versions"].items())
@@ -129,20 +132,13 @@ def _episode(plain: Mapping[str, Any]) -> str:
     return f"{plain['task']}, seed {plain['root_seed']}, episode {plain['episode_index']}{attempt}"
 
 
-def _outcome(plain: Mapping[str, Any]) -> str:
-    reason = plain["failure_reason"]
-    if plain["is_recovered"]:
-        return "unknown: recovered after a crash"
-    if plain["task"] is None:
-        return _SUCCESS_WORDS[plain["success"]] + (f": {reason}" if reason else "")
-    retries = f" after {plain['retries']} retries" if plain["retries"] else ""
-    if plain["success"]:
-        return f"success{retries}"
-    return f"failure in phase {plain['failure_phase'] or 'unknown'}: {reason or 'unknown'}{retries}"
+def _outcome_of(plain: Mapping[str, Any]) -> str:
+    words = _outcome(plain["success"], plain.get("failure_phase") or "", plain["failure_reason"])
+    return words + (f" after {plain['retries']} retries" if plain.get("retries") else "")
 
 
-def _origin(origin: Mapping[str, Any]) -> str:
-    return " ".join([origin["kind"], *(file["name"] for file in origin["files"])])
+def _outcome(success: bool | None, phase: str = "", reason: str = "") -> str:
+    return _SUCCESS_WORDS[success] + (f" in phase {phase}" if phase else "") + (f": {reason}" if reason else "")
 
 
 def _camera(camera: Mapping[str, Any]) -> Iterator[str]:
@@ -161,96 +157,136 @@ def _camera(camera: Mapping[str, Any]) -> Iterator[str]:
         yield camera["source"]
 
 
-def _run(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
+def _recording_features(features: Sequence[Mapping[str, Any]]) -> Iterator[tuple[str, str]]:
+    """Known properties of each feature; features without a role come first."""
+    roles = {feature["role"] for feature in features}
+    yield from ((role, _not_found(role)) for role in ("state", "action") if role not in roles)
+    for feature in sorted(features, key=lambda feature: feature["role"] is not None):
+        names = _elements_in_words(feature["elements"])
+        words = [
+            feature["role"] or _NO_ROLE,
+            f"{len(feature['elements'])} {feature['dtype']}{f' ({names})' if names else ''}",
+            ", ".join(dict.fromkeys(filter(None, feature["units"]))) or "units unknown",
+            f"at most {1000 * feature['oldest']:.3g} ms old",
+            feature["source"],
+        ]
+        yield f"feature {feature['name']}", ", ".join(filter(None, words))
+
+
+def _not_found(role: str) -> str:
+    return f"not found: --{role} FEATURE names it"
+
+
+def _elements_in_words(names: Sequence[str]) -> str:
+    """Names of a vector's elements in one line; only the first and the last if there are many."""
+    if is_numbered(names):
+        return "unnamed" if len(names) > 1 else ""
+    return ", ".join(names) if len(names) <= _MOST_ELEMENTS else f"{names[0]} .. {names[-1]}"
+
+
+def _run(path: Path, named: NamedRoles) -> Described:
+    from demorec.episode.roles import SIMULATED_ROLES
     from demorec.runs.run_file import load_any_run_file
 
     run = load_any_run_file(path)
-    known = {"path": str(path), "complete": run.is_complete, "digest": run.digest}
-    if run.generation is None:
-        left_out = dropped_by_import(path)
-        roles = role_lines.roles_of_run(path, run, named)
-        plain = {"kind": "external run", **known, **run.plain()}
-        plain |= {"roles": None if roles is None else role_lines.roles_as_plain(roles), "left_out": left_out}
-        lines = _external_run_lines(path, run, roles)
-        if left_out:
-            rows = ((row["bag"], row["what"], row["reason"]) for row in left_out)
-            lines += ["", *aligned([("left out of", "what", "reason"), *rows])]
-        return plain, lines
-    if named:
-        from demorec.episode.roles import SIMULATED_ROLES
-
+    is_external = run.generation is None
+    if named and not is_external:
         raise ConfigError(SIMULATED_ROLES)
-    return {"kind": "run", **known, "config_digest": run.config_digest, **run.plain()}, _run_lines(path, run)
-
-
-def _run_lines(path: Path, run: RunFile) -> list[str]:
-    config = run.config
-    frames = sum(attempt.num_frames for attempt in run.attempts)
-    cameras = f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
-    failed = f", {counted(len(run.failures), 'failed attempt')}" if run.failures else ""
+    plain: dict[str, Any] = {"kind": "external run" if is_external else "run", "path": str(path), **run.plain()}
+    plain |= {"complete": run.is_complete, "digest": run.digest}
+    left_out: list[dict[str, Any]] = []
+    if is_external:
+        roles, left_out = _roles_of_run(path, run, named), dropped_by_import(path)
+        plain |= {"roles": _plain_roles(roles), "left_out": left_out}
+        content = _external_facts(run, roles)
+    else:
+        plain["config_digest"] = run.config_digest
+        content = _generated_facts(path, run)
+    state = f"{'external, ' if is_external else ''}{'complete' if run.is_complete else 'unfinished'}"
+    frames, fps = sum(attempt.num_frames for attempt in run.attempts), run.fps or run.config.fps
     facts = [
-        ("run", f"{path} ({'complete' if run.is_complete else 'unfinished'})"),
-        ("task", f"{config.task} with {config.robot}, seed {config.seed}"),
-        ("episodes", f"{len(run.successes)} of {run.num_episodes}{failed}"),
-        ("frames", f"{frames} ({frames / config.fps:.1f} s at {config.fps} Hz)"),
+        ("run", f"{path} ({state})"),
+        ("frames", f"{frames} ({frames / fps:.1f} s at {fps} Hz)"),
         ("size", size_in_words(sum(attempt.num_bytes for attempt in run.attempts))),
-        ("cameras", cameras if config.cameras else "none"),
+        *content,
         ("digest", run.digest),
     ]
+    rows = [("episode", "attempt", "outcome", "frames", "size", "file", "task" if is_external else "")]
+    for line in run.attempts:
+        outcome, size = _outcome(line.success, line.phase, line.reason), size_in_words(line.num_bytes)
+        numbers = str(line.episode_index), str(line.attempt), outcome, str(line.num_frames)
+        rows.append((*numbers, size, line.file or "(no scene)", line.instruction))
+    lines = [*aligned(facts), "", *aligned(rows)]
+    if left_out:
+        named_parts = ((row["bag"], row["what"], row["reason"]) for row in left_out)
+        lines += ["", *aligned([("left out of", "what", "reason"), *named_parts])]
+    return plain, lines
+
+
+def _generated_facts(path: Path, run: RunFile) -> Iterator[tuple[str, str]]:
+    config = run.config
+    yield "task", f"{config.task} with {config.robot}, seed {config.seed}"
+    failed = f", {counted(len(run.failures), 'failed attempt')}" if run.failures else ""
+    yield "episodes", f"{len(run.successes)} of {run.num_episodes}{failed}"
+    cameras = f"{', '.join(config.cameras)} at {config.width}x{config.height}, {config.video.codec}"
+    yield "cameras", cameras if config.cameras else "none"
     if run.beyond:
-        facts.append(("beyond these", f"{len(run.beyond)} attempts at later episodes, requested earlier"))
+        yield "beyond these", f"{len(run.beyond)} attempts at later episodes, requested earlier"
     if run.export is not None:
-        facts.append(("dataset", f"{path / 'dataset'} ({run.export.repo_id})"))
-    rows = [("episode", "attempt", "outcome", "frames", "size", "file")]
-    rows += [
-        (
-            str(attempt.episode_index),
-            str(attempt.attempt),
-            "success" if attempt.success else f"{attempt.phase}: {attempt.reason}",
-            str(attempt.num_frames),
-            size_in_words(attempt.num_bytes),
-            attempt.file or "(no scene)",
-        )
-        for attempt in run.attempts
-    ]
-    return [*aligned(facts), "", *aligned(rows)]
+        yield "dataset", f"{path / 'dataset'} ({run.export.repo_id})"
 
 
-def _external_run_lines(path: Path, run: RunFile, roles: Roles | None) -> list[str]:
-    """Lines about an external run."""
-    frames = sum(line.num_frames for line in run.attempts)
+def _external_facts(run: RunFile, roles: Roles | None) -> Iterator[tuple[str, str]]:
+    yield "robot", run.robot
     counts = {word: sum(line.success is success for line in run.attempts) for success, word in _SUCCESS_WORDS.items()}
     parts = ", ".join(f"{count} {word}" for word, count in counts.items() if count)
-    facts = [
-        ("run", f"{path} (external, {'complete' if run.is_complete else 'unfinished'})"),
-        ("robot", run.robot),
-        ("episodes", f"{len(run.attempts)}{f' ({parts})' if parts else ''}"),
-        ("frames", f"{frames} ({frames / run.fps:.1f} s at {run.fps} Hz)"),
-        ("size", size_in_words(sum(line.num_bytes for line in run.attempts))),
-        *(() if roles is None else role_lines.role_facts(roles)),
-        ("digest", run.digest),
-    ]
+    yield "episodes", f"{len(run.attempts)}{f' ({parts})' if parts else ''}"
+    yield from _role_facts(roles)
     if run.unfinished:
-        facts.append(("missing", f"{counted(run.num_missing, 'item')}: {run.unfinished}."))
-    rows = [("episode", "outcome", "frames", "size", "file", "task")]
-    rows += [
-        (
-            str(line.episode_index),
-            _SUCCESS_WORDS[line.success] + (f": {line.reason}" if line.reason else ""),
-            str(line.num_frames),
-            size_in_words(line.num_bytes),
-            line.file,
-            line.instruction,
-        )
-        for line in run.attempts
-    ]
-    return [*aligned(facts), "", *aligned(rows)]
+        yield "missing", f"{counted(run.num_missing, 'item')}: {run.unfinished}."
 
 
-def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
+def _roles_of_run(path: Path, run: RunFile, named: NamedRoles) -> Roles | None:
+    """Roles of an external run, whose recordings share their features; None if no recording is readable."""
+    from demorec.episode.roles import roles_of_recording
+    from demorec.mcap import open_recording
+
+    for attempt in run.attempts:
+        with suppress(RecordingError), open_recording(path / attempt.file) as recording:
+            return roles_of_recording(recording.info, named)
+    return None
+
+
+def _plain_roles(roles: Roles | None) -> dict[str, Any] | None:
+    if roles is None:
+        return None
+    state, action = list(roles.state), list(roles.action)
+    return {"of": dict(roles.of), "state": state, "action": action, "grippers": _grippers(roles)}
+
+
+def _role_facts(roles: Roles | None) -> Iterator[tuple[str, str]]:
+    """(name, value) of the features without a role, state, action and grippers."""
+    if roles is None:
+        return
+    if roles.unknown:
+        yield _NO_ROLE, ", ".join(roles.unknown)
+    for role, parts in (("state", roles.state), ("action", roles.action)):
+        count = len(roles.elements(parts))
+        yield role, f"{', '.join(parts)} ({count} elements)" if parts else _not_found(role)
+    yield "gripper", ", ".join(_grippers(roles)) or "not found: --gripper NAME names it"
+
+
+def _grippers(roles: Roles) -> list[str]:
+    """Names of the state's elements that are grippers."""
+    elements = zip(roles.elements(roles.state), roles.grippers().tolist(), strict=True)
+    return [name for name, is_gripper in elements if is_gripper]
+
+
+def _dataset(path: Path, named: NamedRoles) -> Described:
     from demorec.datasets.lerobot.files import read_json
 
     file = path / INFO_PATH
+    roles = None
     try:
         info: dict[str, Any] = read_json(file)
         facts = [
@@ -262,21 +298,15 @@ def _dataset(path: Path, named: NamedRoles) -> tuple[dict[str, Any], list[str]]:
             ("size", size_in_words(sum(part.stat().st_size for part in path.rglob("*") if part.is_file()))),
         ]
         folder, more, problems = _dataset_content(path, named)
-        roles = None
         with suppress(ExportError):  # one of the problems
             roles = None if folder is None else folder.roles
-        facts += [
-            *([] if roles is None else role_lines.role_facts(roles)),
-            *more,
-            *(("problem", problem) for problem in problems[:_MOST_PROBLEMS]),
-        ]
+        facts += [*_role_facts(roles), *more, *(("problem", problem) for problem in problems[:_MOST_PROBLEMS])]
         if len(problems) > _MOST_PROBLEMS:
             facts.append(("problems", f"{len(problems)} in all; demorec check reports more"))
-        rows = role_lines.feature_rows(None if roles is None else folder, info)
+        rows = _feature_rows(None if roles is None else folder, info)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ArithmeticError) as error:
         raise RecordingError(f"The dataset's info.json is damaged ({describe_error(error)}): {file}") from error
-    plain: dict[str, Any] = {"kind": "dataset", "path": str(path), "info": info, "problems": problems}
-    plain["roles"] = None if roles is None else role_lines.roles_as_plain(roles)
+    plain = {"kind": "dataset", "path": str(path), "info": info, "problems": problems, "roles": _plain_roles(roles)}
     return plain, [*aligned(facts), "", *aligned(rows)]
 
 
@@ -312,30 +342,47 @@ def _dataset_content(path: Path, named: NamedRoles) -> tuple[LeRobotFolder | Non
     return folder, facts, problems
 
 
-def _folder(found: Found) -> tuple[dict[str, Any], list[str]]:
+def _feature_rows(folder: LeRobotFolder | None, info: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """A row for each feature of a dataset, after a header: features without a role first, counters last.
+
+    Args:
+        folder: The open dataset; None if info.json cannot be interpreted.
+        info: Content of info.json, unchecked.
+    """
+    types = {name: (str(item["dtype"]), "x".join(map(str, item["shape"]))) for name, item in info["features"].items()}
+    if folder is None:
+        return [("feature", "dtype", "shape"), *((name, *kind) for name, kind in types.items())]
+    from demorec.datasets.lerobot.inspect import known_units
+    from demorec.episode.roles import ROLES
+
+    units: Mapping[str, tuple[str, ...]] = {}
+    with suppress(ExportError):  # demorec check reports it
+        units = known_units(folder)
+    roles = folder.roles
+    order = [None, *(role for role in ROLES if role is not None)]
+    rows = [("role", "feature", "dtype", "shape", "elements", "units")]
+    for name in sorted(roles.of, key=lambda name: order.index(roles.of[name])):
+        column, role = roles.columns[name], roles.of[name]
+        unknown = "unknown" if column.is_vector and role != "label" else ""
+        unit = ", ".join(dict.fromkeys(filter(None, units.get(name, ())))) or unknown
+        rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements), unit))
+    return rows + [("", name, *kind, "", "") for name, kind in types.items() if name not in roles.of]
+
+
+def _folder(found: Found) -> Described:
     from demorec.mcap import open_recording
 
-    path, recordings = found.path, (*found.recordings, *found.failed)
     rows = [("file", "task", "seed", "episode", "outcome", "frames", "size")]
     items = []
-    for file in recordings:
+    for file in (*found.recordings, *found.failed):
         with open_recording(file) as recording:
             info, outcome = recording.info, recording.outcome
             facts = simulation_facts(info)
             task, seed = facts.get("task", "(external)"), str(facts.get("root_seed", ""))
-            success = None if outcome is None else outcome.success
-        items.append({"path": str(file), "task": task, "success": success, "frames": recording.num_frames})
-        word = "recovered" if outcome is None else _SUCCESS_WORDS[outcome.success]
-        rows.append(
-            (
-                str(file.relative_to(path)),
-                task,
-                seed,
-                str(info.episode_index),
-                word,
-                str(recording.num_frames),
-                size_in_words(file.stat().st_size),
-            )
-        )
-    plain = {"kind": "folder", "path": str(path), "recordings": items}
-    return plain, [f"{counted(len(recordings), 'recording')} in {path}", "", *aligned(rows)]
+            success, frames = None if outcome is None else outcome.success, recording.num_frames
+        items.append({"path": str(file), "task": task, "success": success, "frames": frames})
+        word = "recovered" if outcome is None else _SUCCESS_WORDS[success]
+        numbers = str(info.episode_index), word, str(frames), size_in_words(file.stat().st_size)
+        rows.append((str(file.relative_to(found.path)), task, seed, *numbers))
+    plain = {"kind": "folder", "path": str(found.path), "recordings": items}
+    return plain, [f"{counted(len(items), 'recording')} in {found.path}", "", *aligned(rows)]
