@@ -49,8 +49,9 @@ def page() -> str:
     parts = [COMMANDS, table("Tasks (`--task`)", ("name", "motion", "success"), tasks)]
     parts += [table(title, ("name", "meaning"), rows_of(what)) for what, title in TITLES.items()]
     parts += [table("Sensors of simulated arms", ("feature", "meaning"), sensors), PYTHON]
-    for purpose, names in GROUPS.items():
-        rows = [(name, sentence(importlib.import_module(module), name)) for name, module in names.items()]
+    for purpose, modules in GROUPS.items():
+        places = [(name, importlib.import_module(module)) for module, names in modules.items() for name in names]
+        rows = [(name, sentence(module, name)) for name, module in places]
         parts.append(table(purpose, ("name", "meaning"), rows))
     return "\n".join(parts)
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, cast
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from tyro.conf import arg
 
@@ -27,6 +29,10 @@ from demorec.runs.run_file import RUN_NAME
 if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
     from demorec.runs.run_file import Attempt, RunFile
+
+
+_PLACED = re.compile(r"(?:^|(?<=; ))(.*?) @ [\w.]*?(\w+)(?=$|; )")
+"""Wrong value and its place in an error of `from_plain`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -157,10 +163,12 @@ class Generate:
 
                 assert options.repo_id is not None
                 export, report = export_run(
-                    result.folder, repo_id=options.repo_id, progress=progress.exporting, says=progress.says
+                    result.folder, repo_id=options.repo_id, progress=partial(progress.show, "exporting"), says=tell
                 )
             if self.check and result.run.successes:
-                checked = check_run(result, deep_every=self.deep_every, progress=progress.checking)
+                checked = check_run(
+                    result, deep_every=self.deep_every, progress=partial(progress.show, "checking", unit="item")
+                )
         print_result(result, export, checked)
         if report is not None and report.not_verified:
             tell(f"Not verified: {report.not_verified}")
@@ -233,19 +241,19 @@ class RunProgress(RunObserver, Closing):
 
     def verifying(self, done: int, total: int) -> None:
         """Show the verification of existing recordings."""
-        self._show("verifying", total).set(done)
+        self.show("verifying", done, total)
 
-    def checking(self, done: int, total: int) -> None:
-        """Show the checks of run, recordings and dataset."""
-        self._show("checking", total, unit="item").set(done)
-
-    def exporting(self, done: int, total: int) -> None:
-        """Show the export of recordings."""
-        self._show("exporting", total).set(done)
+    def show(self, title: str, done: int, total: int, *, unit: str = "episode", at_once: int = 1) -> None:
+        """Show the state of an activity; another one than before gets a new bar."""
+        if self._bar is None or title != self._title:
+            self.close()
+            self._title = title
+            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
+        self._bar.set(done)
 
     def started(self, run: RunFile, workers: int) -> None:
         """Show that the work begins."""
-        self._show("generating", run.num_episodes, done=len(run.successes), at_once=workers)
+        self.show("generating", len(run.successes), run.num_episodes, at_once=workers)
 
     def ended(self, attempt: Attempt) -> None:
         """Show that an attempt has ended."""
@@ -261,14 +269,6 @@ class RunProgress(RunObserver, Closing):
     def says(self, message: str) -> None:
         """Print a message for the user."""
         tell(message)
-
-    def _show(self, title: str, total: int, *, done: int = 0, unit: str = "episode", at_once: int = 1) -> ProgressBar:
-        if self._bar is None or title != self._title:
-            if self._bar is not None:
-                self._bar.close()
-            self._title = title
-            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
-        return self._bar
 
 
 @contextmanager
@@ -297,34 +297,25 @@ def with_file_values[T](command: T, path: Path) -> T:
         ConfigError: The file cannot be read, or has unknown keys or values of a wrong type, all listed at once.
     """
     values = {key.replace("-", "_"): value for key, value in read_toml(path).items()}
-    places = dict(_places(command))
+    plain = to_plain(command)
+    places = dict(_places(plain))
     wrong = [f"an unknown key {key!r}.{nearest_match(key, places)}" for key in values if key not in places]
     if wrong:
         raise ConfigError(f"The config file has {' '.join(wrong)} Its keys are the flags' names: {path}")
     for key, value in values.items():
-        owner_path = places[key]
-        try:
-            command = cast(T, _replaced(command, owner_path, key, value))
-        except ValueError as error:
-            wrong.append(f"{key}: {str(error).partition(' @ ')[0]}")
-    if wrong:
-        raise ConfigError(f"The config file has wrong values ({'; '.join(wrong)}): {path}")
-    return command
+        is_single = isinstance(places[key][key], list | tuple) and not isinstance(value, list)
+        places[key][key] = [value] if is_single else value  # cameras = "front" means one camera
+    try:
+        return from_plain(plain, type(command))
+    except ValueError as error:
+        wrong_values = _PLACED.sub(r"\2: \1", str(error))
+        raise ConfigError(f"The config file has wrong values ({wrong_values}): {path}") from error
 
 
-def _places(owner: Any, above: tuple[str, ...] = ()) -> Iterator[tuple[str, tuple[str, ...]]]:
-    """Name of each flag -> the fields that lead to its dataclass."""
-    for part in dataclasses.fields(owner):
-        value = getattr(owner, part.name)
-        if dataclasses.is_dataclass(value):
-            yield from _places(value, (*above, part.name))
-        elif part.name != "config":
-            yield part.name, above
-
-
-def _replaced(owner: Any, above: tuple[str, ...], key: str, value: Any) -> Any:
-    if above:
-        return dataclasses.replace(owner, **{above[0]: _replaced(getattr(owner, above[0]), above[1:], key, value)})
-    if isinstance(getattr(owner, key), tuple) and not isinstance(value, list):
-        value = [value]  # cameras = "front" means one camera
-    return dataclasses.replace(owner, **{key: getattr(from_plain({**to_plain(owner), key: value}, type(owner)), key)})
+def _places(owner: dict[str, Any]) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Name of each flag -> the object that has its value."""
+    for name, value in owner.items():
+        if isinstance(value, dict):
+            yield from _places(value)
+        elif name != "config":
+            yield name, owner

@@ -8,7 +8,6 @@ import shutil
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,19 +15,13 @@ from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.cli.shared.progress import duration
 from demorec.core.processes import available_cores
 from demorec.core.replacing import shown
-from demorec.episode.features import ENVIRONMENT_STATE, observation_names
 from demorec.generate.contents import set_aside
 from demorec.generate.executor import Made
 from demorec.generate.options import RunOptions, RunResult
-from demorec.mcap import open_simulated
-from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, Attempt, ExportRecord, RunFile
+from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, ExportRecord, RunFile
 
 if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
-
-POLICY_CONFIG = Path("examples/act_numbers.json")
-"""Configuration of README's training, relative to a checkout."""
-MAX_PROBED_EPISODES = 8
 
 
 def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
@@ -95,8 +88,6 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
         target = folder / DATASET
         dataset_bytes = sum(path.stat().st_size for path in target.rglob("*") if path.is_file())
         rows.append(("dataset", f"{size_in_words(dataset_bytes)} in {target} (repo id {export.repo_id})"))
-    if seconds := _seconds(attempts, export):
-        rows.append(("CPU seconds", seconds))
     if result.made:
         session = run.sessions[-1]
         wall = session.wall_seconds
@@ -146,28 +137,8 @@ def print_comparison(original: Original, result: RunResult) -> bool:
 
 def next_commands(result: RunResult) -> list[str]:
     """Next commands for the user, quoted for the shell."""
-    folder = str(result.folder)
     allow = [word for module in result.run.config.modules for word in ("--allow", module)]
-    commands = [[_program("demorec"), name, folder, *allow] for name in ("view", "check")]
-    if find_spec("torch") and find_spec("lerobot") and POLICY_CONFIG.is_file() and has_environment_state(result):
-        data = result.folder / "policy_data"
-        numbers = ["--privileged", "--features", ENVIRONMENT_STATE, "--action", "joint_increment"]
-        commands += [
-            [_program("demorec"), "export", "lerobot", folder, "--out", str(data), *numbers],
-            [_program("lerobot-train"), f"--config_path={POLICY_CONFIG}", f"--dataset.root={data}"],
-        ]
-    return [shlex.join(command) for command in commands]
-
-
-def has_environment_state(result: RunResult) -> bool:
-    """Whether the first recordings have equally many values of object state, which a policy without images needs."""
-    lengths = set()
-    for attempt in result.run.successes[:MAX_PROBED_EPISODES]:
-        with open_simulated(result.folder / attempt.file) as recording:
-            info = recording.info
-        names = observation_names(info.simulated.robot, info.simulated.scene, privileged=True)
-        lengths.add(len(names[ENVIRONMENT_STATE]))
-    return len(lengths) == 1
+    return [shlex.join([_program("demorec"), name, str(result.folder), *allow]) for name in ("view", "check")]
 
 
 def _program(name: str) -> str:
@@ -180,16 +151,6 @@ def _failures(run: RunFile) -> str:
     if not causes:
         return ""
     return "; failed attempts: " + ", ".join(f"{count} x {cause}" for cause, count in causes.most_common(5))
-
-
-def _seconds(attempts: tuple[Attempt, ...], export: ExportRecord | None) -> str:
-    stages: Counter[str] = Counter()
-    for attempt in attempts:
-        stages.update(attempt.seconds)
-    shown = [f"{stage} {stages[stage]:.1f}" for stage in sorted(stages, key=lambda stage: stage != STARTING)]
-    if export is not None:
-        shown.append(f"export {export.seconds:.1f}")
-    return ", ".join(shown)
 
 
 def print_estimate(measured: Sequence[Made], tried: Sequence[Made], dataset_bytes: int, options: RunOptions) -> None:

@@ -16,7 +16,7 @@ OUTSIDE = ("examples", "plugins", "viewers", "tests/support/lab_extension")
 
 
 def test_every_name_loads() -> None:
-    names = [name for group in api.GROUPS.values() for name in group]
+    names = [name for modules in api.GROUPS.values() for names in modules.values() for name in names]
     assert len(set(names)) == len(names)
     for name in names:
         value = getattr(api, name)
@@ -36,7 +36,8 @@ def test_types_are_those_of_the_names() -> None:
         for name in node.names
         if name.asname
     }
-    assert typed == {name: module for group in api.GROUPS.values() for name, module in group.items()}
+    promised = [(module, names) for modules in api.GROUPS.values() for module, names in modules.items()]
+    assert typed == {name: module for module, names in promised for name in names}
 
 
 def test_importing_it_loads_nothing() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import time
 
 import pytest
 
@@ -30,7 +29,6 @@ def lines_of(
         for _ in range(done, total):
             clock.now += seconds_each
             bar.advance()
-            bar.write_line_if_due()
     told = capsys.readouterr()
     assert told.out == ""
     return told.err.splitlines()
@@ -57,8 +55,6 @@ def test_the_start_does_not_affect_the_remaining_time(
             for _ in range(workers):
                 clock.now += 1
                 bar.advance()
-            if not is_terminal:
-                bar.write_line_if_due()
     left = re.findall(r"about ([\d.]+) days left", capsys.readouterr().err)
     expected = total / workers * 60 / 86400
     assert left
@@ -79,15 +75,3 @@ def test_lines_are_neither_too_many_nor_too_few(
     capsys: pytest.CaptureFixture[str], total: int, seconds_each: float, fewest: int, most: int
 ) -> None:
     assert fewest <= len(lines_of(capsys, total=total, seconds_each=seconds_each)) <= most
-
-
-def test_lines_are_printed_until_the_end(capsys: pytest.CaptureFixture[str]) -> None:
-    told = ""
-    with ProgressBar("generating", total=3, is_terminal=False, quiet=0.01):
-        while not told:  # the tests' time limit ends it
-            time.sleep(0.01)
-            told = capsys.readouterr().err
-    assert re.match(r"generating: 0 of 3 episodes \(0 %\), \d+ s passed\n", told)
-    capsys.readouterr()
-    time.sleep(0.05)
-    assert capsys.readouterr().err == ""

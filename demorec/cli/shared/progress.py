@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-import threading
 import time
 from collections.abc import Callable
 from typing import Any
@@ -14,11 +13,11 @@ from demorec.cli.shared.output import tell
 from demorec.core.files import Closing
 
 _QUIET_S = 10.0
-"""Time before the first line and between the first lines; a shorter job prints none."""
+"""Minimum time before the first line and between lines; a shorter job prints none."""
 _SHARE = 0.05
 """Part of the elapsed time after which the next line is due."""
 _LONGEST_S = 300.0
-"""Maximum time without a line."""
+"""Time after which the next line is due in any case."""
 _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 """Without tqdm's own estimate of the remaining time, which counts the start as work."""
 
@@ -26,9 +25,9 @@ _BAR = "{l_bar}{bar}| {n_fmt}/{total_fmt} [{elapsed}{postfix}]"
 class ProgressBar(Closing):
     """Progress counter of one job; a context manager.
 
-    Shows a bar on a terminal. Elsewhere it prints a line every ten seconds, in a long job after each 5 % of the elapsed
-    time, at least every five minutes. The remaining time is estimated from the first finished item on, because workers
-    have started by then, and is shown after one more round.
+    Shows a bar on a terminal. Elsewhere it prints a line when an item ends, at most every ten seconds, in a long job
+    every five minutes. The remaining time is estimated from the first finished item on, because workers have started by
+    then, and is shown after one more round.
 
     Args:
         title: Activity, as in "exporting".
@@ -38,7 +37,6 @@ class ProgressBar(Closing):
         at_once: Number of items processed at the same time.
         is_terminal: Whether to show a bar (default: whether standard error is a terminal).
         clock: Monotonic time in seconds.
-        quiet: Time before the first line, s.
     """
 
     def __init__(
@@ -51,29 +49,18 @@ class ProgressBar(Closing):
         at_once: int = 1,
         is_terminal: bool | None = None,
         clock: Callable[[], float] = time.monotonic,
-        quiet: float = _QUIET_S,
     ) -> None:
-        self._title, self._unit, self._clock, self._quiet = title, unit, clock, quiet
+        self._title, self._unit, self._at_once, self._clock = title, unit, at_once, clock
         self.done, self.total = done, total
-        self._at_once = at_once
         self._first_end: tuple[float, int] | None = None  # time, and the number of finished items
         self._note = ""
         self._started = self._last_line = clock()
-        watched = sys.stderr.isatty() if is_terminal is None else is_terminal
         self._bar: tqdm[Any] | None = None
-        self._closed = threading.Event()
-        self._writer: threading.Thread | None = None
-        if watched:
+        if sys.stderr.isatty() if is_terminal is None else is_terminal:
             self._bar = tqdm(desc=title, total=total, initial=done, unit=unit, dynamic_ncols=True)
-        else:
-            self._writer = threading.Thread(target=self._write_lines, daemon=True)
-            self._writer.start()
 
     def close(self) -> None:
-        """Remove the bar from the terminal and print no further lines; idempotent."""
-        self._closed.set()
-        if self._writer is not None:
-            self._writer.join()
+        """Remove the bar from the terminal; idempotent."""
         if self._bar is not None:
             self._bar.close()
 
@@ -87,11 +74,13 @@ class ProgressBar(Closing):
             self._first_end = self._clock(), done
         self.done = done
         self.total = self.total if total is None else total
-        if self._bar is not None:
-            self._bar.total = self.total
-            self._bar.bar_format = _BAR if self.total else None
-            self._bar.set_postfix_str(self._last_words(), refresh=False)
-            self._bar.update(done - self._bar.n)
+        if self._bar is None:
+            self._write_line_if_due()
+            return
+        self._bar.total = self.total
+        self._bar.bar_format = _BAR if self.total else None
+        self._bar.set_postfix_str(self._last_words(), refresh=False)
+        self._bar.update(done - self._bar.n)
 
     def note(self, text: str) -> None:
         """Set the text shown with the count: "2 failed attempts"."""
@@ -99,15 +88,9 @@ class ProgressBar(Closing):
         if self._bar is not None:
             self._bar.set_postfix_str(self._last_words())
 
-    def _write_lines(self) -> None:
-        """Write lines from a separate thread, independent of the time that an item takes."""
-        while not self._closed.wait(self._quiet / 9):  # so that a line is hardly late
-            self.write_line_if_due()
-
-    def write_line_if_due(self) -> None:
-        """Write a line unless the last one was written recently."""
+    def _write_line_if_due(self) -> None:
         now = self._clock()
-        if now - self._last_line < max(self._quiet, min(_LONGEST_S, _SHARE * (now - self._started))):
+        if now - self._last_line < max(_QUIET_S, min(_LONGEST_S, _SHARE * (now - self._started))):
             return
         self._last_line = now
         how_far = f"{self.done}"
