@@ -20,7 +20,7 @@ from demorec.cli.shared.flags import parse, terminal_width
 from demorec.cli.shared.output import PrintableFormatter, say, tell
 from demorec.core.errors import DemorecError, MissingDependencyError, OptionError, resource_error
 from demorec.core.extension import GROUPS
-from demorec.core.extensions import ExtensionRows, command_rows, extensions
+from demorec.core.extensions import command_rows, extensions, targets_of
 from demorec.core.own_code import own_line
 from demorec.core.registry import Registry, nearest_match
 
@@ -36,7 +36,7 @@ class Command(Protocol):
         """Run the command and return the exit code."""
 
 
-COMMANDS: Registry[type[Command]] = Registry(kind="command", rows=ExtensionRows("commands"))
+COMMANDS: Registry[type[Command]] = Registry(kind="command", rows=targets_of("commands"))
 
 _LONGEST = 4000
 """Maximum characters of an error message."""

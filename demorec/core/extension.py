@@ -18,10 +18,6 @@ Rows = Mapping[str, str]
 """Name -> "module:name"."""
 
 
-def _no_rows() -> Rows:
-    return {}
-
-
 @dataclass(frozen=True, kw_only=True)
 class CommandRow:
     """A command of `demorec`.
@@ -139,16 +135,16 @@ class Extension:
     needs: tuple[str, ...] = ()
     commands: Mapping[str, CommandRow] = field(default_factory=dict)
     readers: Mapping[str, ReaderRow] = field(default_factory=dict)
-    tasks: Rows = field(default_factory=_no_rows)
-    robots: Rows = field(default_factory=_no_rows)
-    cameras: Rows = field(default_factory=_no_rows)
-    objects: Rows = field(default_factory=_no_rows)
-    renderers: Rows = field(default_factory=_no_rows)
+    tasks: Rows = field(default_factory=dict)
+    robots: Rows = field(default_factory=dict)
+    cameras: Rows = field(default_factory=dict)
+    objects: Rows = field(default_factory=dict)
+    renderers: Rows = field(default_factory=dict)
     exporters: Mapping[str, ExporterRow] = field(default_factory=dict)
-    file_checks: Rows = field(default_factory=_no_rows)
-    checks: Rows = field(default_factory=_no_rows)
-    operations: Rows = field(default_factory=_no_rows)
-    columns: Rows = field(default_factory=_no_rows)
-    rankings: Rows = field(default_factory=_no_rows)
-    lists: Rows = field(default_factory=_no_rows)
-    proofs: Rows = field(default_factory=_no_rows)
+    file_checks: Rows = field(default_factory=dict)
+    checks: Rows = field(default_factory=dict)
+    operations: Rows = field(default_factory=dict)
+    columns: Rows = field(default_factory=dict)
+    rankings: Rows = field(default_factory=dict)
+    lists: Rows = field(default_factory=dict)
+    proofs: Rows = field(default_factory=dict)

@@ -69,16 +69,13 @@ def _declaration(place: str, target: str, problems: list[str]) -> Extension | No
     try:
         found = getattr(importlib.import_module(module), name)
     except (Exception, SystemExit) as error:  # code of another package may raise anything
-        problems.append(f"The extension of {place} is left out: {target} cannot be loaded ({_words(error)}).")
+        words = f"{type(error).__name__}: {error}".rstrip(": ")
+        problems.append(f"The extension of {place} is left out: {target} cannot be loaded ({words}).")
         return None
     if not isinstance(found, Extension):
         problems.append(f"The extension of {place} is left out: {target} is not a demorec.core.extension.Extension.")
         return None
     return found
-
-
-def _words(error: BaseException) -> str:
-    return f"{type(error).__name__}: {error}".rstrip(": ")
 
 
 def _clash(extension: Extension, others: Mapping[str, Extension]) -> str:
@@ -126,23 +123,6 @@ def extension_packages() -> frozenset[str]:
     return frozenset(packages - {"demorec"})
 
 
-class ExtensionRows(Mapping[str, str]):
-    """Name -> "module:name" of one table, read when it is first used."""
-
-    def __init__(self, table: str) -> None:
-        self._table = table
-
-    def _rows(self) -> dict[str, str]:
-        return {name: getattr(row, "target", row) for name, row in rows_of(self._table)}
-
-    def __getitem__(self, name: str) -> str:
-        """Location of the code."""
-        return self._rows()[name]
-
-    def __iter__(self) -> Iterator[str]:
-        """Names, the core's first."""
-        return iter(self._rows())
-
-    def __len__(self) -> int:
-        """Number of names."""
-        return len(self._rows())
+def targets_of(table: str) -> dict[str, str]:
+    """Name -> "module:name" of a table."""
+    return {name: getattr(row, "target", row) for name, row in rows_of(table)}

@@ -125,12 +125,18 @@ def remove_limits() -> None:
         resource.setrlimit(kind, (hard, hard))
 
 
-def _limit_this_process(parent: int, limits: Limits) -> None:
-    import ctypes
+def end_with_parent(parent: int) -> None:
+    """Let the kernel kill this process (Linux) when the parent's thread that started it ends."""
+    if sys.platform == "linux":
+        import ctypes
 
-    ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # the parent was killed before this call
-        os._exit(1)
+        ctypes.CDLL(None).prctl(_SET_PDEATHSIG, signal.SIGKILL)
+        if os.getppid() != parent:  # the parent was killed before this call
+            os._exit(1)
+
+
+def _limit_this_process(parent: int, limits: Limits) -> None:
+    end_with_parent(parent)
     reserved = RESERVED_BYTES + RESERVED_BYTES_PER_CORE * (os.cpu_count() or 1)
     _lower(resource.RLIMIT_DATA, limits.memory_bytes + reserved)
     if limits.cpu_s is not None:

@@ -18,11 +18,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, NoReturn
 
-from demorec.core.limited import remove_limits
+from demorec.core.limited import end_with_parent, remove_limits
 from demorec.core.streams import drop_output
 
-_PATIENCE_S = 3.0
-"""Maximum time that a program may take to end after it was asked to."""
 _LATER_S = 0.02
 """Delay before repeating an interrupt that arrived where no exception can be raised."""
 _hiding = threading.Lock()
@@ -61,11 +59,6 @@ class _Process(SpawnProcess):
 class _Context(SpawnContext):
     Process = _Process
 
-    def Lock(self) -> Any:
-        """A lock, as in multiprocessing."""
-        _start_tracker()
-        return super().Lock()
-
 
 SPAWN = _Context()
 """Like `multiprocessing.get_context("spawn")`, but its processes do not run the main module's file again.
@@ -82,6 +75,7 @@ def process_pool(workers: int) -> Iterator[ProcessPoolExecutor]:
 
     No exception may be raised during the join: a thread being joined would count as ended and never end.
     """
+    _start_tracker()
     pool = ProcessPoolExecutor(workers, mp_context=SPAWN)
 
     def kill(number: int, frame: FrameType | None) -> None:
@@ -158,41 +152,19 @@ def blocked(*numbers: signal.Signals) -> Iterator[None]:
 
 
 def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
-    """Start a program that ends when this process ends, for any reason.
-
-    An intermediate process starts the program and ends with it. It ends the program when its standard input is closed,
-    whose other end only this process holds.
+    """Start a program, without limits and with an empty standard input, that is killed when the calling thread ends.
 
     Args:
-        command: The program and its arguments; its standard input is empty.
-        options: Arguments of `subprocess.Popen`, except `stdin`.
-
-    Returns:
-        The intermediate process; terminating it ends the program.
+        command: The program and its arguments.
+        options: Arguments of `subprocess.Popen`, except `stdin` and `preexec_fn`.
     """
-    return subprocess.Popen([sys.executable, "-P", "-m", __name__, *command], stdin=subprocess.PIPE, **options)
 
+    def prepare() -> None:
+        remove_limits()
+        end_with_parent(parent)
 
-def _stand_between(command: Sequence[str]) -> int:
-    remove_limits()
-    program = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C also reaches the program
-
-    def end(number: int, frame: FrameType | None) -> None:
-        program.terminate()
-        killing = threading.Timer(_PATIENCE_S, program.kill)
-        killing.daemon = True
-        killing.start()
-
-    signal.signal(signal.SIGTERM, end)
-
-    def watch() -> None:
-        while os.read(0, 1):
-            pass
-        program.kill()
-
-    threading.Thread(target=watch, daemon=True).start()
-    return abs(program.wait())
+    parent = os.getpid()
+    return subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=prepare, **options)  # noqa: PLW1509 (two system calls)
 
 
 def _interrupt_again(args: sys.UnraisableHookArgs) -> None:
@@ -256,7 +228,3 @@ def handled(handler: Callable[[int, FrameType | None], None], *numbers: signal.S
     finally:
         for number, usual in before.items():
             signal.signal(number, usual)
-
-
-if __name__ == "__main__":
-    sys.exit(_stand_between(sys.argv[1:]))

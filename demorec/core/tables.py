@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from demorec.core.extensions import ExtensionRows
+from demorec.core.extensions import targets_of
 from demorec.core.registry import Registry, is_foreign, modules_of, split_name
 from demorec.robots.assets import model_name
 
@@ -19,21 +19,19 @@ if TYPE_CHECKING:
     from demorec.robots.robot import RobotSpec
     from demorec.tasks.base import Task
 
-TASKS: Registry[type[Task]] = Registry(kind="task", rows=ExtensionRows("tasks"), subclass_of="demorec.tasks.base:Task")
+TASKS: Registry[type[Task]] = Registry(kind="task", rows=targets_of("tasks"), subclass_of="demorec.tasks.base:Task")
 ROBOTS: Registry[RobotSpec] = Registry(
-    kind="robot", rows=ExtensionRows("robots"), instance_of="demorec.robots.robot:RobotSpec"
+    kind="robot", rows=targets_of("robots"), instance_of="demorec.robots.robot:RobotSpec"
 )
 CAMERAS: Registry[CameraPreset] = Registry(
-    kind="camera", rows=ExtensionRows("cameras"), instance_of="demorec.render.cameras:CameraPreset"
+    kind="camera", rows=targets_of("cameras"), instance_of="demorec.render.cameras:CameraPreset"
 )
-OBJECTS: Registry[Shelf] = Registry(
-    kind="shelf", rows=ExtensionRows("objects"), instance_of="demorec.objects.shelf:Shelf"
-)
-RENDERERS: Registry[type[Renderer]] = Registry(kind="renderer", rows=ExtensionRows("renderers"))
-EXPORTERS: Registry[Exporter[Any]] = Registry(kind="format", rows=ExtensionRows("exporters"))
-FILE_CHECKS: Registry[Check] = Registry(kind="check", rows=ExtensionRows("file_checks"))
-LISTS: Registry[Callable[[], Any]] = Registry(kind="list", rows=ExtensionRows("lists"))
-RANKINGS: Registry[Callable[..., Any]] = Registry(kind="ranking", rows=ExtensionRows("rankings"))
+OBJECTS: Registry[Shelf] = Registry(kind="shelf", rows=targets_of("objects"), instance_of="demorec.objects.shelf:Shelf")
+RENDERERS: Registry[type[Renderer]] = Registry(kind="renderer", rows=targets_of("renderers"))
+EXPORTERS: Registry[Exporter[Any]] = Registry(kind="format", rows=targets_of("exporters"))
+FILE_CHECKS: Registry[Check] = Registry(kind="check", rows=targets_of("file_checks"))
+LISTS: Registry[Callable[[], Any]] = Registry(kind="list", rows=targets_of("lists"))
+RANKINGS: Registry[Callable[..., Any]] = Registry(kind="ranking", rows=targets_of("rankings"))
 
 
 def load_robot(name: str, allowed: Collection[str] = ()) -> RobotSpec:

@@ -271,8 +271,6 @@ def _wait_for_page(page: str, process: subprocess.Popen[Any]) -> None:
 
 def _end_process(process: subprocess.Popen[Any]) -> None:
     """Ask a process to end, and kill it if it does not within some seconds."""
-    if process.stdin is not None:
-        process.stdin.close()
     if process.poll() is None:
         process.terminate()
         try:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from demorec.core.extensions import ExtensionRows
+from demorec.core.extensions import targets_of
 from demorec.core.registry import Registry
 
 
@@ -14,4 +14,4 @@ class DatasetCommand:
     Reads any LeRobot dataset (v3.0, v2.1); a run means its own dataset. The result appears complete or not at all.
     """
 
-    commands: Registry[Any] = Registry(kind="command of demorec dataset", rows=ExtensionRows("operations"))
+    commands: Registry[Any] = Registry(kind="command of demorec dataset", rows=targets_of("operations"))
