@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from demorec.core.extensions import rows_of
+from demorec.core.extension import rows_of
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -19,8 +19,7 @@ from typing import Protocol
 from demorec.cli.shared.flags import parse, terminal_width
 from demorec.cli.shared.output import PrintableFormatter, say, tell
 from demorec.core.errors import DemorecError, MissingDependencyError, OptionError, resource_error
-from demorec.core.extension import GROUPS
-from demorec.core.extensions import command_rows, extensions, targets_of
+from demorec.core.extension import GROUPS, command_rows, extensions, targets_of
 from demorec.core.own_code import own_line
 from demorec.core.registry import Registry, nearest_match
 

@@ -9,12 +9,11 @@ from typing import Annotated, Any, ClassVar
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
 
-from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside, tell_incomplete
-from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
+from demorec.core.replacing import Target
 from demorec.core.tables import EXPORTERS
-from demorec.core.targets import Target
 from demorec.datasets.options import CommonOptions, ExportReport
 
 

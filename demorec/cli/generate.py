@@ -14,9 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 from tyro.conf import arg
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.output import counted, tell
+from demorec.cli.shared.output import ProgressBar, counted, tell
 from demorec.cli.shared.paths import refuse_inside
-from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, read_toml
 from demorec.core.errors import ConfigError
 from demorec.core.files import Closing

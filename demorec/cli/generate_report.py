@@ -11,8 +11,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
-from demorec.cli.shared.progress import duration
+from demorec.cli.shared.output import aligned, counted, duration, say, size_in_words, tell
 from demorec.core.processes import available_cores
 from demorec.core.replacing import shown
 from demorec.generate.contents import set_aside

@@ -10,10 +10,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
-from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.paths import MappingFile, NamedByFlags, Readable, RoleFlags, need_paths, reading
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
-from demorec.core.extensions import reader_rows
+from demorec.core.extension import reader_rows
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.element_names import is_numbered
 from demorec.episode.features import IMAGE_PREFIX

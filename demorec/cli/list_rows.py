@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from tyro.conf import Positional, arg
 
 from demorec.cli.shared.output import aligned, say, say_json
-from demorec.core.extensions import extensions
+from demorec.core.extension import extensions
 from demorec.core.registry import Registry, check_choice
 from demorec.core.tables import CAMERAS, EXPORTERS, LISTS, OBJECTS, RENDERERS, ROBOTS, TASKS
 

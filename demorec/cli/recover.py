@@ -8,7 +8,7 @@ from pathlib import Path
 from tyro.conf import Positional
 
 from demorec.cli.shared.output import say
-from demorec.core.targets import OptionalTarget
+from demorec.core.replacing import OptionalTarget
 from demorec.runs.find import EVALUATION_NAME, expect
 from demorec.runs.run_file import EPISODES, FAILED, RUN_NAME
 

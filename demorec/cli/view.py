@@ -16,18 +16,18 @@ from demorec.cli.shared.output import say, size_in_words, tell
 from demorec.cli.shared.paths import (
     WHAT_IS_READ,
     MappingFile,
+    NamedByFlags,
+    RoleFlags,
     places_read,
     reading,
     refuse_inside,
     tell_incomplete,
     tell_unfinished,
 )
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
 from demorec.core.atomic import atomic_write, atomic_write_all
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.replacing import IMAGE, RERUN_FILE, check_replaceable
+from demorec.core.replacing import IMAGE, RERUN_FILE, OptionalTarget, check_replaceable
 from demorec.core.tables import RANKINGS
-from demorec.core.targets import OptionalTarget
 from demorec.robots.assets import allow_models
 from demorec.runs.find import expect
 

@@ -23,7 +23,7 @@ from itertools import islice
 from pathlib import Path
 from typing import NamedTuple, NoReturn
 
-from demorec.core.extensions import command_rows
+from demorec.core.extension import command_rows
 
 VARIABLE = "DEMOREC_LIMITS"
 """Environment variable; "off" removes the limits, for trusted files."""

@@ -1,4 +1,4 @@
-"""Tables of everything users can name; `demorec.core.extensions` provides their rows."""
+"""Tables of everything users can name; `demorec.core.extension` provides their rows."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from demorec.core.extensions import targets_of
+from demorec.core.extension import targets_of
 from demorec.core.registry import Registry, is_foreign, modules_of, split_name
 from demorec.robots.assets import model_name
 

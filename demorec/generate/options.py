@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.targets import OptionalTarget
+from demorec.core.replacing import OptionalTarget
 from demorec.datasets.lerobot.options import check_repo_id
 from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile
 

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, MissingDependencyError, NotAllowedError, SceneError
-from demorec.core.extensions import extension_packages
+from demorec.core.extension import extension_packages
 from demorec.core.files import cache_folder, write_whole
 from demorec.core.registry import import_root, is_allowed, is_module_name, module_file
 from demorec.episode.mesh import decode_mesh

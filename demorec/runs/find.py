@@ -16,11 +16,9 @@ from pathlib import Path
 from typing import BinaryIO
 
 from demorec.core.errors import ConfigError, resource_error
-from demorec.core.extension import ExporterRow, ReaderRow
-from demorec.core.extensions import exporter_rows, reader_rows
+from demorec.core.extension import ExporterRow, ReaderRow, exporter_rows, reader_rows
 from demorec.core.files import HDF5_MAGIC, MCAP_MAGIC, RERUN_MAGICS, irregular_kind, open_regular
-from demorec.core.replacing import shown
-from demorec.core.targets import is_utf8
+from demorec.core.replacing import is_utf8, shown
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.runs.run_file import DATASET, EPISODES, FAILED, RUN_NAME, UNFINISHED
 

@@ -1,6 +1,6 @@
 """Third-party formats, which commands read through a temporary import.
 
-Each is a row `readers` of an extension (`demorec.core.extensions`). Every command reads them by the same mapping as
+Each is a row `readers` of an extension (`demorec.core.extension`). Every command reads them by the same mapping as
 `demorec import` and prints the same messages.
 """
 
@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import Protocol
 
 from demorec.core.errors import ConfigError, DemorecError
-from demorec.core.extension import ReaderRow
-from demorec.core.extensions import reader_rows
+from demorec.core.extension import ReaderRow, reader_rows
 from demorec.runs.find import PathKind, find
 
 Tell = Callable[[str], None]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from demorec.core.extensions import extensions
+from demorec.core.extension import extensions
 from demorec.mcap import open_recording
 
 PACKAGE = Path(__file__).parents[1] / "support" / "lab_extension"

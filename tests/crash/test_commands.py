@@ -24,7 +24,7 @@ from support.crash_rows import LONG, MAKERS, ROWS, SLOW, make_base
 from support.export import content_of, files_of
 from support.options import TARGETS
 
-from demorec.core.extensions import reader_rows
+from demorec.core.extension import reader_rows
 from demorec.core.limited import VARIABLE
 
 KILLS = 6

@@ -9,8 +9,8 @@ from typing import Any, Literal, NamedTuple, get_args, get_origin, get_type_hint
 from tyro.conf import Positional
 
 from demorec.cli import COMMANDS, subcommands_of
+from demorec.core.replacing import OptionalTarget, Target
 from demorec.core.tables import EXPORTERS
-from demorec.core.targets import OptionalTarget, Target
 
 _POSITIONAL = get_args(Positional[int])[1]
 

@@ -6,7 +6,7 @@ import re
 
 import pytest
 
-from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.output import ProgressBar
 
 
 class Clock:

@@ -38,7 +38,7 @@ from tyro.constructors import (
 from demorec.cli.shared.output import say, tell
 from demorec.core.errors import ConfigError
 from demorec.core.registry import is_module_name, split_name
-from demorec.core.targets import check_targets
+from demorec.core.replacing import check_targets
 from demorec.core.text import printable
 
 FLAG_TYPES = ConstructorRegistry()

@@ -10,10 +10,18 @@ from typing import TYPE_CHECKING, Any
 
 from demorec.check.base import RANK
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.paths import MappingFile, Readable, need_paths, reading, tell_unfinished
-from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
+from demorec.cli.shared.output import ProgressBar, counted, say, say_json
+from demorec.cli.shared.paths import (
+    MappingFile,
+    MotorFlags,
+    MotorsByFlags,
+    NamedByFlags,
+    Readable,
+    RoleFlags,
+    need_paths,
+    reading,
+    tell_unfinished,
+)
 from demorec.core.errors import ConfigError, describe_error
 from demorec.extensions.doctor.examine import as_json, examine, lines_of
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
-from demorec.core.extensions import rows_of
+from demorec.core.extension import rows_of
 from demorec.core.registry import check_choice, nearest_match
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.episode_records import episode_columns

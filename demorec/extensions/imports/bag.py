@@ -19,7 +19,7 @@ import zstandard
 
 from demorec.core.errors import ConfigError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular, read_text_limited, sha256_of
-from demorec.core.targets import is_utf8
+from demorec.core.replacing import is_utf8
 from demorec.extensions.imports.bag_files import (
     MAX_TIME_NS,
     BagError,

@@ -9,16 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 from demorec.cli.shared.flags import Positional, arg
-from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
-from demorec.cli.shared.paths import refuse_inside
-from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
+from demorec.cli.shared.output import ProgressBar, aligned, counted, say, size_in_words, tell
+from demorec.cli.shared.paths import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags, refuse_inside
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.extension import ReaderRow
-from demorec.core.extensions import reader_rows
+from demorec.core.extension import ReaderRow, reader_rows
 from demorec.core.registry import nearest_match
-from demorec.core.targets import OptionalTarget
+from demorec.core.replacing import OptionalTarget
 from demorec.runs.find import find
 
 if TYPE_CHECKING:

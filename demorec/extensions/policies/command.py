@@ -9,12 +9,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from demorec.cli.shared.flags import Allow, allowed_modules
-from demorec.cli.shared.output import say, say_json
+from demorec.cli.shared.output import ProgressBar, say, say_json
 from demorec.cli.shared.paths import refuse_inside
-from demorec.cli.shared.progress import ProgressBar
 from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.targets import OptionalTarget
+from demorec.core.replacing import OptionalTarget
 from demorec.extensions.policies import TakeOver
 
 if TYPE_CHECKING:

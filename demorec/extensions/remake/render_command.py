@@ -9,13 +9,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import Allow, Positional, allowed_modules, arg
-from demorec.cli.shared.output import counted, say, tell
+from demorec.cli.shared.output import ProgressBar, counted, say, tell
 from demorec.cli.shared.paths import refuse_sources
-from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.processes import available_cores, in_turn
 from demorec.core.registry import modules_of
-from demorec.core.targets import Target
+from demorec.core.replacing import Target
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 

@@ -11,14 +11,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from demorec.cli.shared.flags import Allow, Positional, allowed_modules
-from demorec.cli.shared.output import say, say_json, tell
-from demorec.cli.shared.paths import need_paths, refuse_sources
-from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags
+from demorec.cli.shared.output import ProgressBar, say, say_json, tell
+from demorec.cli.shared.paths import MotorFlags, MotorsByFlags, NamedByFlags, RoleFlags, need_paths, refuse_sources
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.registry import modules_of
+from demorec.core.replacing import OptionalTarget
 from demorec.core.tables import load_robot
-from demorec.core.targets import OptionalTarget
 from demorec.runs.find import EPISODE_FOLDERS, Found, expect, expect_recordings
 
 if TYPE_CHECKING:

@@ -7,14 +7,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import Positional, arg
-from demorec.cli.shared.output import counted, say, size_in_words
-from demorec.cli.shared.paths import WHAT_IS_READ, MappingFile, places_read, reading, refuse_inside
-from demorec.cli.shared.progress import ProgressBar
-from demorec.cli.shared.roles import NamedByFlags, RoleFlags
+from demorec.cli.shared.output import ProgressBar, counted, say, size_in_words
+from demorec.cli.shared.paths import (
+    WHAT_IS_READ,
+    MappingFile,
+    NamedByFlags,
+    RoleFlags,
+    places_read,
+    reading,
+    refuse_inside,
+)
 from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.replacing import REPORT
-from demorec.core.targets import Target
+from demorec.core.replacing import REPORT, Target
 from demorec.runs.find import EPISODE_FOLDERS, expect
 from demorec.runs.foreign import imported_kinds
 

@@ -7,7 +7,7 @@ import pkgutil
 from functools import cache
 
 from demorec.check.base import FAMILIES, Check
-from demorec.core.extensions import rows_of
+from demorec.core.extension import rows_of
 
 
 @cache

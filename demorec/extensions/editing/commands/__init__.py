@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from demorec.core.extensions import targets_of
+from demorec.core.extension import targets_of
 from demorec.core.registry import Registry
 
 

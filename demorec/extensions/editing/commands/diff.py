@@ -7,8 +7,7 @@ from pathlib import Path
 from typing import Annotated
 
 from demorec.cli.shared.flags import Positional, arg
-from demorec.cli.shared.output import counted, say, say_json
-from demorec.cli.shared.progress import ProgressBar
+from demorec.cli.shared.output import ProgressBar, counted, say, say_json
 from demorec.core.errors import ConfigError, ExportError
 from demorec.extensions.editing.commands.edit import MAX_SHOWN, dataset_at
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import Positional, arg
-from demorec.cli.shared.output import counted, say
+from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.cli.shared.paths import refuse_inside
-from demorec.cli.shared.progress import ProgressBar
 from demorec.core.errors import ConfigError
-from demorec.core.targets import OptionalTarget
+from demorec.core.replacing import OptionalTarget
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
