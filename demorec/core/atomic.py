@@ -16,7 +16,6 @@ import json
 import os
 import shutil
 import stat
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -30,8 +29,8 @@ _LOCK, _JOURNAL, _NEW, _OLD = "lock", "journal.json", "new", "old"
 """Content of a workshop: the lock, the journal of moves, the new targets and the old ones."""
 _MARK = b"demorec is writing here; its next command to the same place removes this folder.\n"
 _AT_FDCWD = -100
-_EXCHANGE = 2
-_NO_REPLACE = 4 if sys.platform == "darwin" else 1
+_NO_REPLACE, _EXCHANGE = 1, 2
+"""Flags of renameat2(2)."""
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 Snapshot = dict[str, list[int]]
@@ -143,7 +142,7 @@ def take_name(new: Path, target: Path) -> None:
             new.rename(target)
         except OSError as error:
             if error.errno in (errno.ENOTEMPTY, errno.ENOTDIR):
-                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from error
+                raise _taken(target) from error
             raise
     elif not _rename(new, target, _NO_REPLACE):
         try:
@@ -152,25 +151,25 @@ def take_name(new: Path, target: Path) -> None:
             raise
         except OSError:
             if os.path.lexists(target):
-                raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(target)) from None
+                raise _taken(target) from None
             new.rename(target)
         else:
             new.unlink()
+
+
+def _taken(path: Path) -> FileExistsError:
+    return FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
 
 
 def _rename(old: Path, new: Path, flag: int) -> bool:
     """Rename with the system call that takes a flag; False if the system or the file system lacks it."""
     import ctypes
 
-    library = ctypes.CDLL(None, use_errno=True)
-    names = os.fsencode(old), os.fsencode(new)
     try:
-        if sys.platform == "darwin":
-            result = library.renamex_np(*names, flag)
-        else:
-            result = library.renameat2(_AT_FDCWD, names[0], _AT_FDCWD, names[1], flag)
+        rename = ctypes.CDLL(None, use_errno=True).renameat2
     except AttributeError:
         return False
+    result = rename(_AT_FDCWD, os.fsencode(old), _AT_FDCWD, os.fsencode(new), flag)
     code = ctypes.get_errno()
     if result != 0 and code not in _UNSUPPORTED:
         raise OSError(code, os.strerror(code), str(new))
@@ -275,7 +274,7 @@ def _exchanged(part: Path, place: Path, before: Snapshot) -> bool:
         return True
     if snapshot(part) != before:
         _rename(part, place, _EXCHANGE)
-        raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(place))
+        raise _taken(place)
     return True
 
 
@@ -292,7 +291,7 @@ def _move_all(workshop: Path, parts: Sequence[Path], places: Sequence[Path], bef
             if was and os.path.lexists(place):
                 place.rename(old)
                 if snapshot(old) != was:
-                    raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(place))
+                    raise _taken(place)
         for place, part in zip(places, parts, strict=True):
             take_name(part, place)
             sync_path(place.parent)

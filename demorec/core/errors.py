@@ -28,12 +28,7 @@ class ConfigError(DemorecError):
 
 
 class OptionError(ConfigError):
-    """Impossible value of one option. Reported with the field's name, as in Python and TOML files.
-
-    Args:
-        option: Field name ("max_attempts").
-        problem: The rest of the sentence ("is 0, allowed are 1 to 100.").
-    """
+    """Impossible value of one option: its field ("max_attempts") and the problem ("is 0, allowed are 1 to 100.")."""
 
     def __init__(self, option: str, problem: str) -> None:
         super().__init__(option, problem)
@@ -106,12 +101,7 @@ _LINKER_WORDS |= {os.strerror(number): number for number in (errno.ENOMEM, errno
 
 
 def resource_error(error: BaseException, path: Path | None = None) -> ResourceError | None:
-    """Return the machine's failure behind `error` or one of its causes; None if the machine is not the cause.
-
-    Args:
-        error: Exception caught while reading or writing.
-        path: The file read or written, if known.
-    """
+    """Return the machine's failure behind `error` or one of its causes; None if the machine is not the cause."""
     for cause in error_chain(error):
         if isinstance(cause, ResourceError):
             return cause
@@ -129,19 +119,8 @@ def resource_error(error: BaseException, path: Path | None = None) -> ResourceEr
     return None
 
 
-_UNUSABLE = frozenset(
-    {
-        errno.EACCES,
-        errno.EEXIST,
-        errno.EISDIR,
-        errno.ELOOP,
-        errno.ENAMETOOLONG,
-        errno.ENOENT,
-        errno.ENOTDIR,
-        errno.EPERM,
-        errno.EROFS,
-    }
-)
+_UNUSABLE = {errno.EACCES, errno.EEXIST, errno.EISDIR, errno.ELOOP, errno.ENAMETOOLONG, errno.ENOENT, errno.ENOTDIR}
+_UNUSABLE |= {errno.EPERM, errno.EROFS}
 """Errors that another target fixes; others concern the machine, such as a full disk."""
 
 
@@ -152,7 +131,7 @@ def write_error(
 
     Args:
         what: Subject of the sentence ("The dataset").
-        error: Exception raised while writing the target.
+        error: Exception raised while writing.
         target: The path that the user named.
         otherwise: Error type for all other reasons.
         reason: Reason in words; "" for the operating system's.
@@ -221,13 +200,7 @@ def error_chain(error: BaseException) -> Iterator[BaseException]:
 
 
 class MissingDependencyError(DemorecError):
-    """An optional package is not installed.
-
-    Args:
-        feature: The requested feature, as the start of a sentence ("The Ray executor").
-        package: The package that is missing.
-        remedy: Command that installs it.
-    """
+    """An optional package is not installed: the feature that needs it ("The Ray executor"), its name, the command."""
 
     def __init__(self, feature: str, package: str, remedy: str) -> None:
         super().__init__(feature, package, remedy)

@@ -121,11 +121,8 @@ class Extension:
         needs: Names of the extensions that it imports.
         commands: Name -> command.
         readers: Kind of path -> reader. "dataset", "hdf5" and "rosbag" are kinds that the core knows.
-        tasks: Name -> subclass of `demorec.tasks.base.Task`.
-        robots: Name -> `demorec.robots.robot.RobotSpec`.
-        cameras: Name -> `demorec.render.cameras.CameraPreset`.
-        objects: Name -> `demorec.objects.shelf.Shelf`.
-        renderers: Name -> class with the methods of `demorec.render.Renderer`.
+        tasks, robots, cameras, objects, renderers: Name -> subclass of `Task`, `RobotSpec`, `CameraPreset`, `Shelf`,
+        class with the methods of `Renderer`.
         exporters: Name -> format for exporting recordings.
         file_checks: Name -> `demorec.check.base.Check` of the integrity of recordings, runs and their datasets.
         checks: Name -> check of any dataset, for the extension that judges datasets.
@@ -164,12 +161,7 @@ ENTRY_POINTS = "demorec.extensions"
 
 @dataclass(frozen=True)
 class Extensions:
-    """Usable extensions, and problems with the others.
-
-    Attributes:
-        found: The core first, then the others by name.
-        problems: One sentence for each extension left out.
-    """
+    """Usable extensions, the core first, and one sentence for each one left out."""
 
     found: tuple[Extension, ...]
     problems: tuple[str, ...]
@@ -177,7 +169,7 @@ class Extensions:
 
 @cache
 def extensions() -> Extensions:
-    """Find all extensions; cached for the lifetime of the process."""
+    """Find all extensions, once."""
     problems: list[str] = []
     declared = [_declaration("demorec", "demorec.extension:EXTENSION", problems)]
     declared += [_declaration(place, target, problems) for place, target in _targets()]

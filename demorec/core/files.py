@@ -64,12 +64,7 @@ def open_regular(path: Path) -> BufferedReader:
 
 
 def read_text_limited(path: Path, limit: int) -> str:
-    """Read a regular UTF-8 file of at most `limit` bytes.
-
-    Raises:
-        OSError: As in `open_regular`, or the file is larger.
-        UnicodeDecodeError: It is not UTF-8.
-    """
+    """Read a regular UTF-8 file; OSError as in `open_regular` or for more than `limit` bytes."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         if size > limit:
@@ -83,12 +78,7 @@ MAX_JSON_BYTES = 2 << 30
 
 
 def read_json_limited(path: Path) -> Any:
-    """Read a regular JSON file of at most `MAX_JSON_BYTES`.
-
-    Raises:
-        OSError: As in `read_text_limited`.
-        ValueError: It is not UTF-8, not JSON, or nested too deeply.
-    """
+    """Read a regular JSON file of at most `MAX_JSON_BYTES`; OSError as in `read_text_limited`, or ValueError."""
     try:
         return json.loads(read_text_limited(path, MAX_JSON_BYTES))
     except RecursionError:
@@ -100,12 +90,7 @@ MAX_SETTINGS_BYTES = 16 << 20
 
 
 def read_json_object(path: Path) -> dict[str, Any]:
-    """Read the JSON object in a regular file of settings or results, with limited nesting.
-
-    Raises:
-        OSError: As in `read_text_limited`.
-        ValueError: It is not UTF-8, not JSON, not an object, or nested too deeply.
-    """
+    """Read the JSON object in a file of settings or results; OSError as in `read_text_limited`, or ValueError."""
     found = parse_json(read_text_limited(path, MAX_SETTINGS_BYTES), allow_nan=True)
     if not isinstance(found, dict):
         raise ValueError("it is not a JSON object")
@@ -113,11 +98,7 @@ def read_json_object(path: Path) -> dict[str, Any]:
 
 
 def make_folder(path: Path) -> None:
-    """Create a folder for results and its parents; an existing folder is fine.
-
-    Raises:
-        DemorecError: It cannot be created.
-    """
+    """Create a folder for results and its parents, unless it exists; DemorecError if that fails."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -128,9 +109,6 @@ def replace_text(path: Path, text: str) -> None:
     """Write a file atomically: the existing file stays until all of the text is on the disk.
 
     The text is first written to a new file next to it, so an existing link or device is never written through.
-
-    Raises:
-        OSError: It cannot be written.
     """
     part = path.with_name(f"{path.name}.part")
     part.unlink(missing_ok=True)
@@ -173,12 +151,8 @@ def open_locked(path: Path, *, waits: bool = False) -> int:
 
     Does not block on a FIFO or follow a link, because the file is written to.
 
-    Args:
-        path: The file.
-        waits: Whether to wait for another process that holds the lock.
-
     Raises:
-        BlockingIOError: Another process holds the lock.
+        BlockingIOError: Another process holds the lock, unless this call `waits`.
         OSError: It is not a regular file, or cannot be opened.
     """
     if os.path.lexists(path):
@@ -242,7 +216,7 @@ def sha256_of(path: Path) -> str:
 
 
 def sync_path(path: Path) -> None:
-    """Flush a file, or a folder's entries, to the disk so that they survive a power cut."""
+    """Flush a file, or a folder's entries, to the disk."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)

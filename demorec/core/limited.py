@@ -59,14 +59,7 @@ _SET_PDEATHSIG = 1
 
 
 class Limits(NamedTuple):
-    """Limits of one child process.
-
-    Attributes:
-        paths: Existing files and folders on the command line.
-        input_bytes: Their total size.
-        memory_bytes: Private memory.
-        cpu_s: CPU time; None means unlimited.
-    """
+    """Limits of one child process; `paths` are the existing files and folders on the command line."""
 
     paths: tuple[str, ...]
     input_bytes: int
@@ -92,10 +85,7 @@ def continue_in_child(words: Sequence[str]) -> None:
     """Continue in a limited child process; the parent exits with the child's exit status.
 
     Signals sent to the parent alone are forwarded, and the child dies with the parent. Does not fork if there are no
-    limits.
-
-    Args:
-        words: The command line without the program's name.
+    limits for these words, the command line without the program's name.
     """
     if sys.platform != "linux" or os.environ.get(VARIABLE) == "off":
         return

@@ -27,9 +27,7 @@ SOURCE = "source of "
 def own_versions(modules: Sequence[str], *, robot: str = "") -> dict[str, str]:
     """Return name -> version, or source digest (16 hex digits), for the user's own modules.
 
-    Args:
-        modules: Modules that may be imported; if empty, the result is empty.
-        robot: Name of the robot; a user's own robot also counts with its model.
+    A user's own robot also counts with its model.
 
     Raises:
         ConfigError: A module or the robot cannot be found or loaded, or its model is not a URDF.
@@ -102,12 +100,7 @@ def _spelt(values: Mapping[str, Any], key: str) -> str:
 
 
 def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tuple[str, ...]:
-    """One line per user's module or model that has changed since these versions were recorded.
-
-    Args:
-        versions: Recorded versions.
-        allowed: Modules that may be read; others, and missing ones, are skipped.
-    """
+    """One line per allowed and existing module or model that has changed since these versions were recorded."""
     now: dict[str, str] = {}
     for name in (key.removeprefix(SOURCE) for key in versions if key.startswith(SOURCE)):
         module, _, model = name.partition(":")
@@ -122,9 +115,6 @@ def source_digest(module: str) -> str:
     """Return the SHA-256 (16 hex digits) of a module's file, or of all files of its outermost package.
 
     A process keeps the digest of its first call, because that version is the one it has imported.
-
-    Raises:
-        ConfigError: The module cannot be found.
     """
     file, root = module_file(module), import_root(module)
     package = root / module.partition(".")[0]

@@ -94,11 +94,8 @@ def in_turn[Item, Result](
 ) -> Iterator[Result]:
     """Yield the function's result for each item, in order, from several processes if `workers` is more than one.
 
-    Args:
-        function: Imported by name if it runs in other processes.
-        items: Inputs of the function.
-        workers: Number of processes; 1 runs in this process.
-        ahead: Maximum items that each process may be ahead of the consumer, to limit memory; None means all.
+    Other processes import the function by name. `ahead` limits, for their memory, by how many items each of them may be
+    ahead of the consumer.
     """
     workers = min(workers, len(items))
     if workers < 2:
@@ -154,9 +151,7 @@ def blocked(*numbers: signal.Signals) -> Iterator[None]:
 def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[Any]:
     """Start a program, without limits and with an empty standard input, that is killed when the calling thread ends.
 
-    Args:
-        command: The program and its arguments.
-        options: Arguments of `subprocess.Popen`, except `stdin` and `preexec_fn`.
+    `options` are those of `subprocess.Popen`.
     """
 
     def prepare() -> None:

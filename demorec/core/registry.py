@@ -16,6 +16,7 @@ import difflib
 import importlib
 import importlib.util
 import inspect
+import pkgutil
 import sys
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
@@ -49,16 +50,10 @@ def check_choice[T: str](kind: str, name: str, allowed: Collection[T]) -> T:
 
 @dataclass(frozen=True)
 class Registry[T]:
-    """Names of one kind, each with the location of its object.
+    """Names of one kind ("task"), each with "module:attribute" of its object.
 
-    A registry with `subclass_of` or `instance_of` is open: it also accepts "my_package.my_module:MyThing" if the caller
-    allows that module (`demorec.core.registry`) and the object has that type.
-
-    Attributes:
-        kind: Name of one row, singular, for messages ("task").
-        rows: name -> "module:attribute".
-        subclass_of: "module:attribute" of the base class of the user's classes.
-        instance_of: "module:attribute" of the class of the user's objects.
+    A registry is open if `subclass_of` or `instance_of` names a class: it also accepts "my_package.my_module:MyThing",
+    an object of that kind, if the caller allows its module.
     """
 
     kind: str
@@ -75,14 +70,10 @@ class Registry[T]:
         return self.rows.get(name, name)
 
     def check_name(self, name: str, allowed: Iterable[str] = ()) -> None:
-        """Raise ConfigError with the closest match if `name` is not known or allowed; imports nothing.
-
-        Args:
-            name: A row's name, or "package.module:Thing" if the registry is open.
-            allowed: The user's modules and packages that may be imported.
+        """Raise ConfigError with the closest match if `name` is not known; imports nothing.
 
         Raises:
-            NotAllowedError: Its module is not allowed.
+            NotAllowedError: It is "package.module:Thing" of a module that is not `allowed`, itself or by a package.
         """
         if name in self.rows:
             return
@@ -101,17 +92,16 @@ class Registry[T]:
             )
 
     def load(self, name: str, allowed: Iterable[str] = ()) -> T:
-        """Import and return the object called `name`; arguments as in `check_name`.
+        """Import and return the object called `name`.
 
         Raises:
-            ConfigError: Unknown name, or a user's object that cannot be imported or has the wrong type.
-            NotAllowedError: As in `check_name`.
+            ConfigError: As in `check_name`, or a user's object cannot be imported or has the wrong type.
         """
         self.check_name(name, allowed)
         if name in self.rows:
-            return cast(T, _import(self.rows[name]))
+            return cast(T, pkgutil.resolve_name(self.rows[name]))
         found = import_object(self.kind, name)
-        base = _import(self.subclass_of or self.instance_of)
+        base: Any = pkgutil.resolve_name(self.subclass_of or self.instance_of)
         fits = isinstance(found, type) and issubclass(found, base) if self.subclass_of else isinstance(found, base)
         if not fits:
             relation = "a subclass" if self.subclass_of else "an instance"
@@ -122,12 +112,6 @@ class Registry[T]:
             missing = ", ".join(sorted(getattr(found, "__abstractmethods__", ())))
             raise ConfigError(f"The {self.kind} {name!r} is not complete: it lacks {missing}.")
         return cast(T, found)
-
-
-def _import(target: str) -> Any:
-    """Import the object at a table's "module:attribute"."""
-    module_name, _, attribute = target.partition(":")
-    return getattr(importlib.import_module(module_name), attribute)
 
 
 def split_name(name: str) -> tuple[str, str] | None:
@@ -155,15 +139,7 @@ def is_allowed(module: str, allowed: Iterable[str]) -> bool:
 
 
 def import_object(kind: str, name: str) -> object:
-    """Import the module of "package.module:Thing" and return the object.
-
-    Args:
-        kind: Expected kind ("task"), for messages.
-        name: A name that `split_name` accepts.
-
-    Raises:
-        ConfigError: The module cannot be imported, for any reason, or has no such attribute.
-    """
+    """Import "package.module:Thing"; ConfigError if that fails for any reason. `kind` is for messages."""
     module_name, _, attribute = name.partition(":")
     make_importable(module_name)
     try:
@@ -199,12 +175,9 @@ def make_importable(module: str) -> None:
 
 
 def module_file(module: str) -> Path:
-    """File of a module; for a package, its `__init__` file.
+    """File of a module, or `__init__` file of a package; ConfigError if there is none.
 
     Imports the enclosing packages, so the module must be an allowed one.
-
-    Raises:
-        ConfigError: There is no such module, or it has no file.
     """
     make_importable(module)
     try:

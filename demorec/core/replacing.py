@@ -68,13 +68,8 @@ REPORT = ReplaceableKind(name="a report (HTML)", recognises=_begins_with(REPORT_
 def check_replaceable(target: Path, kind: ReplaceableKind, *, overwrite: bool, sources: Iterable[Path] = ()) -> None:
     """Raise unless `target` is free, or is of this kind and the user asks for replacement.
 
-    An empty folder counts as free; an empty file does not, because it may be a lock or a marker.
-
-    Args:
-        target: Path of the new result.
-        kind: Kind of the result.
-        overwrite: Whether the user asks for replacement.
-        sources: Inputs of the command; they, the folders that contain them and their content are never replaced.
+    An empty folder counts as free; an empty file does not, because it may be a lock or a marker. The `sources` of the
+    command, the folders that contain them and their content are never replaced.
 
     Raises:
         ConfigError: The target exists and the user does not ask for replacement, or it must never be replaced.
@@ -179,15 +174,14 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
         are complete: it is moved away first and restored last.
 
     Raises:
-        ConfigError: The folder cannot be written to.
-        ResourceError: The disk is full.
+        DemorecError: The folder cannot be written to.
     """
     aside = folder / _ASIDE
     try:
         aside.mkdir()
         (aside / _MARK).write_text(_MARK_TEXT)
     except OSError as error:
-        _put_back(folder, ())
+        _settle(folder, (), is_new_complete=False)
         raise resource_error(error) or write_error("The folder", error, folder, DemorecError) from error
     try:
         for name in names:
@@ -195,9 +189,9 @@ def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
                 (folder / name).rename(aside / name)
         yield
     except BaseException:
-        _put_back(folder, names)
+        _settle(folder, names, is_new_complete=False)
         raise
-    _drop(aside, names)
+    _settle(folder, names, is_new_complete=True)
 
 
 def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
@@ -216,40 +210,28 @@ def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
 
 
 def settle_parts(folder: Path, names: Sequence[str]) -> None:
-    """Finish `replaced_parts` after a crash: restore the old parts, or delete them if the new ones are complete.
-
-    Raises:
-        ConfigError: As in `check_unsettled_parts`.
-    """
-    aside = folder / _ASIDE
+    """Finish `replaced_parts` after a crash: restore the old parts, or delete them if the new ones are complete."""
     check_unsettled_parts(folder, names)
-    if not os.path.lexists(aside):
-        return
-    if os.path.lexists(folder / names[0]):
-        _drop(aside, names)
-    else:
-        _put_back(folder, names)
+    _settle(folder, names, is_new_complete=os.path.lexists(folder / names[0]))
 
 
-def _drop(aside: Path, names: Sequence[str]) -> None:
-    for name in names:
-        if (aside / name).is_dir() and not (aside / name).is_symlink():
-            shutil.rmtree(aside / name)
-        else:
-            (aside / name).unlink(missing_ok=True)
-    (aside / _MARK).unlink(missing_ok=True)  # last: it marks the folder as demorec's
-    aside.rmdir()
-
-
-def _put_back(folder: Path, names: Sequence[str]) -> None:
+def _settle(folder: Path, names: Sequence[str], *, is_new_complete: bool) -> None:
+    """Delete the old parts or restore them, the first one last; then remove the folder that held them."""
     aside = folder / _ASIDE
     for name in reversed(names):
-        if os.path.lexists(aside / name):
+        old = aside / name
+        if not os.path.lexists(old):
+            continue
+        if not is_new_complete:
             if _is_empty(folder / name):
                 (folder / name).rmdir()
-            (aside / name).rename(folder / name)
+            old.rename(folder / name)
+        elif old.is_dir() and not old.is_symlink():
+            shutil.rmtree(old)
+        else:
+            old.unlink()
     if aside.is_dir():
-        (aside / _MARK).unlink(missing_ok=True)
+        (aside / _MARK).unlink(missing_ok=True)  # last: it marks the folder as demorec's
         aside.rmdir()
 
 
@@ -260,10 +242,7 @@ OptionalTarget = Annotated[Path | None, _TARGET]
 
 
 def check_targets(command: Any) -> None:
-    """Check the targets of a command before it does anything.
-
-    Args:
-        command: A dataclass whose fields, and those of nested dataclasses, are options.
+    """Check the targets among the options of a command, a dataclass, before it does anything.
 
     Raises:
         OptionError: A target can never be created: its name is too long or not UTF-8, it is below a file, or it is (or

@@ -63,11 +63,6 @@ def terminal_width() -> int:
 def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     """Parse the flags into an instance of the command; `command.defaults(args)`, if it exists, has their defaults.
 
-    Args:
-        command: A dataclass.
-        args: Arguments of the command line.
-        prog: Name of the program.
-
     Raises:
         SystemExit: 0 after --help, 2 after reporting a wrong flag.
     """

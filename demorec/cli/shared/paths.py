@@ -72,13 +72,8 @@ def places_read(paths: Sequence[Path]) -> list[Path]:
 def refuse_sources(paths: Sequence[Path], targets: Sequence[Path], *, do: str) -> None:
     """Raise ConfigError if a new recording would be inside, or replace, an input of the same command.
 
-    Also raises if one new recording would replace another.
-
-    Args:
-        paths: The user's paths: recordings, runs, folders of recordings, datasets. A run counts as a whole, even if
-        only one of its recordings is named.
-        targets: Paths of the new recordings.
-        do: The command's verb: "render".
+    Also raises if one new recording would replace another. A run counts as a whole, even if only one of its recordings
+    is named. `do` is the command's verb: "render".
     """
     if len(set(targets)) != len(targets):
         raise ConfigError(f"Two recordings have the same name and would overwrite each other: {do} them apart.")
@@ -129,8 +124,7 @@ def reading(
         imports_datasets: Whether the command reads datasets as recordings.
 
     Raises:
-        ConfigError: A mapping is missing, impossible or given without need, or the disk is too small.
-        DemorecError: A path cannot be read.
+        DemorecError: A path cannot be read, a mapping is impossible or given without need, or the disk is too small.
     """
     if mapping is None and not any(import_kind(path, imports_datasets) for path in paths):
         yield tuple(paths)
