@@ -180,71 +180,46 @@ _VALUE_OF: Mapping[Any, Callable[[str], Any]] = {
 
 @FLAG_TYPES.primitive_rule
 def _value(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--noise FLOAT`; `--workers INT` and `--codec {auto,h264,av1}` with auto for None, which tyro would show as
-    `{None}|INT`.
+    """`--noise FLOAT`; with auto for None, `--workers INT`, `--codec {auto,h264,av1}` and `--cube-mass LOW HIGH`.
+
+    `--language [STR ...]` without a value differs from omitting the flag (None).
     """
     optional = _kind_beside_none(info.type)
     kind = info.type if optional is None else optional
     choices = ("auto", *get_args(kind)) if optional is not None and get_origin(kind) is Literal else None
-    if choices is None and kind not in _VALUE_OF:
+    nargs: Any = 1
+    part: Any = str if choices else kind
+    if choices:
+        metavar = f"{{{','.join(choices)}}}"
+    elif optional in (tuple[int, int], tuple[float, float], tuple[Path, Path]):
+        nargs, part = (1, 2), get_args(kind)[0]
+        metavar = "PATH PATH" if part is Path else "LOW HIGH"
+    elif optional == tuple[str, ...]:
+        nargs, part, metavar = "*", str, "[STR ...]"
+    elif kind in _VALUE_OF:
+        metavar = kind.__name__.upper()
+    else:
         return None
-    value_of = _VALUE_OF[str if choices else kind]
 
     def from_words(words: list[str]) -> Any:
-        return None if optional is not None and words[0] == "auto" else value_of(words[0])
+        if optional is not None and nargs != "*" and words == ["auto"]:
+            return None
+        if nargs == (1, 2) and len(words) != 2:
+            raise ValueError(f"two {'paths' if part is Path else 'numbers'} are needed, {metavar}, or auto")
+        values = tuple(_VALUE_OF[part](word) for word in words)
+        return values[0] if nargs == 1 else values
 
     def is_instance(value: Any) -> bool:
         if value is None:
             return optional is not None
-        return value in choices if choices else isinstance(value, kind)
+        return value in choices if choices else isinstance(value, part if nargs == 1 else tuple)
 
-    return PrimitiveConstructorSpec(
-        nargs=1,
-        metavar=f"{{{','.join(choices)}}}" if choices else kind.__name__.upper(),
-        choices=choices,
-        instance_from_str=from_words,
-        is_instance=is_instance,
-        str_from_instance=lambda value: ["auto" if value is None else str(value)],
-    )
+    def to_words(value: Any) -> list[str]:
+        if value is None:
+            return [] if nargs == "*" else ["auto"]
+        return [str(item) for item in ((value,) if nargs == 1 else value)]
 
-
-@FLAG_TYPES.primitive_rule
-def _optional_pair(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--cube-mass LOW HIGH` with auto for None, where tyro would show `--cube-mass {None}|{FLOAT FLOAT}`."""
-    pair = _kind_beside_none(info.type)
-    if pair not in (tuple[int, int], tuple[float, float], tuple[Path, Path]):
-        return None
-    kind = get_args(pair)[0]
-    metavar, needed = ("PATH PATH", "paths") if kind is Path else ("LOW HIGH", "numbers")
-
-    def from_words(words: list[str]) -> tuple[Any, ...] | None:
-        if words == ["auto"]:
-            return None
-        if len(words) != 2:
-            raise ValueError(f"two {needed} are needed, {metavar}, or auto")
-        return tuple(_VALUE_OF[kind](word) for word in words)
-
-    return PrimitiveConstructorSpec(
-        nargs=(1, 2),
-        metavar=metavar,
-        instance_from_str=from_words,
-        is_instance=lambda value: value is None or (isinstance(value, tuple) and len(value) == 2),
-        str_from_instance=lambda value: ["auto"] if value is None else [str(part) for part in value],
-    )
-
-
-@FLAG_TYPES.primitive_rule
-def _optional_words(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-    """`--language [STR ...]` where omitting the flag (None) differs from giving it without a value."""
-    if _kind_beside_none(info.type) != tuple[str, ...]:
-        return None
-    return PrimitiveConstructorSpec(
-        nargs="*",
-        metavar="[STR ...]",
-        instance_from_str=lambda words: tuple(map(_line_of_text, words)),
-        is_instance=lambda value: value is None or isinstance(value, tuple),
-        str_from_instance=lambda value: [] if value is None else list(value),
-    )
+    return PrimitiveConstructorSpec(nargs, metavar, from_words, is_instance, to_words, choices=choices)
 
 
 def _kind_beside_none(kind: Any) -> Any:
