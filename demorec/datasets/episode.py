@@ -114,7 +114,6 @@ class ExportEpisode[O: CommonOptions]:
         self.depth_left_out = () if options.depth else tuple(only_depth)
 
     def _offered_names(self) -> dict[str, tuple[str, ...]]:
-        """Vector feature -> names of its elements; with a scene, in the requested forms."""
         if self.scene is None:
             return {feature.name: feature.names for feature in self.info.features}
         robot, options = self.info.simulated.robot, self.options
@@ -187,14 +186,9 @@ class ExportEpisode[O: CommonOptions]:
 
     @cached_property
     def vectors(self) -> Mapping[str, NDArray[np.floating[Any]]]:
-        """Feature of `names` -> (T, D), in the recording's precision.
-
-        If frames are left out, an observation is from the first frame of its group and an action from the last: the
-        target at the time of the next observation.
-
-        Raises:
-            ExportError: The recording has no frames, or a number that is not finite.
-            RecordingError: It is damaged.
+        """Feature of `names` -> (T, D), in the recording's precision. If frames are left out, an observation is from
+        the first frame of its group and an action from the last: the target at the time of the next observation. Raises
+        ExportError if the recording has no frames, or a number that is not finite, and RecordingError if it is damaged.
         """
         last_of_group = np.minimum(self.rows + self.stride - 1, self.recording.num_frames - 1)
         frames = dict.fromkeys(self.names, self.rows) | dict.fromkeys((ACTION, COMMAND), last_of_group)
@@ -215,7 +209,6 @@ class ExportEpisode[O: CommonOptions]:
         return vectors
 
     def _scene_observations(self) -> dict[str, NDArray[np.floating[Any]]]:
-        """Observations with a form that needs the scene."""
         vectors = observation_vectors(
             ObservationRows.of_trajectory(self.recording.trajectory(), self.rows),
             self.info.simulated.robot,
@@ -228,9 +221,8 @@ class ExportEpisode[O: CommonOptions]:
 
     @cached_property
     def columns(self) -> Mapping[str, NDArray[np.generic]]:
-        """Feature of `names` -> (T, D) float32, feature of `scalars` -> (T,).
-
-        Raises ExportError for a number that float32 cannot hold, and as in `vectors`.
+        """Feature of `names` -> (T, D) float32, feature of `scalars` -> (T,). Raises ExportError for a number that
+        float32 cannot hold, and as in `vectors`.
         """
         columns: dict[str, NDArray[np.generic]] = {}
         for name, values in self.vectors.items():
@@ -259,12 +251,8 @@ class ExportEpisode[O: CommonOptions]:
             )
 
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
-        """(T,) number of the image that each frame shows, in the order of `recording.packets`.
-
-        A frame without an image shows the camera's last one, if holding is allowed.
-
-        Raises:
-            ExportError: A frame has no image.
+        """(T,) number of the image that each frame shows, in the order of `recording.packets`. A frame without an image
+        shows the camera's last one, if holding is allowed. Raises ExportError if a frame has no image.
         """
         table = self.table
         numbers, stamps = table.images[camera.name].copy(), table.image_stamps[camera.name]
@@ -287,10 +275,8 @@ class ExportEpisode[O: CommonOptions]:
         return numbers[self.rows]
 
     def images(self, camera: ExportCamera) -> Iterator[NDArray[Any]]:
-        """Yield one image per frame: (H, W, 3) uint8 RGB, or (H, W) float32 metres for a depth camera.
-
-        Raises:
-            ExportError: The frames show the images in another order than the camera; and as in `numbers`.
+        """Yield one image per frame: (H, W, 3) uint8 RGB, or (H, W) float32 metres for a depth camera. Raises
+        ExportError if the frames show the images in another order than the camera, and as in `numbers`.
         """
         wanted, recording = self.numbers(camera), self.recording
         if (np.diff(wanted) < 0).any():
@@ -328,11 +314,6 @@ def _refuse_without_scene(info: EpisodeInfo, options: CommonOptions, recording: 
 
 
 def _frame_stride(recording_fps: int, fps: int | None) -> int:
-    """Number of recorded frames per exported frame.
-
-    Raises:
-        ConfigError: The requested fps does not divide the recording's.
-    """
     if fps is None:
         return 1
     if recording_fps % fps:
@@ -344,7 +325,6 @@ def _frame_stride(recording_fps: int, fps: int | None) -> int:
 
 
 def _check_feature_names(options: CommonOptions, offered: Collection[str]) -> None:
-    """Raise ConfigError if `options.features` names a feature that is not offered."""
     for name in options.features:
         if name == ENVIRONMENT_STATE and name not in offered:
             raise ConfigError(f"The feature {name} is named in --features, but only --privileged adds it.")

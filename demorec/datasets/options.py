@@ -103,20 +103,16 @@ _OPEN_END = 2**62
 
 
 def parse_episodes(text: str) -> Callable[[int], bool]:
-    """Parse "0:100", "::2", "7" and lists of them into a test of episode numbers; "" accepts all.
-
-    Raises:
-        OptionError: Invalid text.
+    """Parse "0:100", "::2", "7" and lists of them into a test of episode numbers; "" accepts all. Raises OptionError
+    for invalid text.
     """
     parts = _ranges(text, "episodes")
     return lambda index: not parts or any(index in part for _, part in parts)
 
 
 def select_episodes[E](episodes: Sequence[E], text: str, option: str = "episodes") -> list[E]:
-    """Select episodes, numbered from 0, by a list as in `parse_episodes` and in its order; "" for all.
-
-    Raises:
-        ConfigError: Invalid text, or numbers out of range.
+    """Select episodes, numbered from 0, by a list as in `parse_episodes` and in its order; "" for all. Raises
+    ConfigError for invalid text, or numbers out of range.
     """
     chosen: list[E] = []
     for word, part in _ranges(text, option):

@@ -13,12 +13,9 @@ from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
 
 def find_recordings(paths: Sequence[Path]) -> list[Path]:
-    """Return the recordings in files, runs (folders with episodes/) and folders of recordings, in order.
-
-    Recordings of failed attempts are included.
-
-    Raises:
-        ConfigError: A path is missing, holds no recording, or the same recording is given twice.
+    """Return the recordings in files, runs (folders with episodes/) and folders of recordings, in order. Recordings of
+    failed attempts are included. Raises ConfigError if a path is missing, holds no recording, or the same recording is
+    given twice.
     """
     found: list[Path] = []
     for path in paths:
@@ -36,10 +33,8 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
 
 
 def is_wanted(recording: Recording, options: CommonOptions) -> bool:
-    """Whether the options ask for the episode of a recording (`--episodes`, `--corrected-only`).
-
-    Raises:
-        RecordingError: The recording is damaged.
+    """Whether the options ask for the episode of a recording (`--episodes`, `--corrected-only`). Raises RecordingError
+    if it is damaged.
     """
     if not parse_episodes(options.episodes)(recording.info.episode_index):
         return False
@@ -50,17 +45,15 @@ def is_wanted(recording: Recording, options: CommonOptions) -> bool:
 
 
 def goes_in(recording: Recording, options: CommonOptions) -> bool:
-    """Whether a recording of a wanted episode is exported, rather than left out as a failed attempt.
-
-    An episode with unknown success is not a failure; a recording in a folder `failed` always is.
+    """Whether a recording of a wanted episode is exported, rather than left out as a failed attempt. An episode with
+    unknown success is not a failure; a recording in a folder `failed` always is.
     """
     return options.include_failures or not (recording.has_failed or recording.path.parent.name == "failed")
 
 
 def places_of(files: Sequence[Path]) -> list[Path]:
-    """Return the paths that an export must not overwrite: the recordings, and a run's folders of recordings.
-
-    A dataset next to these folders, such as the run's own, may be replaced.
+    """Return the paths that an export must not overwrite: the recordings, and a run's folders of recordings. A dataset
+    next to these folders, such as the run's own, may be replaced.
     """
     folders = dict.fromkeys(file.absolute().parent for file in files)
     return [*(folder for folder in folders if folder.name in ("episodes", "failed")), *files]

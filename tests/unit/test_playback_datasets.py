@@ -13,8 +13,8 @@ from support.recording import write_episode
 
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
+from demorec.datasets.lerobot.dataset_features import why_not_recorded
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.recorded_features import why_not_recorded
 from demorec.mcap import Recording
 from demorec.view.from_dataset import held, open_dataset_episode
 from demorec.view.save import save

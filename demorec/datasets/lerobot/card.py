@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
@@ -76,40 +76,62 @@ _RECORDED_ROWS = (
     "timestamps are multiples of the nominal period; the recordings have the exact timestamps of the frames and the "
     "age of each sample."
 )
+_CARD = """---
+{license}task_categories:
+- robotics
+tags:
+- LeRobot
+- demorec
+{simulation}configs:
+- config_name: default
+  data_files: data/*/*.parquet
+---
 
+# {repo_id}
 
-class _Origin(NamedTuple):
-    """What a card says of the episodes' origin: licence, tags, sentences, and feature -> meaning."""
+{summary}
+{success}
 
-    licence: str | None
-    tags: tuple[str, ...]
-    demonstrations: str
-    made: str
-    packets: str
-    meaning: Mapping[str, str]
-    rows: str
+## Task
 
+{tasks}
 
-_RECORDED = _Origin(
-    licence=None,
-    tags=(),
-    demonstrations="demonstration{plural} of {robot}",
-    made="Exported by demorec",
-    packets="unchanged",
-    meaning={},
-    rows=_RECORDED_ROWS,
-)
+## Use
+
+```python
+from lerobot.datasets import LeRobotDataset
+
+# or with root="path/of/this/folder"; LeRobot's default backend, torchcodec, needs FFmpeg installed
+dataset = LeRobotDataset("{repo_id}", video_backend="pyav")
+```
+
+## Features
+
+| feature | type | shape | meaning |
+|---|---|---|---|
+{features}
+
+{rows}
+
+`meta/info.json` names all elements. `demorec/` holds data without a column in LeRobot's format.
+"""
+_AGAIN = """
+This command generates it again from this folder alone and compares every episode bit for bit:
+
+```sh
+generate-dataset --config path/of/this/folder --out copy
+```
+
+"""
 
 
 def write_card(
     root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
 ) -> None:
     """Write the card of a finished dataset folder; `meanings` has the features' descriptions in the recordings."""
-    there = root / CARD_PATH
-    path = root / SECOND_CARD_PATH if has_own_card(root) else there
+    path = root / (SECOND_CARD_PATH if has_own_card(root) else CARD_PATH)
     path.unlink(missing_ok=True)
-    lines = _card(root, info, options, meanings, is_transcoded=is_transcoded)
-    write_text(path, _marked("\n".join(lines) + "\n"))
+    write_text(path, _marked(_card(root, info, options, meanings, is_transcoded=is_transcoded)))
 
 
 def has_own_card(root: Path) -> bool:
@@ -129,69 +151,53 @@ def _marked(text: str) -> str:
 
 def _card(
     root: Path, info: DatasetInfo, options: ExportOptions, meanings: Mapping[str, str], *, is_transcoded: bool
-) -> Iterable[str]:
+) -> str:
     configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
-    seeds = rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed"])  # null in recordings of other robots
-    is_simulated = bool(configs) and all(row["root_seed"] is not None for row in seeds)
-    origin = _simulated(options) if is_simulated else _RECORDED
-    sensed = {name: markdown(source) for name, source in meanings.items() if source}
-    meaning = {**_MEANING, **sensed, **origin.meaning}
-    tasks = read_tasks(root)
-    licence = options.license or origin.licence
-    yield "---"
-    if licence is not None:
-        yield f"license: {licence}"
-    yield from ("task_categories:", "- robotics", "tags:", "- LeRobot", "- demorec")
-    yield from origin.tags
-    yield from ("configs:", "- config_name: default", "  data_files: data/*/*.parquet", "---", "")
-    yield from (f"# {options.repo_id}", "", _summary(info, origin, is_transcoded=is_transcoded))
-    yield from (_success(root), "", "## Task", "", *(f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]))
-    if len(tasks) > _MAX_TASKS:
-        yield f"- and {len(tasks) - _MAX_TASKS} more"
-    yield from ("", "## Use", "", "```python", "from lerobot.datasets import LeRobotDataset", "")
-    yield '# or with root="path/of/this/folder"; LeRobot\'s default backend, torchcodec, needs FFmpeg installed'
-    yield from (f'dataset = LeRobotDataset("{options.repo_id}", video_backend="pyav")', "```", "")
-    yield from ("## Features", "", "| feature | type | shape | meaning |", "|---|---|---|---|")
+    rows = list(rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed", "origin"]))
+    # recordings of other robots have no seed
+    is_simulated = bool(configs) and all(row["root_seed"] is not None for row in rows)
+    meaning = {**_MEANING, **{name: markdown(source) for name, source in meanings.items() if source}}
+    if is_simulated:
+        meaning |= {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
+        if options.state == "joint_ee":
+            meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
+    features = []
     for key, item in info.features.items():
         name = f"`{key}`" if markdown(key) == key else markdown(key)
-        yield f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {_feature_meaning(key, item, meaning)} |"
-    yield from ("", origin.rows, "")
-    yield f"`meta/info.json` names all elements. `{SIDECAR_DIR}/` holds data without a column in LeRobot's format."
-    is_one_run = len(configs) == 1 and not options.append
-    if is_one_run and not any(row["origin"] for row in rows_in(root, f"{SIDECAR_DIR}/episodes", ["origin"])):
-        yield from (
-            "",
-            "This command generates it again from this folder alone and compares every episode bit for bit:",
-        )
-        yield from ("", "```sh", "generate-dataset --config path/of/this/folder --out copy", "```", "")
-
-
-def _summary(info: DatasetInfo, origin: _Origin, *, is_transcoded: bool) -> str:
-    """Describe the dataset's content and origin in one paragraph."""
-    demonstrations = origin.demonstrations.format(
-        plural="" if info.total_episodes == 1 else "s", robot=markdown(str(info.robot_type))
+        text = _feature_meaning(key, item, meaning)
+        features.append(f"| {name} | {markdown(item.dtype)} | {list(item.shape)} | {text} |")
+    tasks = read_tasks(root)
+    listed = [f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]]
+    if len(tasks) > _MAX_TASKS:
+        listed.append(f"- and {len(tasks) - _MAX_TASKS} more")
+    licence = options.license or (_OWN_LICENCE if is_simulated else None)
+    card = _CARD.format(
+        license="" if licence is None else f"license: {licence}\n",
+        simulation="- simulation\n" if is_simulated else "",
+        repo_id=options.repo_id,
+        summary=_summary(info, is_simulated=is_simulated, is_transcoded=is_transcoded),
+        success=_success(root),
+        tasks="\n".join(listed),
+        features="\n".join(features),
+        rows=_SIMULATED_ROWS if is_simulated else _RECORDED_ROWS,
     )
+    is_one_run = len(configs) == 1 and not options.append and not any(row["origin"] for row in rows)
+    return card + _AGAIN if is_one_run else card
+
+
+def _summary(info: DatasetInfo, *, is_simulated: bool, is_transcoded: bool) -> str:
+    demonstrations = "demonstration" if info.total_episodes == 1 else "demonstrations"
+    robot = markdown(str(info.robot_type))
+    if is_simulated:
+        content = f"scripted {demonstrations} by a simulated {robot} arm in PyBullet"
+        made, packets = "Recorded and exported by demorec", "stored as recorded"
+    else:
+        content, made, packets = f"{demonstrations} of {robot}", "Exported by demorec", "unchanged"
     minutes = info.total_frames / info.fps / 60
-    images = "some images were encoded again" if is_transcoded else f"video packets are {origin.packets}"
+    images = "some images were encoded again" if is_transcoded else f"video packets are {packets}"
     return (
-        f"{info.total_episodes} {demonstrations}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
-        f"in the LeRobot v3.0 format. {origin.made}; {images}."
-    )
-
-
-def _simulated(options: ExportOptions) -> _Origin:
-    """Return the words for a dataset of episodes that demorec simulated."""
-    meaning = {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
-    if options.state == "joint_ee":
-        meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
-    return _Origin(
-        licence=_OWN_LICENCE,
-        tags=("- simulation",),
-        demonstrations="scripted demonstration{plural} by a simulated {robot} arm in PyBullet",
-        made="Recorded and exported by demorec",
-        packets="stored as recorded",
-        meaning=meaning,
-        rows=_SIMULATED_ROWS,
+        f"{info.total_episodes} {content}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
+        f"in the LeRobot v3.0 format. {made}; {images}."
     )
 
 
@@ -204,7 +210,6 @@ def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str])
 
 
 def _success(root: Path) -> str:
-    """Report the success rate of the attempts made for this dataset, and the number of unknown outcomes."""
     rows = rows_in(root, f"{SIDECAR_DIR}/attempts", ["success"], schema=ATTEMPT_SCHEMA)
     outcomes = [row["success"] for row in rows]
     good, unknown = outcomes.count(True), outcomes.count(None)

@@ -34,7 +34,6 @@ _PARAMETERS = "lossless=1"
 
 def quantised(depth: NDArray[np.float32]) -> NDArray[np.uint16]:
     """(H, W) codes of distances in metres; float32 arithmetic, so that codes equal those of LeRobot's `quantize_depth`.
-
     Values that are not finite, or behind the camera, count as not measured and get code 0.
     """
     shift = np.float32(_SHIFT)

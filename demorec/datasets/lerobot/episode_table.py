@@ -130,7 +130,6 @@ def _old_rows(root: Path, info: DatasetInfo) -> Iterator[tuple[Path, dict[str, A
 
 
 def _check_row(row: dict[str, Any], path: Path) -> None:
-    """Raise ExportError if a row of the episodes' table has impossible positions."""
     for name, value in row.items():
         if name == "tasks":
             is_good = isinstance(value, list) and all(isinstance(task, str) for task in value)
@@ -158,7 +157,6 @@ def read_tasks(root: Path) -> list[str]:
 
 
 def _by_number(rows: Sequence[tuple[object, object]], path: Path) -> list[str]:
-    """List the tasks by number, with "" for missing numbers."""
     found: dict[int, str] = {}
     for number, task in rows:
         if isinstance(number, float) and number.is_integer():

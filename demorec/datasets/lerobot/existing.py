@@ -34,10 +34,8 @@ _CONVERT = "demorec dataset select {} --where 'num_frames > 0' --out NEW"
 
 
 def start_after(folder: LeRobotFolder) -> DatasetStart:
-    """Read the state that a writer needs to continue a dataset.
-
-    Raises:
-        ExportError: It has another format, or is incomplete.
+    """Read the state that a writer needs to continue a dataset. Raises ExportError if it has another format, or is
+    incomplete.
     """
     root, info = folder.root, folder.info
     if info.is_old:
@@ -73,7 +71,6 @@ def start_after(folder: LeRobotFolder) -> DatasetStart:
 
 
 def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statistics | None:
-    """Statistics of a camera in stats.json's form; ValueError and the like for an invalid entry."""
     part = Statistics.from_json(found.get(key, {}))
     if part is None:
         return None
@@ -116,9 +113,8 @@ def features_to_append(root: Path, info: DatasetInfo, new: DatasetInfo) -> tuple
 
 
 def link_files(source: Path, target: Path) -> None:
-    """Link a dataset's finished tables and videos into another folder, or copy them if links are not possible.
-
-    Only files that are never changed in place are linked; files that the writer replaces are left out.
+    """Link a dataset's finished tables and videos into another folder, or copy them if links are not possible. Only
+    files that are never changed in place are linked; files that the writer replaces are left out.
     """
     renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH}
     for folder, _, names in os.walk(source):

@@ -24,10 +24,9 @@ from demorec.datasets.lerobot.facts import STAGE_COLUMNS, fact_types, write_prog
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_digests
 from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
-from demorec.datasets.lerobot.motor_units import NO_PLACE, export_episode
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
-from demorec.datasets.lerobot.prepare import ExportedEpisode, prepare_episode
+from demorec.datasets.lerobot.prepare import NO_PLACE, ExportedEpisode, export_episode, prepare_episode
 from demorec.datasets.lerobot.sidecar import attempt_row
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter
@@ -89,8 +88,6 @@ _ENCODED = ".encoded"
 
 
 class _Export:
-    """One export of recordings, to a new dataset or to the end of an existing one."""
-
     def __init__(self, found: list[Path], options: ExportOptions, existing: LeRobotFolder | None) -> None:
         self._found = found
         self._options = options
@@ -146,7 +143,6 @@ class _Export:
         return [(len(self._before) + index, paths[index]) for index in chosen]
 
     def _start(self, first: ExportedEpisode) -> DatasetStart:
-        """Return the dataset before the first new episode."""
         existing, start = self._existing, self._begin
         if existing is None or start is None:
             return DatasetStart(info=first.info, facts=fact_types(first.data.facts), configs={})
@@ -173,12 +169,11 @@ class _Export:
             writer.add_attempt(recording.attempt)
             return
         self._digests[recording.path] = writer.add(episode.data)
-        if self._options.language is not None and not episode.data.language.persistent:
+        if self._options.language is not None and not episode.has_statements:
             self._silent.append(recording.path.name)
         self._transcoded.update(dict.fromkeys(episode.transcoded))
 
     def _refuse_duplicates(self) -> None:
-        """Raise ConfigError if the dataset already contains new episodes, by their content."""
         there = {digest: number for number, digest in enumerate(self._before)}
         known = {path: there[digest] for path, digest in self._digests.items() if digest in there}
         twice = [f"{path.name} (its episode {number})" for path, number in known.items()]
@@ -202,14 +197,9 @@ class _Export:
 
 
 def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:
-    """Upload the folder as a dataset repository, with the tag of the format's version that LeRobot expects.
-
-    Returns:
-        URL of the repository.
-
-    Raises:
-        ExportError: No token, no network, or no write permission; the folder is unchanged.
-        MissingDependencyError: The Hub's client, part of LeRobot's dependencies, is not installed.
+    """Upload the folder as a dataset repository and return its URL, tagged with the format's version. Raises
+    ExportError without a token, network, or write permission, and MissingDependencyError without the Hub's client; the
+    folder is unchanged.
     """
     try:
         from huggingface_hub import HfApi, get_token
@@ -264,16 +254,7 @@ class ReadRecording:
 
 
 def _read(path: Path, options: ExportOptions, folder: Path | None) -> ReadRecording | None:
-    """Read one recording; None if its episode is not selected (`is_wanted`).
-
-    Args:
-        folder: Folder for files with the images; None keeps them in memory.
-
-    Raises:
-        ConfigError: Options that the recording does not support.
-        RecordingError: The recording is damaged.
-        ExportError: It has no frames, or frames without images.
-    """
+    """Read one recording; None if its episode is not selected (`is_wanted`)."""
     with open_recording(path) as recording:
         if not is_wanted(recording, options):
             return None
@@ -289,10 +270,8 @@ def _read(path: Path, options: ExportOptions, folder: Path | None) -> ReadRecord
 def _read_recordings(
     sources: Sequence[Path], options: ExportOptions, progress: ProgressCallback | None, *, folder: Path
 ) -> Iterator[ReadRecording]:
-    """Yield every selected recording in order.
-
-    Several processes read ahead if that saves time. They store the images in `folder`, because sending them through a
-    pipe takes as long as the rest of the work.
+    """Yield every selected recording in order. Several processes read ahead if that saves time. They store the images
+    in `folder`, because sending them through a pipe takes as long as the rest of the work.
     """
     workers = options.workers or _workers_that_pay(sources, options)
     one = partial(_read, options=options, folder=None if workers == 1 else folder)

@@ -66,10 +66,8 @@ def _stage_runs(row: Mapping[str, Any]) -> list[StageRun]:
 
 
 def write_progress(root: Path) -> None:
-    """Write the files of progress from the stages in the dataset's table of episodes.
-
-    Raises:
-        ExportError: The stages cannot be read.
+    """Write the files of progress from the stages in the dataset's table of episodes. Raises ExportError if they cannot
+    be read.
     """
     try:
         rows = list(rows_in(root, "meta/episodes", [*STAGE_COLUMNS, "num_goals"]))
@@ -110,10 +108,8 @@ def fact_types(names: Iterable[str]) -> dict[str, pa.DataType]:
 
 
 def fact_columns(tables: Sequence[Path]) -> dict[str, pa.DataType]:
-    """Return column -> type for columns of the table of episodes beyond LeRobot's own.
-
-    Raises:
-        ExportError: The table is damaged.
+    """Return column -> type for columns of the table of episodes beyond LeRobot's own. Raises ExportError if the table
+    is damaged.
     """
     schema = open_table(tables[0]).schema_arrow if tables else ()
     return {item.name: item.type for item in schema if not _LEROBOT_COLUMN.match(item.name)}
@@ -141,7 +137,6 @@ def episode_facts(recording: Recording) -> dict[str, Any]:
 
 
 def _first_goal(scene: Scene) -> dict[str, Any]:
-    """Return the first object to be moved, its position and its goal's position at the start (m, world frame)."""
     if not scene.goals:
         return {"object": "", "object_x": None, "object_y": None, "goal_x": None, "goal_y": None}
     goal = scene.goals[0]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import lru_cache
 from importlib.abc import MetaPathFinder
 from pathlib import Path
 from typing import Any
@@ -27,9 +28,8 @@ _MAX_OPEN_TABLES = 16
 
 
 def leave_pandas_out() -> None:
-    """Make PyArrow work without pandas in this process.
-
-    PyArrow would import pandas, which takes longer than most edits, to check whether given lists are pandas objects.
+    """Make PyArrow work without pandas in this process. PyArrow would import pandas, which takes longer than most
+    edits, to check whether given lists are pandas objects.
     """
     finder = _NoPandas()
     sys.meta_path.insert(0, finder)
@@ -50,11 +50,8 @@ def write_text(path: Path, text: str) -> None:
 
 
 def read_json(path: Path) -> Any:
-    """Read a JSON file of a dataset; accepts NaN, which other writers leave in statistics.
-
-    Raises:
-        OSError: It is missing, not a regular file, or very large.
-        ValueError: It is not JSON, or nested too deeply.
+    """Read a JSON file of a dataset; accepts NaN, which other writers leave in statistics. Raises OSError if it is
+    missing, not a regular file, or very large, and ValueError if it is not JSON, or nested too deeply.
     """
     return parse_json(read_text_limited(path, MAX_JSON_BYTES), allow_nan=True)
 
@@ -72,10 +69,8 @@ def read_json_lines(path: Path) -> list[dict[str, Any]]:
 
 
 def open_table(path: Path, columns: Sequence[str] | None = None) -> pq.ParquetFile:
-    """Open a Parquet file with these columns for its footer; only `TableReader` reads its rows.
-
-    Raises:
-        ExportError: It is missing, not a regular file, not Parquet, or lacks a column.
+    """Open a Parquet file with these columns for its footer; only `TableReader` reads its rows. Raises ExportError if
+    it is missing, not a regular file, not Parquet, or lacks a column.
     """
     with _table_errors(path):
         open_regular(path).close()
@@ -111,7 +106,7 @@ def table_batches(
 
 
 class TableReader:
-    """Rows of tables by number; all rows of datasets are read by this class. One batch of a table is in memory.
+    """Rows of tables by number; all rows of datasets are read by this class. One batch of one table is in memory.
 
     Rows requested in ascending order are read in one pass; row groups before the requested rows are skipped.
 
@@ -127,53 +122,23 @@ class TableReader:
         self, columns: Sequence[str] | None = None, *, optional: Sequence[str] = (), rows: int = _ROWS_AT_ONCE
     ) -> None:
         self._columns, self._optional, self._max_rows = columns, optional, rows
-        self._open: dict[Path, _OpenTable] = {}
+        self._table = lru_cache(maxsize=_MAX_OPEN_TABLES)(lambda path: open_table(path, columns))
+        self._path: Path | None = None
+        self._batches: Iterator[pa.RecordBatch] = iter(())
+        self._held: pa.RecordBatch | None = None
+        self._next = 0
 
     def num_rows(self, path: Path) -> int:
         """Number of rows of a table."""
-        return self._table(path).num_rows
+        return int(self._table(path).metadata.num_rows)
 
     def read(self, path: Path, first: int = 0, count: int | None = None) -> Iterator[pa.RecordBatch]:
         """Yield `count` rows from row `first`, by default all; fewer if the table ends earlier."""
-        return self._table(path).read(first, count)
-
-    def _table(self, path: Path) -> _OpenTable:
-        found = self._open.pop(path, None)
-        if self._open and (found is None or len(self._open) >= _MAX_OPEN_TABLES):
-            self._open[next(reversed(self._open))].rest()
-        if found is None:
-            found = _OpenTable(path, self._columns, self._optional, self._max_rows)
-        self._open[path] = found
-        if len(self._open) > _MAX_OPEN_TABLES:
-            del self._open[next(iter(self._open))]
-        return found
-
-
-class _OpenTable:
-    """A table that `TableReader` reads."""
-
-    def __init__(self, path: Path, columns: Sequence[str] | None, optional: Sequence[str], rows: int) -> None:
-        self._path = path
-        self._table = open_table(path, columns)
-        there = self._table.schema_arrow.names
-        added = [name for name in optional if name in there and name not in (columns or ())]
-        self._names = None if columns is None else [*columns, *added]
-        self._max_rows = max(1, min(rows, _BATCH_BYTES // _row_bytes(self._table.metadata, self._names)))
-        self.num_rows: int = self._table.metadata.num_rows
-        self.rest()
-
-    def rest(self) -> None:
-        """Free the batch in memory."""
-        self._batches: Iterator[pa.RecordBatch] = iter(())
-        self._held: pa.RecordBatch | None = None
-        self._next = self.num_rows + 1
-
-    def read(self, first: int, count: int | None) -> Iterator[pa.RecordBatch]:
-        end = self.num_rows if count is None else first + count
-        if first < self._next:
-            self._seek(first)
+        end = self.num_rows(path) if count is None else first + count
+        if path != self._path or first < self._next:
+            self._seek(path, first)
         while self._next < end:
-            with _table_errors(self._path):
+            with _table_errors(path):
                 batch = next(self._batches, None) if self._held is None else self._held
             if batch is None:
                 return
@@ -185,13 +150,18 @@ class _OpenTable:
             if taken:
                 yield batch.slice(skipped, taken)
 
-    def _seek(self, first: int) -> None:
-        metadata = self._table.metadata
+    def _seek(self, path: Path, first: int) -> None:
+        table = self._table(path)
+        names, metadata = table.schema_arrow.names, table.metadata
         begins = np.cumsum([0, *(metadata.row_group(number).num_rows for number in range(metadata.num_row_groups))])
         group = max(0, int(np.searchsorted(begins, first, side="right")) - 1)
         groups = range(group, metadata.num_row_groups)
-        self._held, self._next = None, int(begins[group])
-        self._batches = self._table.iter_batches(batch_size=self._max_rows, row_groups=groups, columns=self._names)
+        columns = self._columns
+        if columns is not None:
+            columns = [*columns, *(name for name in self._optional if name in names and name not in columns)]
+        num_rows = max(1, min(self._max_rows, _BATCH_BYTES // _row_bytes(metadata, columns)))
+        self._path, self._held, self._next = path, None, int(begins[group])
+        self._batches = table.iter_batches(batch_size=num_rows, row_groups=groups, columns=columns)
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:
@@ -225,9 +195,7 @@ def column_numbers(column: pa.Array) -> NDArray[Any]:
 
 
 def _numbers(flat: pa.Array) -> NDArray[Any]:
-    """Numbers of a flat column. PyArrow's own `to_numpy` would first import pandas, which takes a quarter of a
-    second.
-    """
+    """PyArrow's own `to_numpy` would first import pandas, which takes a quarter of a second."""
     if not flat.null_count and (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
         return np.from_dlpack(flat)
     if not flat.null_count and pa.types.is_boolean(flat.type):
@@ -256,7 +224,6 @@ def plain_column(column: pa.Array) -> pa.Array:
 
 @contextmanager
 def _table_errors(path: Path) -> Iterator[None]:
-    """Turn PyArrow's errors into an ExportError; lack of memory implies nothing about the table."""
     try:
         yield
     except (OSError, ValueError, IndexError, KeyError, MemoryError, pa.ArrowException) as error:

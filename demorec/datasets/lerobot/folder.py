@@ -103,7 +103,7 @@ class LeRobotFolder:
     @cached_property
     def roles(self) -> Roles:
         """The role of each feature. Raises ConfigError if the dataset lacks one that the user names."""
-        from demorec.datasets.lerobot.modality import dataset_roles
+        from demorec.datasets.lerobot.dataset_features import dataset_roles
 
         return dataset_roles(self.root, self.info, self._named)
 
@@ -134,7 +134,6 @@ class LeRobotFolder:
 
     @cached_property
     def _short_videos(self) -> tuple[str, ...]:
-        """Sentences about video files of several episodes with fewer images than rows."""
         from demorec.datasets.lerobot.mp4_index import mp4_index
 
         notes: list[str] = []
@@ -236,7 +235,6 @@ class LeRobotFolder:
         )
 
     def _only_task_number(self, place: EpisodePlace) -> int:
-        """Number of an episode's only task, if its rows do not contain one."""
         if len(place.tasks) != 1 or place.tasks[0] not in self.tasks:
             raise ExportError(
                 f"The rows of episode {place.episode_index} have no task_index, and it has {len(place.tasks)} tasks in "
@@ -348,7 +346,7 @@ class LeRobotFolder:
     @cached_property
     def features(self) -> tuple[Feature, ...]:
         """Numeric features of its recordings."""
-        from demorec.datasets.lerobot.recorded_features import recorded_feature, why_not_recorded
+        from demorec.datasets.lerobot.dataset_features import recorded_feature, why_not_recorded
 
         roles = self.roles.beyond_names()
         return tuple(
@@ -371,7 +369,7 @@ class LeRobotFolder:
     @cached_property
     def keys(self) -> Mapping[str, str]:
         """Camera name in recordings -> feature. Raises ConfigError if two cameras would get the same name."""
-        from demorec.datasets.lerobot.recorded_features import camera_name, why_not_recorded
+        from demorec.datasets.lerobot.dataset_features import camera_name, why_not_recorded
 
         found: dict[str, str] = {}
         for key, feature in self.info.features.items():
@@ -397,7 +395,6 @@ class LeRobotFolder:
         raise problem
 
     def _image_format(self, key: str, place: EpisodePlace) -> tuple[int, int, Kept]:
-        """Width, height and codec ("" if encoded as single images) of a camera in an episode."""
         feature = self.info.features[key]
         if feature.is_depth:
             height, width = feature.shape[:2]

@@ -1,4 +1,4 @@
-"""Inspection of a dataset: attempts, missing parts, and the content digest recomputed from its files."""
+"""Inspection of a dataset: attempts, missing parts, values of each episode, stored types, and the content digest."""
 
 from __future__ import annotations
 
@@ -7,22 +7,39 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import pyarrow as pa
+
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.episode_table import EpisodePlace
-from demorec.datasets.lerobot.files import open_table, read_json, read_table
+from demorec.datasets.lerobot.episode_table import EpisodePlace, has_episode_table
+from demorec.datasets.lerobot.files import open_table, read_json, read_json_lines, read_table, table_batches
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import STATS_PATH, DatasetInfo, combined_digest, episode_digest
-from demorec.datasets.lerobot.mp4_index import check_video
+from demorec.datasets.lerobot.layout import (
+    AUTOMATIC_FEATURES,
+    NUMBER_TYPES,
+    OLD_EPISODES_PATH,
+    STATS_PATH,
+    DatasetInfo,
+    FeatureType,
+    combined_digest,
+    episode_digest,
+)
+from demorec.datasets.lerobot.stats import NAMES
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.validity import read_episode_info
 
+OLD_STATS = "meta/episodes_stats.jsonl"
+"""Statistics of each episode before v3.0."""
+_SIDECAR = ("source", "success", "failure_phase", "failure_reason", "num_retries", "attempt", "run_episode_index")
+"""Columns of the sidecar for selecting episodes."""
+_DTYPE_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
+"""Arrow's type names -> LeRobot's, if different."""
+
 
 def attempt_counts(folder: LeRobotFolder) -> tuple[int, int, int] | None:
-    """Count (successful episodes, episodes without a known outcome, attempts made); None if no outcome is known.
-
-    Raises:
-        ExportError: Its tables are damaged.
+    """Count (successful episodes, episodes without a known outcome, attempts made); None if no outcome is known. Raises
+    ExportError if its tables are damaged.
     """
     attempts = folder.sidecar_tables("attempts")
     if not attempts:
@@ -35,12 +52,9 @@ def attempt_counts(folder: LeRobotFolder) -> tuple[int, int, int] | None:
 
 
 def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:
-    """Feature -> units of its elements, from the sidecar's robot and first episode; empty without a sidecar.
-
-    An action with the elements of the state has the state's units.
-
-    Raises:
-        ExportError: The tables or the robot's description are damaged.
+    """Feature -> units of its elements, from the sidecar's robot and first episode; empty without a sidecar. An action
+    with the elements of the state has the state's units. Raises ExportError if the tables or the robot's description
+    are damaged.
     """
     digests = (row["robot_digest"] for row in folder.sidecar(["robot_digest"]))
     digest = next((digest for digest in digests if digest), None)
@@ -63,10 +77,11 @@ def recorded_info(row: Mapping[str, Any], root: Path) -> EpisodeInfo:
 
 
 def dataset_problems(folder: LeRobotFolder) -> list[str]:
-    """List missing, empty and truncated files, one sentence each; reads only the ends of files, which is fast.
-
-    `demorec check` reads their whole content.
+    """List missing, empty and truncated files, one sentence each; reads only the ends of files, which is fast. `demorec
+    check` reads their whole content.
     """
+    from demorec.datasets.lerobot.mp4_index import check_video  # loads libav
+
     problems: list[str] = []
     places: Sequence[EpisodePlace] = ()
     with noted(problems, folder.root):
@@ -126,11 +141,7 @@ def without_digest(info: DatasetInfo) -> list[str]:
 
 
 def check_tables(path: Path) -> None:
-    """Read the ends of all tables and the JSON files to detect empty or truncated ones.
-
-    Raises:
-        ExportError: A file is empty or truncated.
-    """
+    """Read the ends of all tables and the JSON files. Raises ExportError for an empty or truncated one."""
     for file in sorted(path.rglob("*")):
         try:
             if file.suffix == ".parquet":
@@ -142,10 +153,8 @@ def check_tables(path: Path) -> None:
 
 
 def dataset_digest(path: Path) -> str:
-    """SHA-256 (hex) of the content, read back from all files; equals `ExportReport.digest` of a new dataset.
-
-    Raises:
-        ExportError: The dataset is damaged.
+    """SHA-256 (hex) of the content, read back from all files; equals `ExportReport.digest` of a new dataset. Raises
+    ExportError if the dataset is damaged.
     """
     folder = LeRobotFolder(path)
     return combined_digest(folder.info, episode_digests(folder))
@@ -171,3 +180,87 @@ def episode_digests(folder: LeRobotFolder, numbers: Sequence[int] | None = None)
 def video_digests(folder: LeRobotFolder, place: EpisodePlace) -> dict[str, str]:
     """SHA-256 (hex) of an episode's encoded images for each camera feature."""
     return {key: folder.video(key, place).digest() for key in folder.info.video_keys}
+
+
+def episode_columns(folder: LeRobotFolder) -> list[dict[str, Any]]:
+    """Read the values for selecting and sorting: name -> value, for each episode in order."""
+    found = [
+        {
+            "episode_index": place.episode_index,
+            "num_frames": place.length,
+            "length": place.length,
+            "duration_s": place.length / folder.info.fps,
+            "task": "; ".join(place.tasks),
+            "tasks": list(place.tasks),
+        }
+        for place in folder.places
+    ]
+    more = episode_facts(folder)
+    if folder.info.is_old and has_episode_table(folder.root, folder.info):
+        more = read_json_lines(folder.root / OLD_EPISODES_PATH)
+    sidecar = {row["episode_index"]: row for row in folder.sidecar(_SIDECAR)}
+    for row, facts in zip(found, more, strict=True):
+        known = {**sidecar.get(row["episode_index"], {}), **facts}
+        row |= {name: value for name, value in known.items() if name not in row}
+    return found
+
+
+def episode_facts(folder: LeRobotFolder) -> list[dict[str, Any]]:
+    """Read the columns of the episodes' table beyond LeRobot's own, for each episode in order."""
+    if folder.info.is_old or not has_episode_table(folder.root, folder.info):
+        return [{} for _ in folder.places]
+    found: list[dict[str, Any]] = []
+    for path in folder.episode_tables:
+        there = open_table(path).schema_arrow.names
+        for batch in table_batches(path, ["episode_index", *(name for name in folder.fact_types if name in there)]):
+            found += batch.to_pylist()
+    return found
+
+
+def episode_statistics(folder: LeRobotFolder, features: Sequence[str]) -> Iterator[tuple[int, str, Mapping[str, Any]]]:
+    """Yield (episode_index, feature, its available statistics in LeRobot's form)."""
+    if folder.info.is_old:
+        path = folder.root / OLD_STATS
+        for line in read_json_lines(path) if path.exists() else ():
+            stats, number = line.get("stats"), line.get("episode_index")
+            if isinstance(stats, dict) and isinstance(number, int):
+                yield from ((number, name, stats[name]) for name in features if isinstance(stats.get(name), dict))
+        return
+    for path in folder.episode_tables:
+        there = open_table(path).schema_arrow.names
+        quantities = {name: [key for key in NAMES if f"stats/{name}/{key}" in there] for name in features}
+        columns = [f"stats/{name}/{key}" for name, keys in quantities.items() for key in keys]
+        for batch in table_batches(path, ["episode_index", *columns]):
+            for row in batch.to_pylist():
+                for name, keys in quantities.items():
+                    if keys:
+                        yield row["episode_index"], name, {key: row[f"stats/{name}/{key}"] for key in keys}
+
+
+def mistyped_features(source: LeRobotFolder) -> dict[str, FeatureType]:
+    """Find numeric features whose type in the data files differs from info.json -> the files' type. If files differ, it
+    is the type that holds all their numbers.
+    """
+    numeric = {name: feature for name, feature in source.info.features.items() if feature.is_numeric}
+    stored: dict[str, set[str]] = {}
+    for path in source.data_tables:
+        schema = open_table(path).schema_arrow
+        for name in numeric:
+            if name in schema.names:
+                stored.setdefault(name, set()).add(stored_dtype(schema.field(name).type))
+    found: dict[str, FeatureType] = {}
+    for name, dtypes in stored.items():
+        if name in AUTOMATIC_FEATURES and name != "timestamp":
+            continue
+        if dtypes <= set(NUMBER_TYPES) and dtypes != {numeric[name].dtype}:
+            found[name] = str(np.result_type(*dtypes))  # type: ignore[assignment]
+    return found
+
+
+def stored_dtype(column: pa.DataType) -> str:
+    """Return LeRobot's name of the type in a column of numbers, texts, lists or arrays."""
+    if isinstance(column, pa.BaseExtensionType):
+        column = column.storage_type
+    while pa.types.is_list(column) or pa.types.is_fixed_size_list(column) or pa.types.is_large_list(column):
+        column = column.value_type
+    return _DTYPE_NAMES.get(str(column), str(column))

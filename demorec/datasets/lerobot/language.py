@@ -113,15 +113,6 @@ def _structs(found: Sequence[dict[str, Any]], kind: pa.StructType) -> pa.StructA
     return pa.StructArray.from_arrays(arrays, fields=list(kind))
 
 
-def language_digests(language: EpisodeLanguage, frames: int) -> dict[str, NDArray[np.str_]]:
-    """Column -> (T, 1) SHA-256 (hex) of each row's content; equal to `column_digests` of the column read back."""
-    state = _digest(language.persistent)
-    events = np.full((frames, 1), _digest([]))
-    for row, entries in language.events.items():
-        events[row] = _digest(entries)
-    return {PERSISTENT: np.full((frames, 1), state), EVENTS: events}
-
-
 def is_language(kind: pa.DataType) -> bool:
     """Whether a column of this type can hold statements; for empty columns, LeRobot's tools write lists of nulls."""
     listed = pa.types.is_list(kind) or pa.types.is_large_list(kind)
@@ -129,10 +120,8 @@ def is_language(kind: pa.DataType) -> bool:
 
 
 def column_digests(column: pa.Array) -> NDArray[np.str_]:
-    """(T, 1) SHA-256 (hex) of the content of each row of a language column, from any writer.
-
-    Raises:
-        ValueError: It is not a list of structures.
+    """(T, 1) SHA-256 (hex) of the content of each row of a language column, from any writer. Raises ValueError if it is
+    not a list of structures.
     """
     if not is_language(column.type):
         raise ValueError(f"a language column of type {column.type}")
@@ -165,10 +154,8 @@ def _parsed(call: Any) -> Any:
 
 
 def spoken_of(batches: Iterable[pa.RecordBatch], path: Path) -> EpisodeLanguage:
-    """Language of one episode, from any writer, from its rows of both columns; `path` is the dataset's folder.
-
-    Raises:
-        ExportError: They cannot be read.
+    """Language of one episode, from any writer, from its rows of both columns; `path` is the dataset's folder. Raises
+    ExportError if they cannot be read.
     """
     said: list[dict[str, Any]] = []
     events: dict[int, list[dict[str, Any]]] = {}

@@ -277,10 +277,8 @@ class DatasetInfo:
 
     @classmethod
     def load(cls, root: Path) -> DatasetInfo:
-        """Read it from a dataset's folder.
-
-        Raises:
-            ExportError: info.json is missing, or has another version of the format.
+        """Read it from a dataset's folder. Raises ExportError if info.json is missing, or has another version of the
+        format.
         """
         try:
             return cls.from_json(read_json(root / INFO_PATH), root)
@@ -313,7 +311,6 @@ class DatasetInfo:
         return info
 
     def _check(self) -> None:
-        """Raise ValueError for impossible values."""
         for name in ("fps", "total_episodes", "total_frames", "total_tasks", "chunks_size"):
             if not _is_count(getattr(self, name), 0 if name.startswith("total") else 1, 1 << 40):
                 raise ValueError(f"{name} is {reprlib.repr(getattr(self, name))}")
@@ -331,7 +328,6 @@ class DatasetInfo:
 
 
 def _as_new(template: object) -> object:
-    """Convert a path template to v3.0's placeholders."""
     if not isinstance(template, str):
         return template
     return template.replace("{episode_chunk", "{chunk_index").replace("{episode_index", "{file_index")

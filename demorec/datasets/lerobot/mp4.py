@@ -167,7 +167,6 @@ class Mp4Writer:
             video.samples.unlink()
 
     def _mux(self, sample: bytes, is_keyframe: bool, shift: int) -> None:
-        """Append an image with its display position `shift` after its storage position."""
         assert self._file is not None
         packet = av.Packet(sample)
         packet.stream = self._stream

@@ -34,9 +34,8 @@ def _read(file: BinaryIO, begin: int, layout: str) -> tuple[Any, ...]:
 
 
 def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, int]]:
-    """(type, first byte of its content, end) of the boxes in a part of a file.
-
-    A box begins with its length (1: 64 bits follow; 0: to the end) and its type.
+    """(type, first byte of its content, end) of the boxes in a part of a file. A box begins with its length (1: 64 bits
+    follow; 0: to the end) and its type.
     """
     while start + 8 <= end:
         (length, kind), head = _read(file, start, ">I4s"), 8
@@ -50,7 +49,6 @@ def _boxes(file: BinaryIO, start: int, end: int) -> Iterator[tuple[bytes, int, i
 
 
 def _flat(file: BinaryIO, start: int, end: int) -> dict[bytes, bytes]:
-    """Type -> content of all boxes in a part of a file, including nested ones."""
     found, waiting = {}, [(start, end)]
     for part in waiting:
         for kind, begin, stop in _boxes(file, *part):
@@ -135,7 +133,6 @@ def _numbers(box: bytes, start: int, count: int, kind: str = ">u4") -> NDArray[n
 
 
 def _repeated(box: bytes, count: int, *, signed: bool = False) -> NDArray[np.int64]:
-    """Expand a table of runs (count, value)."""
     runs = _numbers(box, 8, 2 * _count(box), ">u4").reshape(-1, 2)
     values = runs[:, 1].astype(np.uint32).astype(np.int32).astype(np.int64) if signed else runs[:, 1]
     if int(runs[:, 0].sum()) != count:
@@ -154,7 +151,6 @@ def _edited(box: bytes) -> int:
 
 
 def _offsets(track: Mapping[bytes, bytes], sizes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Offset of each image, from its chunk."""
     name, kind = (b"co64", ">u8") if b"co64" in track else (b"stco", ">u4")
     chunks = _numbers(track[name], 8, _count(track[name]), kind)
     runs = _numbers(track[b"stsc"], 8, 3 * _count(track[b"stsc"])).reshape(-1, 3)

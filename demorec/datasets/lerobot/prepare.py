@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import islice
 from typing import Any
 
@@ -16,22 +17,29 @@ from demorec.annotate.progress import dense_runs
 from demorec.annotate.statements import episode_statements
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.episode import SCALARS, ExportCamera, ExportEpisode
+from demorec.datasets.episode import DONE, REWARD, SCALARS, SUCCESS, ExportCamera, ExportEpisode
 from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
 from demorec.datasets.lerobot.facts import episode_facts, stage_columns
-from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language
+from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language, language_arrays
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS, motor_features
 from demorec.datasets.lerobot.sidecar import EpisodeRecord
 from demorec.datasets.lerobot.stats import PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.writer import EpisodeData
-from demorec.episode.features import ACTION, IMAGE_PREFIX
+from demorec.episode.episode import Table
+from demorec.episode.features import ACTION, EE_POSE, IMAGE_PREFIX, STATE, VELOCITY
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import scene_of
 from demorec.mcap import Recording, VideoSettings
 from demorec.mcap.video import make_encoder
+from demorec.robots.motors import Motors
 
 LeRobotEpisode = ExportEpisode[ExportOptions]
+NO_PLACE = (VELOCITY, EE_POSE, REWARD, DONE, SUCCESS)
+"""Features that LeRobot does not record from a real arm."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -44,6 +52,7 @@ class ExportedEpisode:
         info: Description of a dataset made from this episode.
         depth_left_out: Depth cameras that were not requested.
         transcoded: Cameras with transcoded images, and the reason.
+        has_statements: Whether it has any language.
         meanings: Feature -> its description in the recording.
     """
 
@@ -52,16 +61,51 @@ class ExportedEpisode:
     info: DatasetInfo
     depth_left_out: tuple[str, ...]
     transcoded: tuple[str, ...]
+    has_statements: bool
     meanings: Mapping[str, str]
 
 
-def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
-    """Read an episode into memory.
+def export_episode(recording: Recording, options: ExportOptions) -> LeRobotEpisode:
+    """Select the frames, features and images of a recording for a dataset with these options. Raises ConfigError for
+    options that the recording does not support, or a calibration that does not fit the arm's servos, and RecordingError
+    if it is damaged.
+    """
+    if options.motor_units is None:
+        return ExportEpisode(recording, options)
+    name = recording.info.robot_name
+    if scene_of(recording.info) is None or name not in IN_MOTOR_UNITS:
+        raise ConfigError(
+            f"Motor units exist for simulated episodes of {', '.join(IN_MOTOR_UNITS)}, not for those "
+            f"of {name or 'an unnamed robot'}: leave out --motor-units: {recording.path}"
+        )
+    motors = IN_MOTOR_UNITS[name].motors(options.motor_units, options.calibration)
+    info, read_table = _info_of_arm(recording, motors), partial(_motor_table, recording, motors)
+    return ExportEpisode(recording, options, info=info, read_table=read_table)
 
-    Raises:
-        ConfigError: Segmentation was requested, but no camera has it.
-        ExportError: The episode has no frames, or frames without images.
-        RecordingError: The recording is damaged.
+
+def _info_of_arm(recording: Recording, motors: Motors) -> EpisodeInfo:
+    simulation = recording.info.simulated
+    return replace(
+        recording.info,
+        robot_name=motors.robot_type,
+        urdf=recording.description(),
+        features=motor_features(motors),
+        origin=f"simulated: {simulation.task}, seed {simulation.root_seed}, configuration {simulation.config_digest}",
+        simulation=None,
+    )
+
+
+def _motor_table(recording: Recording, motors: Motors) -> Table:
+    trajectory, table = recording.trajectory(), recording.table()
+    jaw = recording.info.simulated.robot.gripper.joint_position(trajectory.action_gripper)
+    targets = np.concatenate([trajectory.action_joint_target, jaw], axis=1)
+    values = {STATE: motors.values(trajectory.joint_position), ACTION: motors.values(targets)}
+    return replace(table, features=values, stamps=dict.fromkeys(values, table.time_ns))
+
+
+def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
+    """Read an episode into memory. Raises ConfigError for boxes without segmentation, ExportError if it has no frames,
+    or frames without images, and RecordingError if it is damaged.
     """
     options, recording = episode.options, episode.recording
     reasons = reasons_to_transcode(episode)
@@ -80,13 +124,13 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         video_infos[key] = _video_info(settings)
         found = recording.pixel_statistics(camera.name)
         pixels[key] = PixelHistogram(counts=found.counts, level_values=colour_levels(), num_images=found.num_images)
+    language = language_of(episode)
     data = EpisodeData(
         task=episode.info.instruction,
-        columns=episode.columns,
+        columns={**episode.columns, **language_arrays(language, len(episode.rows))},
         videos=videos,
         video_info=video_infos,
         pixels=pixels,
-        language=language_of(episode),
         facts=_facts(episode),
         record=EpisodeRecord.of(episode),
         boxes=_episode_boxes(episode) if options.boxes else {},
@@ -105,12 +149,12 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         info=info,
         depth_left_out=episode.depth_left_out,
         transcoded=tuple(f"{camera.name}, {reason}" for camera, reason in reasons.items() if reason),
+        has_statements=bool(language.persistent),
         meanings={feature.name: feature.source for feature in episode.info.features},
     )
 
 
 def _dataset_features(episode: LeRobotEpisode, video_infos: Mapping[str, dict[str, Any]]) -> dict[str, DatasetFeature]:
-    """Return the features of a dataset made from this episode, in order."""
     vectors = {
         name: DatasetFeature(dtype="float32", shape=(len(names),), names=names) for name, names in episode.names.items()
     }
@@ -130,9 +174,8 @@ def _dataset_features(episode: LeRobotEpisode, video_infos: Mapping[str, dict[st
 
 
 def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
-    """Return the statements about the episode; empty unless requested.
-
-    Without a scene, the only statements are the subtasks that the source specifies.
+    """Return the statements about the episode; empty unless requested. Without a scene, the only statements are the
+    subtasks that the source specifies.
     """
     options, recording = episode.options, episode.recording
     if options.language is None:
@@ -145,7 +188,6 @@ def language_of(episode: LeRobotEpisode) -> EpisodeLanguage:
 
 
 def _facts(episode: LeRobotEpisode) -> dict[str, Any]:
-    """Return the facts about an episode with a scene, with its stages if requested."""
     if episode.scene is None:
         return {}
     facts = episode_facts(episode.recording)
@@ -155,11 +197,6 @@ def _facts(episode: LeRobotEpisode) -> dict[str, Any]:
 
 
 def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:
-    """Return camera feature -> visible objects, for the cameras with segmentation.
-
-    Raises:
-        ConfigError: No camera has segmentation.
-    """
     boxes = {}
     taken = {camera.name for camera in episode.cameras}
     for camera in episode.info.simulated.scene.cameras:
@@ -180,9 +217,8 @@ def reasons_to_transcode(episode: LeRobotEpisode) -> dict[ExportCamera, str]:
 
 
 def reason_to_transcode(episode: LeRobotEpisode, camera: ExportCamera) -> str:
-    """Explain why the images of a camera cannot pass through; "" if they can.
-
-    If frames are left out, the rest stay decodable only if they are all keyframes.
+    """Explain why the images of a camera cannot pass through; "" if they can. If frames are left out, the rest stay
+    decodable only if they are all keyframes.
     """
     settings = episode.recording.video_settings(camera.name)
     if settings.codec == "jpeg":
@@ -202,7 +238,6 @@ def _ordinal(number: int) -> str:
 
 
 def _lead(recording: Recording, camera: str, number: int) -> int:
-    """Count the images from the last keyframe up to an image; a recorded video begins with a keyframe."""
     if number == 0:
         return 0
     packets = islice(recording.packets(camera), number + 1)
@@ -210,7 +245,6 @@ def _lead(recording: Recording, camera: str, number: int) -> int:
 
 
 def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[EncodedVideo, VideoSettings]:
-    """Re-encode the images of a camera, one per frame."""
     size, options = episode.recording.video_settings(camera.name), episode.options
     video = VideoConfig(codec=options.transcode_codec, crf=options.transcode_crf)
     encoder = make_encoder(video=video, width=size.width, height=size.height, fps=episode.fps)
@@ -247,13 +281,11 @@ def recorded_videos(episode: LeRobotEpisode, cameras: Sequence[ExportCamera]) ->
 
 
 def _mp4_codec(settings: VideoSettings) -> str:
-    """Name of the codec in mp4 files and LeRobot."""
     return "hevc" if settings.codec == "h265" else settings.codec
 
 
 def _video_info(settings: VideoSettings) -> dict[str, Any]:
     """Return the `info` of a camera feature: properties of the video and its encoder settings, null where unknown.
-
     LeRobot transcodes with these settings when it extracts episodes. It replaces null by its default and rejects a GOP
     of 0.
     """

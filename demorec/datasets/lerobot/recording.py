@@ -198,7 +198,6 @@ class DatasetRecording(Episode):
         return 0 if video is None else video.lead
 
     def _has_packets(self, camera: str) -> bool:
-        """Whether recordings can hold a camera's codec."""
         return not self._is_depth[camera] and self.dataset.camera(camera).kept != ""
 
     def _video(self, camera: str) -> EpisodeVideo | None:
@@ -292,7 +291,6 @@ def with_robot(info: EpisodeInfo, robot: DatasetRobot, roles: Roles) -> EpisodeI
 
 
 def _described(camera: Camera, found: Mapping[str, Any] | None, links: set[str]) -> Camera:
-    """Add the sidecar's data to a camera."""
     if found is None:
         return camera
     intrinsics, pose = found["intrinsics"], found["mount_from_camera"]

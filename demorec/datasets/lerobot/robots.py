@@ -106,10 +106,8 @@ class DatasetRobot:
 
 
 def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
-    """Return the robot of an episode with the joints that the features move; None if its URDF is unknown.
-
-    Raises:
-        RecordingError: The recording is damaged.
+    """Return the robot of an episode with the joints that the features move; None if its URDF is unknown. Raises
+    RecordingError if the recording is damaged.
     """
     if not (text := episode.urdf):
         return None
@@ -125,7 +123,6 @@ def robot_of(episode: ExportEpisode[Any]) -> DatasetRobot | None:
 
 
 def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> DatasetRobot:
-    """Build an arm with the joints that these features move; `known` are further attributes of its record."""
     record = RobotRecord(
         name=name,
         urdf_sha256=_sha256(urdf),
@@ -140,7 +137,6 @@ def _robot(name: str, urdf: str, moving: Iterable[Feature], **known: Any) -> Dat
 @functools.cache
 def recognised_robot(names: tuple[str, ...]) -> DatasetRobot | None:
     """Return the row of `ROBOTS` with joints named like the elements of observation.state, such as "panda_joint1.pos".
-
     For datasets without a description of the robot; lengths are those of the model. LeRobot's own arms are left out
     unless the gripper's name implies metres: their joints have the same names in degrees and in percent.
     """
@@ -177,10 +173,9 @@ def robot_of_motors(motors: Motors) -> DatasetRobot:
 
 @functools.lru_cache(maxsize=8)  # usually the same for all recordings of a run
 def portable_urdf(text: str) -> str:
-    """Return the links, joints and materials of a URDF, without paths of the source machine.
-
-    Files in a ROS package are named by package (package://NAME/...), files with other absolute paths by file name only.
-    Comments are removed, because xacro writes its working folder into one.
+    """Return the links, joints and materials of a URDF, without paths of the source machine. Files in a ROS package are
+    named by package (package://NAME/...), files with other absolute paths by file name only. Comments are removed,
+    because xacro writes its working folder into one.
     """
     robot = parse_xml(text)
     for part in list(robot):
@@ -210,10 +205,8 @@ def write_robot(root: Path, robot: DatasetRobot) -> None:
 
 
 def read_robot(root: Path, name: str) -> DatasetRobot:
-    """Read the arm with this digest from a dataset.
-
-    Raises:
-        ExportError: It is missing, has changed since it was written, or cannot be used.
+    """Read the arm with this digest from a dataset. Raises ExportError if it is missing, has changed since it was
+    written, or cannot be used.
     """
     path = root / ROBOTS_DIR / f"{name}.json"
     try:

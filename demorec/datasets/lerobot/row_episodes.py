@@ -94,7 +94,6 @@ def _numbered(path: Path, counters: Mapping[str, NDArray[np.int64]], first: int)
 
 
 def _counters(path: Path) -> dict[str, NDArray[np.int64]]:
-    """The columns of `COUNTERS` that a data file has."""
     schema = open_table(path).schema_arrow
     names = [name for name in COUNTERS if name in schema.names]
     parts: dict[str, list[NDArray[np.int64]]] = {name: [np.zeros(0, np.int64)] for name in names}
@@ -109,10 +108,8 @@ def _counters(path: Path) -> dict[str, NDArray[np.int64]]:
 
 
 def places_by_rows(root: Path, info: DatasetInfo, tasks: Sequence[str]) -> tuple[EpisodePlace, ...]:
-    """Locate every episode by its rows, in the order of their numbers.
-
-    Raises:
-        ExportError: Two episodes have the same number, or the images of an episode cannot be determined.
+    """Locate every episode by its rows, in the order of their numbers. Raises ExportError if two have the same number,
+    or the images of one cannot be determined.
     """
     runs = sorted(episode_runs(tables_in(root, "data")), key=lambda run: run.episode_index)
     numbers = [run.episode_index for run in runs]
@@ -149,10 +146,8 @@ def placed(
 
 
 def images_by_rows(root: Path, info: DatasetInfo, key: str, runs: Sequence[EpisodeRun]) -> list[tuple[Path, int]]:
-    """Locate a camera's images by counting: file and first image of each episode, in order.
-
-    Raises:
-        ExportError: The videos have a different number of images.
+    """Locate a camera's images by counting: file and first image of each episode, in order. Raises ExportError if the
+    videos have a different number of images.
     """
     if info.is_old:
         template, size = info.video_path or VIDEO_PATH, int(info.chunks_size)
@@ -185,9 +180,7 @@ def _unknown_images(root: Path, key: str, found: str) -> ExportError:
 
 def relocated(root: Path, listed: Sequence[EpisodePlace]) -> tuple[EpisodePlace, ...] | None:
     """Locate the rows of episodes if their table names other data files; None if the table fits, or no file does.
-
-    Raises:
-        ExportError: A data file cannot be read.
+    Raises ExportError if a data file cannot be read.
     """
     files = tables_in(root, "data")
     there = {path: open_table(path).metadata.num_rows for path in files}

@@ -86,9 +86,8 @@ class DataRows:
             )
 
     def _completed(self, batch: pa.RecordBatch, place: EpisodePlace, begin: int) -> pa.RecordBatch:
-        """Add missing counters and timestamps, and convert counters to integers.
-
-        The first row of the batch is frame `begin`.
+        """Add missing counters and timestamps, and convert counters to integers. The first row of the batch is frame
+        `begin`.
         """
         frames = np.arange(begin, begin + len(batch))
         for name in self._automatic:
@@ -110,9 +109,8 @@ class DataRows:
         return pa.Table.from_batches(list(self.batches(place)))
 
     def numbers(self, place: EpisodePlace) -> dict[str, NDArray[Any]]:
-        """Read feature -> (T, D) numbers of an episode as info.json describes them, or (T, 1) texts.
-
-        For language and stored images, the texts are digests of each row.
+        """Read feature -> (T, D) numbers of an episode as info.json describes them, or (T, 1) texts. For language and
+        stored images, the texts are digests of each row.
         """
         parts = [
             [self._values(name, batch.column(name), place) for name in self.names] for batch in self.batches(place)
@@ -141,7 +139,6 @@ class DataRows:
 def _implied(
     name: str, frames: NDArray[np.int64], place: EpisodePlace, fps: float, task_number: Callable[[EpisodePlace], int]
 ) -> NDArray[Any]:
-    """Values of a counter or timestamp in some frames of an episode."""
     if name == "timestamp":
         return (frames / fps).astype(np.float32)
     if name == "task_index":
@@ -151,7 +148,6 @@ def _implied(
 
 
 def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequence[str]) -> None:
-    """Raise ExportError unless a batch, which starts at frame `begin`, has rows of this episode."""
     expected = {"episode_index": place.episode_index, "frame_index": np.arange(begin, begin + len(batch))}
     for name, numbers in expected.items():
         if name not in own or name not in batch.schema.names:
@@ -167,7 +163,6 @@ def _check_own(batch: pa.RecordBatch, place: EpisodePlace, begin: int, own: Sequ
 
 @contextmanager
 def _column_errors(name: str, place: EpisodePlace) -> Iterator[None]:
-    """Turn the errors of a column with unexpected content into an ExportError."""
     try:
         yield
     except (ValueError, TypeError, LookupError, pa.ArrowException) as error:
@@ -182,7 +177,6 @@ def column_values(column: pa.Array) -> NDArray[Any]:
 
 
 def _image_digests(column: pa.Array) -> NDArray[np.str_]:
-    """(T, 1) SHA-256 (hex) of each encoded image."""
     images = column.field("bytes") if pa.types.is_struct(column.type) else column
     digests = [hashlib.sha256(data or b"").hexdigest() for data in images.to_pylist()]
     return np.array(digests, dtype=np.str_).reshape(-1, 1)

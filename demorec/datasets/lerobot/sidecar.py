@@ -167,7 +167,6 @@ def _simulated_row(simulation: Simulation, episode: ExportEpisode[Any]) -> dict[
 
 
 def _described_camera(camera: Camera) -> dict[str, Any]:
-    """Return the entry of a camera; None for unknown values."""
     intrinsics = camera.intrinsics
     placed = camera.mount_from_camera
     return {

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.episode_records import OLD_STATS, episode_statistics
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import OLD_STATS, episode_statistics
 from demorec.datasets.lerobot.layout import STATS_PATH
 from demorec.datasets.lerobot.stats import NAMES, QUANTILES
 

@@ -143,9 +143,7 @@ def quantile_ranks(q: float, count: int) -> tuple[int, int, float]:
 
 
 def merge_statistics(parts: Sequence[Statistics]) -> Statistics:
-    """Merge the statistics of several sets of images: exact except for the quantiles, which are averaged as in
-    LeRobot.
-    """
+    """Merge statistics of sets of images: exact except for the quantiles, which are averaged as in LeRobot."""
     if len(parts) == 1:
         return parts[0]
     counts = np.array([part.count for part in parts], dtype=np.float64)
@@ -240,7 +238,6 @@ def _batches(paths: Sequence[Path], names: list[str]) -> Iterator[list[NDArray[A
 
 def _moments(parts: Iterable[Array]) -> tuple[int, dict[str, Array]]:
     """Number of rows of arrays (T, D) that arrive in parts, and their minimum, maximum, mean and standard deviation.
-
     Chan, Golub and LeVeque 1979.
     """
     count = 0

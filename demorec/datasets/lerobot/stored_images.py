@@ -68,7 +68,6 @@ class StoredImages:
 
 
 def _some_rows(columns: Iterable[pa.Array], wanted: Collection[int]) -> Iterator[pa.Array]:
-    """Yield the rows with these numbers from a column that arrives in parts."""
     first = 0
     for column in columns:
         is_wanted = [first + row in wanted for row in range(len(column))]

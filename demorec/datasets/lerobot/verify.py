@@ -24,9 +24,8 @@ from demorec.core.processes import SPAWN, exit_silently
 from demorec.datasets.episode import ExportCamera
 from demorec.datasets.lerobot.depth import DepthScale, quantised
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
-from demorec.datasets.lerobot.motor_units import export_episode
 from demorec.datasets.lerobot.options import ExportOptions
-from demorec.datasets.lerobot.prepare import LeRobotEpisode, language_of, reason_to_transcode
+from demorec.datasets.lerobot.prepare import LeRobotEpisode, export_episode, language_of, reason_to_transcode
 from demorec.mcap import open_recording
 
 LEROBOT = "lerobot[dataset]>=0.6.1,<0.7"
@@ -72,10 +71,8 @@ class Verifier(AbstractContextManager["Verifier"]):
         self._cache.cleanup()
 
     def verify(self, root: Path, samples: Sequence[tuple[int, Path]], options: ExportOptions) -> int:
-        """Compare episodes with their recordings; return the number of frames compared.
-
-        Raises:
-            ExportError: LeRobot cannot open the dataset, or reads values that differ from the recordings.
+        """Compare episodes with their recordings; return the number of frames compared. Raises ExportError if LeRobot
+        cannot open the dataset, or reads values that differ from the recordings.
         """
         try:
             self._pipe.send((root, tuple(samples), options))
@@ -92,7 +89,6 @@ class Verifier(AbstractContextManager["Verifier"]):
 
 
 def _serve(pipe: Connection[Any, Any], cache: str) -> None:
-    """Load LeRobot, verify the dataset named through the pipe, and answer with a count or an error."""
     signal.signal(signal.SIGTERM, exit_silently)  # an orderly end: libraries left semaphores
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C reaches the whole group; the exporting process ends this one
     os.environ.update(HF_HUB_OFFLINE="1", HF_DATASETS_OFFLINE="1", HF_DATASETS_CACHE=cache)

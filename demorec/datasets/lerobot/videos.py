@@ -62,7 +62,6 @@ def opened_video(path: Path) -> Iterator[OpenedVideo]:
 
 @contextmanager
 def _video_errors(path: Path) -> Iterator[None]:
-    """Turn the errors of a video that cannot be read into an ExportError."""
     try:
         yield
     except (OSError, EOFError, ValueError, IndexError, av.FFmpegError) as error:
@@ -116,9 +115,7 @@ class VideoFile:
     @contextmanager
     def access_units(self) -> Iterator[Callable[[bytes], bytes]]:
         """Yield the function that converts a stored image to an access unit of a stream, with start codes or a temporal
-        delimiter.
-
-        Raises ExportError for a codec that recordings cannot hold.
+        delimiter. Raises ExportError for a codec that recordings cannot hold.
         """
         if not self.codec:
             raise ExportError(f"Recordings hold h264, hevc and av1, this video is {self.codec_name}: {self.path}")
@@ -130,9 +127,7 @@ class VideoFile:
             yield lambda sample: b"".join(bytes(part) for part in bits.filter(av.Packet(sample)))
 
     def first_image(self, number: int) -> bytes:
-        """Read a first image in the form of `EncodedVideo.first`; the parameter sets of H.264 and HEVC are the
-        file's.
-        """
+        """Read a first image as `EncodedVideo.first`; the parameter sets of H.264 and HEVC are the file's."""
         if not self.codec:
             with opened_video(self.path) as (_, stream):
                 return one_image_file(next(self.samples([number])), stream)
@@ -231,10 +226,8 @@ class EpisodeVideo:
         return self._whole.lead
 
     def cut(self, first: int = 0, last: int | None = None) -> EncodedVideo:
-        """Extract the images of frames `first` to `last` - 1, with all images from which they are decoded.
-
-        Raises:
-            ExportError: They are missing, or cannot be extracted without re-encoding.
+        """Extract the images of frames `first` to `last` - 1, with all images from which they are decoded. Raises
+        ExportError if they are missing, or cannot be extracted without re-encoding.
         """
         file, part = self.file, self._part(first, self.length if last is None else last)
         if not file.has_long_lengths:
@@ -261,9 +254,7 @@ class EpisodeVideo:
         return digest.hexdigest()
 
     def packets(self) -> Iterator[tuple[int, bytes, bool]]:
-        """Yield (frame, access unit, whether it is a keyframe) for the `lead`, with negative frames, and for T
-        frames.
-        """
+        """Yield (frame, access unit, is a keyframe) for the `lead`, with negative frames, and for T frames."""
         file, part = self.file, self._whole
         claimed = str((self._feature.info or {}).get("video.codec"))
         if PACKET_CODECS.get(claimed, file.codec) != file.codec:
@@ -375,11 +366,9 @@ class EpisodeVideo:
 
 
 def _without_gaps(frames: NDArray[np.int64], begin: int, end: int) -> NDArray[np.intp]:
-    """Indices of the images from `begin`, in storage order, with those that later ones need.
-
-    Storage order and display order may differ. Images stored after the keyframe and shown before it are left out,
-    because they need images that are not included. Images after the last requested one are included until every moment
-    has an image.
+    """Indices of the images from `begin`, in storage order, with those that later ones need. Storage order and display
+    order may differ. Images stored after the keyframe and shown before it are left out, because they need images that
+    are not included. Images after the last requested one are included until every moment has an image.
     """
     last = min(end + _MAX_REORDERED, len(frames))
     while True:

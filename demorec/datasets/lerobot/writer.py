@@ -21,14 +21,7 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing
 from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
 from demorec.datasets.lerobot.files import tables_in, write_text
-from demorec.datasets.lerobot.language import (
-    REPEATING,
-    EpisodeLanguage,
-    column_digests,
-    is_language,
-    language_arrays,
-    language_digests,
-)
+from demorec.datasets.lerobot.language import REPEATING, column_digests, is_language
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     DATA_PATH,
@@ -75,7 +68,6 @@ class EpisodeData:
         videos: Camera feature -> encoded images, T of them.
         video_info: Camera feature -> its encoding, the feature's `info`.
         pixels: Camera feature -> histogram for the statistics, or the statistics if the images were not decoded.
-        language: Statements; written if the dataset has language columns that `columns` lacks.
         facts: Column of the table of episodes -> value; written if the dataset has the column.
         row_tasks: Instruction of each row, if there are several; `task` is the first.
         annotated_tasks: Tasks of annotation columns, which the table of episodes also lists.
@@ -89,7 +81,6 @@ class EpisodeData:
     videos: Mapping[str, EncodedVideo] = field(default_factory=dict)
     video_info: Mapping[str, dict[str, Any]] = field(default_factory=dict)
     pixels: Mapping[str, PixelHistogram | Statistics] = field(default_factory=dict)
-    language: EpisodeLanguage = field(default_factory=EpisodeLanguage)
     facts: Mapping[str, Any] = field(default_factory=dict)
     row_tasks: Sequence[str] = ()
     annotated_tasks: Sequence[str] = ()
@@ -139,18 +130,18 @@ class DatasetWriter(Closing):
         self._numeric = [name for name in self._schema.names if info.features[name].is_numeric]
         arrays = [name for name in self._numeric if len(info.features[name].shape) > 1]
         self._arrays = {name: info.features[name].shape[-1] for name in arrays}
-        self._language = [name for name in self._schema.names if info.features[name].dtype == "language"]
         self._tasks = {task: index for index, task in enumerate(start.tasks)}
         self.num_episodes = info.total_episodes
         self.num_frames = info.total_frames
         strings = [name for name in self._schema.names if info.features[name].dtype == "string"]
+        has_language = any(feature.dtype == "language" for feature in info.features.values())
         self._cameras = [name for name, feature in info.features.items() if feature.is_camera]
         self._data = RollingParquet(
             root,
             DATA_PATH,
             self._schema,
             info,
-            repeating=["episode_index", "task_index", *strings, *(REPEATING if self._language else ())],
+            repeating=["episode_index", "task_index", *strings, *(REPEATING if has_language else ())],
         )
         self._episodes = RollingParquet(root, EPISODES_PATH, self._episode_schema(), info)
         self._videos: dict[str, Mp4Writer] = {}
@@ -181,11 +172,8 @@ class DatasetWriter(Closing):
         tasks = dict.fromkeys(episode.row_tasks or [episode.task])
         task_indices = {task: self._tasks.setdefault(task, len(self._tasks)) for task in tasks}
         task_index = np.array([task_indices[task] for task in episode.row_tasks or [episode.task] * frames])
-        spoken = {name for name in self._language if name not in episode.columns}
         columns = {
-            **{
-                name: episode.columns[name] for name in self._schema.names if name not in {*AUTOMATIC_FEATURES, *spoken}
-            },
+            **{name: episode.columns[name] for name in self._schema.names if name not in AUTOMATIC_FEATURES},
             "timestamp": (
                 (np.arange(frames) / self._info.fps).astype(self._info.features["timestamp"].dtype)
                 if episode.timestamps is None
@@ -197,8 +185,7 @@ class DatasetWriter(Closing):
             "task_index": task_index,
         }
         position = self._data.make_room(frames)
-        texts = language_arrays(episode.language, frames) if spoken else {}
-        self._write_rows({**columns, **{name: texts[name] for name in spoken}})
+        self._write_rows(columns)
         row: dict[str, Any] = {
             "episode_index": self.num_episodes,
             "tasks": list(dict.fromkeys([*tasks, *episode.annotated_tasks])),
@@ -209,7 +196,7 @@ class DatasetWriter(Closing):
             "dataset_to_index": self.num_frames + frames,
             **{name: episode.facts.get(name) for name in self._facts},
         }
-        values = {name: values_of(column) for name, column in columns.items() if name not in self._cameras}
+        values = {name: values_of(columns[name]) for name in self._numeric}
         digests = {}
         for key in self._info.video_keys:
             row.update(self._add_video(key, episode.videos[key], frames))
@@ -219,10 +206,10 @@ class DatasetWriter(Closing):
         statistics |= {key: self._count(key, episode.pixels[key]) for key in self._cameras}
         row |= {f"stats/{key}/{name}": found.nested(name) for key, found in statistics.items() for name in NAMES}
         self._episodes.add_row(row)
-        if spoken:
-            values.update(language_digests(episode.language, frames))
-        has_digest = len(digests) == len(self._cameras) and all(digests.values())
-        digest = episode_digest(episode.task, values, digests) if has_digest else ""
+        digest = ""
+        if len(digests) == len(self._cameras) and all(digests.values()):
+            values |= {name: values_of(column) for name, column in columns.items() if name not in values}
+            digest = episode_digest(episode.task, values, digests)
         if self._sidecar is not None and episode.record is not None:
             self._sidecar.add(self.num_episodes, digest, episode.record)
         self._boxes.add(self.num_episodes, episode.boxes, frames)
@@ -248,7 +235,6 @@ class DatasetWriter(Closing):
         self._data.write(pa.Table.from_arrays(arrays, schema=self._schema))
 
     def _number_statistics(self, values: Mapping[str, NDArray[Any]], frames: int) -> dict[str, Statistics]:
-        """Return the statistics of all numeric features; those of arrays are along the last dimension."""
         statistics = vector_statistics({name: values[name] for name in self._numeric if name not in self._arrays})
         for name, width in self._arrays.items():
             vectors = vector_statistics({name: values[name].reshape(-1, width)})[name]
@@ -256,7 +242,6 @@ class DatasetWriter(Closing):
         return statistics
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
-        """Statistics of a camera in an episode, merged into those of all episodes."""
         if isinstance(pixels, Statistics):
             unseen = self._unseen.setdefault(key, [])
             unseen.append(pixels)

@@ -19,11 +19,11 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.core.plain import parse_json, to_json
 from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
+from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
-from demorec.datasets.lerobot.modality import MODALITY_PATH
 from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord

@@ -15,8 +15,8 @@ from demorec.core.errors import ConfigError, OptionError, check_option, check_se
 from demorec.core.extension import rows_of
 from demorec.core.registry import check_choice, nearest_match
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.episode_records import episode_columns
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import episode_columns
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.extensions.editing.cut import WatchedNumbers
 from demorec.extensions.editing.plan import FeatureMapping, Plan

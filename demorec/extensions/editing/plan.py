@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import mistyped_features
 from demorec.datasets.lerobot.layout import (
     AUTOMATIC_FEATURES,
     CODEBASE_VERSION,
@@ -19,7 +20,6 @@ from demorec.datasets.lerobot.layout import (
     DatasetFeature,
     DatasetInfo,
 )
-from demorec.datasets.lerobot.stored_types import mistyped_features
 from demorec.episode.features import ACTION, STATE
 
 

@@ -15,10 +15,10 @@ import pyarrow as pa
 from demorec.core.errors import ExportError
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, table_batches
 from demorec.datasets.lerobot.folder import LeRobotFolder
+from demorec.datasets.lerobot.inspect import stored_dtype
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
-from demorec.datasets.lerobot.stored_types import stored_dtype
 
 _COUNTS: dict[str, int] = {
     "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1000, "data_files_size_in_mb": 100,

@@ -19,12 +19,12 @@ from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
 from demorec.core.replacing import check_replaceable
-from demorec.datasets.lerobot.episode_records import episode_statistics
 from demorec.datasets.lerobot.episode_table import EpisodePlace, are_on_grid
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, spoken_of
+from demorec.datasets.lerobot.inspect import episode_statistics
+from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, language_arrays, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.paths import DATASET
@@ -180,6 +180,7 @@ class _Reader:
                 known = self._kept(place, mapping.feature) if whole else None
                 pixels[name] = known or self._counted(mapping.feature, cut, rows)
                 num_decoded += known is None
+        columns |= language_arrays(language, len(rows))
         self.num_decoded += num_decoded > 0
         tasks = [cut.task] if cut.task else self._tasks(rows)
         return EpisodeData(
@@ -188,7 +189,6 @@ class _Reader:
             videos=videos,
             video_info=video_info,
             pixels=pixels,
-            language=language,
             facts=self._facts(cut, place),
             row_tasks=tasks if len(set(tasks)) > 1 else (),
             annotated_tasks=[task for task in place.tasks if task in annotated],

@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, Severity, check
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted, range_errors
+from demorec.datasets.lerobot.inspect import noted, range_errors, stored_dtype
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, VIDEO_PATH, DatasetFeature
-from demorec.datasets.lerobot.stored_types import stored_dtype
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.extensions.doctor.evidence import DROP, REPAIR, Evidence
 

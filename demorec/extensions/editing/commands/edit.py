@@ -141,7 +141,7 @@ class EditOne(Edit):
 
 def _changes(plan: Plan) -> list[str]:
     """Lines about the changes of episodes."""
-    from demorec.datasets.lerobot.stored_types import mistyped_features
+    from demorec.datasets.lerobot.inspect import mistyped_features
 
     lines = []
     for source in plan.sources:
