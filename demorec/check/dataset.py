@@ -10,7 +10,7 @@ from typing import Any
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError, ExportError
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted, recorded_info
 from demorec.datasets.lerobot.sidecar import EPISODE_SCHEMA

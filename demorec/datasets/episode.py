@@ -64,27 +64,21 @@ class ExportCamera:
 
 
 class ExportEpisode[O: CommonOptions]:
-    """The frames, features and images of a recording for a dataset with given options.
+    """The frames, features and images of a recording for a dataset with given options. Raises ConfigError for options
+    that the recording does not support.
 
     Args:
-        recording: An open recording.
-        options: Options of the export.
         info: Description of the episode; default: the recording's.
         read_table: Reads the features that `info` lists; default: the recording's.
 
     Attributes:
-        recording, options, info: As given.
         scene: World at the start; None if unknown.
         fps: Frames per second of the dataset.
         stride: Number of recorded frames per exported frame.
         state: Form of `observation.state`.
         names: Vector feature of the dataset -> names of its elements.
         scalars: Features of `SCALARS` in the dataset.
-        cameras: Cameras in the order of the dataset.
         depth_left_out: Cameras with depth only, if depth was not requested.
-
-    Raises:
-        ConfigError: Options that the recording does not support.
     """
 
     def __init__(

@@ -68,10 +68,6 @@ def _attempt_order(file: Path) -> tuple[str, bool, str]:
 class Intake:
     """The recordings of one export: selected ones, and counts of those left out.
 
-    Args:
-        found: All recordings of the export.
-        options: Options of the export.
-
     Attributes:
         num_taken: Number of selected recordings.
         skipped_failures: Number of failed attempts left out.
@@ -85,14 +81,8 @@ class Intake:
         self._first: tuple[Mapping[str, str], Path] | None = None
 
     def take(self, path: Path, traits: Mapping[str, str]) -> None:
-        """Count a selected recording.
-
-        Args:
-            path: The recording.
-            traits: Properties that all recordings must share (`ExportEpisode.traits`).
-
-        Raises:
-            ConfigError: They differ from those of the first one.
+        """Count a selected recording. Raises ConfigError if its `traits` (`ExportEpisode.traits`) differ from the
+        first one's.
         """
         expected, first = self._first = self._first or (traits, path)
         wrong = {name: value for name, value in traits.items() if expected.get(name, value) != value}

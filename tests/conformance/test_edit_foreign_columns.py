@@ -26,7 +26,7 @@ from support.drawn_datasets import PLAIN, STATE, DrawnDataset, encoded, write_dr
 from support.export import recordings
 from support.foreign_dataset import DATA, EPISODES, TASKS, write_foreign
 
-from demorec.datasets.lerobot.episode_table import are_on_grid
+from demorec.datasets.lerobot.episode_places import are_on_grid
 from demorec.mcap import Recording
 from demorec.view.sources import find_episodes
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
@@ -96,37 +96,13 @@ class StoredBoxes:
                 yield frame, str(values["object"]), (x, y, width, height)
 
 
-class BoxWriter(Closing):
-    """Context manager; `finish` completes the files in the dataset's folder."""
+class BoxFile(Closing):
+    """Context manager that writes a COCO file of the dataset at `root`, episode by episode; `finish` completes it. The
+    images' descriptions follow the annotations, which arrive at the same time.
+    """
 
-    def __init__(self, root: Path, *, fps: int) -> None:
-        self._root, self._fps = root, fps
-        self._cameras: dict[str, _CameraFile] = {}
-        self._num_frames = 0
-
-    def close(self) -> None:
-        """Close the files."""
-        for camera in self._cameras.values():
-            camera.close()
-
-    def add(self, episode_index: int, boxes: Mapping[str, SeenByCamera], num_frames: int) -> None:
-        """Add the visible objects of the next episode by camera (feature)."""
-        for key, seen in boxes.items():
-            if key not in self._cameras:
-                self._cameras[key] = _CameraFile(self._root / BOXES_DIR / f"{key}.json", key, self._fps)
-            self._cameras[key].add(episode_index, seen, self._num_frames, num_frames)
-        self._num_frames += num_frames
-
-    def finish(self) -> None:
-        """Complete all files."""
-        for camera in self._cameras.values():
-            camera.finish()
-
-
-class _CameraFile:
-    """One COCO file; the images' descriptions follow the annotations, which arrive at the same time."""
-
-    def __init__(self, path: Path, key: str, fps: int) -> None:
+    def __init__(self, root: Path, key: str, fps: int) -> None:
+        path = root / BOXES_DIR / f"{key}.json"
         path.parent.mkdir(parents=True, exist_ok=True)
         self._key, self._fps = key, fps
         self._annotations: IO[str] = path.open("w")
@@ -136,6 +112,7 @@ class _CameraFile:
         self._episodes: list[tuple[int, int, int, int, int]] = []
 
     def add(self, episode_index: int, seen: SeenByCamera, first_index: int, num_frames: int) -> None:
+        """Add the visible objects of an episode, whose first row in the dataset is `first_index`."""
         width, height, objects = seen
         self._episodes.append((episode_index, first_index, num_frames, width, height))
         for row, noun, values in objects:
@@ -150,6 +127,7 @@ class _CameraFile:
             self._annotations.write((",\n" if self._num_annotations > 1 else "") + json.dumps(annotation))
 
     def finish(self) -> None:
+        """Add the images and categories."""
         self._annotations.write('\n],\n"images": [\n')
         separator = ""
         for episode_index, first_index, num_frames, width, height in self._episodes:
@@ -170,4 +148,5 @@ class _CameraFile:
         self.close()
 
     def close(self) -> None:
+        """Close the file."""
         self._annotations.close()

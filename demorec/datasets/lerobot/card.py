@@ -13,7 +13,7 @@ from typing import Any
 
 from demorec.core.text import markdown
 from demorec.datasets.episode import DONE, INTERVENTION, REWARD, SUCCESS
-from demorec.datasets.lerobot.episode_table import read_tasks
+from demorec.datasets.lerobot.episode_places import read_tasks
 from demorec.datasets.lerobot.files import read_json, rows_in, write_text
 from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo

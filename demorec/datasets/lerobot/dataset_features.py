@@ -44,16 +44,8 @@ class _Group(NamedTuple):
 
 
 def dataset_roles(root: Path, info: DatasetInfo, named: NamedRoles) -> Roles:
-    """The role of each feature of a dataset.
-
-    Args:
-        root: The dataset's folder.
-        info: Content of info.json.
-        named: Roles that the user names.
-
-    Raises:
-        ConfigError: As in `find_roles`.
-        ExportError: modality.json is damaged.
+    """The role of each feature; `named` are the user's. Raises ConfigError as in `find_roles`, and ExportError if
+    modality.json is damaged.
     """
     columns = {name: feature.column for name, feature in info.features.items()}
     return find_roles(columns, named, read_modality(root, info))

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
+from demorec.core.replacing import files_below
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH
 from demorec.datasets.lerobot.files import open_table, read_json, tables_in
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -81,14 +82,8 @@ def _statistics(found: Mapping[str, Any], key: str, info: DatasetInfo) -> Statis
 
 
 def features_to_append(root: Path, info: DatasetInfo, new: DatasetInfo) -> tuple[str, ...]:
-    """Check that recordings provide every feature of a dataset; return their features that it lacks.
-
-    Args:
-        root, info: The existing dataset.
-        new: A dataset made from the recordings alone.
-
-    Raises:
-        ConfigError: Lists all differences.
+    """Check that a dataset made from the recordings alone, `new`, has every feature of the existing one; return the
+    features that only `new` has. Raises ConfigError with all differences.
     """
     offered = new.features
     wrong = []
@@ -116,20 +111,20 @@ def link_files(source: Path, target: Path) -> None:
     """Link a dataset's finished tables and videos into another folder, or copy them if links are not possible. Only
     files that are never changed in place are linked; files that the writer replaces are left out.
     """
-    renewed = {INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH}
-    for folder, _, names in os.walk(source):
-        for name in names:
-            path = Path(folder) / name
-            relative = path.relative_to(source)
-            is_table_or_video = path.suffix in (".parquet", ".mp4")
-            if relative.as_posix() in renewed:
-                continue
-            copy = target / relative
+    renewed = (INFO_PATH, STATS_PATH, TASKS_PATH, PROGRESS_PATH, PROPORTIONS_PATH)
+    for name in files_below(source):
+        if name not in renewed:
+            path, copy = source / name, target / name
             copy.parent.mkdir(parents=True, exist_ok=True)
-            if is_table_or_video and not path.is_symlink():
-                try:
-                    os.link(path, copy)
-                    continue
-                except OSError:
-                    pass  # another file system, or one without links
-            shutil.copy2(path, copy)
+            _link_or_copy(path, copy)
+
+
+def _link_or_copy(path: Path, copy: Path) -> None:
+    if path.suffix in (".parquet", ".mp4") and not path.is_symlink():
+        try:
+            os.link(path, copy)
+        except OSError:
+            pass  # another file system, or one without links
+        else:
+            return
+    shutil.copy2(path, copy)

@@ -45,17 +45,11 @@ _STATED_OPTIONS = (
 def export_lerobot(
     sources: Sequence[Path], out: Path, options: ExportOptions, progress: ProgressCallback | None = None
 ) -> ExportReport:
-    """Write the recordings to the dataset folder `out`, completely or not at all.
-
-    Args:
-        sources: Recordings, runs, or folders of recordings.
-        out: Folder of the dataset.
-        options: Options of the export.
-        progress: Called after every recording.
+    """Write the recordings in files, runs or folders to the dataset folder `out`, completely or not at all.
 
     Raises:
         ConfigError: Options that contradict each other or ask for data that was not recorded, nothing to export,
-        recordings that differ, an existing `out`, or episodes to append that the dataset already has.
+            recordings that differ, an existing `out`, or episodes to append that the dataset already has.
         ExportError: A full disk, a failed verification. `out` is unchanged.
         RecordingError: A recording is damaged.
     """
@@ -240,7 +234,6 @@ class ReadRecording:
     """A recording read for a dataset.
 
     Attributes:
-        path: Path of the recording.
         attempt: Row of the table of attempts.
         outcome: Recorded outcome; None if the recording has none.
         episode: The episode; None for a failed attempt to leave out. Only the metadata of such an attempt is read, so

@@ -165,16 +165,7 @@ class TableReader:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:
-    """Read some columns of a table, or all.
-
-    Args:
-        path: The file.
-        columns: Names; None for all.
-        schema: Required types of the columns.
-
-    Raises:
-        ExportError: As in `open_table`, or a column has another type.
-    """
+    """Read some columns of a table, or all. Raises ExportError as in `open_table`, or if a type differs from `schema`."""
     found = open_table(path, columns).schema_arrow
     for name in columns or ():
         if schema is not None and found.field(name).type != schema.field(name).type:

@@ -21,12 +21,20 @@ from typing import TYPE_CHECKING, Any
 import pyarrow as pa
 
 from demorec.core.errors import ConfigError, ExportError, describe_error
-from demorec.datasets.lerobot.episode_table import EpisodePlace, has_episode_table, read_episode_table, read_tasks
-from demorec.datasets.lerobot.files import open_table, read_json, table_batches, tables_in
+from demorec.datasets.lerobot.episode_places import (
+    REPAIR,
+    EpisodePlace,
+    has_episode_table,
+    places_by_rows,
+    read_episode_table,
+    read_tasks,
+    relocated,
+    rows_by_file,
+)
+from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
 from demorec.datasets.lerobot.language import COLUMNS
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, DatasetInfo
 from demorec.datasets.lerobot.paths import INFO_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.row_episodes import REPAIR, places_by_rows, relocated, rows_by_file
 from demorec.datasets.lerobot.rows import OWN_COUNTERS, DataRows, IndexedRows
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 
@@ -34,8 +42,8 @@ from demorec.episode.roles import NO_NAMES, NamedRoles, Roles
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.boxes import StoredBoxes
     from demorec.datasets.lerobot.robots import DatasetRobot
+    from demorec.datasets.lerobot.rows import StoredImages
     from demorec.datasets.lerobot.sidecar import Attempts
-    from demorec.datasets.lerobot.stored_images import StoredImages
     from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
     from demorec.episode.info import Camera, Feature, Kept
     from demorec.robots.motors import Motors
@@ -59,8 +67,6 @@ class LeRobotFolder:
         info: Replaces the content of meta/info.json.
 
     Attributes:
-        root, motors: As given.
-        info: The content of meta/info.json.
         own_counters: Columns that verify the episode of a row, if the files have them.
         keeps_timestamps: Whether edits keep timestamps that are not multiples of 1/fps.
         keeps_statistics: Whether edits keep the stored statistics of images.
@@ -276,7 +282,7 @@ class LeRobotFolder:
     @cached_property
     def stored_images(self) -> Mapping[str, StoredImages]:
         """Feature -> its images, for features stored in the data files."""
-        from demorec.datasets.lerobot.stored_images import StoredImages
+        from demorec.datasets.lerobot.rows import StoredImages
 
         keys = [name for name, feature in self.info.features.items() if feature.dtype == "image"]
         return {key: StoredImages(self.rows([key])) for key in keys}
@@ -299,13 +305,9 @@ class LeRobotFolder:
 
         found: list[dict[str, Any]] = []
         for path in tables:
-            schema = open_table(path, ["episode_index"]).schema_arrow
-            there = [name for name in ("episode_index", *names) if name in schema.names]
-            for name in there:
-                if schema.field(name).type != EPISODE_SCHEMA.field(name).type:
-                    raise ExportError(f"The column {name} of the sidecar is {schema.field(name).type}: {path}")
-            for batch in table_batches(path, there):
-                found += [dict.fromkeys(names) | row for row in batch.to_pylist()]
+            stored = open_table(path, ["episode_index"]).schema_arrow.names
+            there = [name for name in ("episode_index", *names) if name in stored]
+            found += [dict.fromkeys(names) | row for row in read_table(path, there, schema=EPISODE_SCHEMA).to_pylist()]
         return found
 
     @cached_property

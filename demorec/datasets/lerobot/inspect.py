@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from demorec.core.errors import ExportError, describe_error, resource_error, without_path
-from demorec.datasets.lerobot.episode_table import EpisodePlace, has_episode_table
+from demorec.datasets.lerobot.episode_places import EpisodePlace, has_episode_table
 from demorec.datasets.lerobot.files import open_table, read_json, read_json_lines, read_table, table_batches
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import (

@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, BinaryIO
 
-import av
 import numpy as np
 from numpy.typing import NDArray
 
@@ -85,21 +84,26 @@ def mp4_index(path: Path) -> Index:
             if track is None:
                 raise ValueError("it has no video track")
             return _index(track, size)
-    except (OSError, EOFError, ValueError, KeyError, IndexError, struct.error, av.FFmpegError) as error:
+    except (OSError, EOFError, ValueError, KeyError, IndexError, struct.error) as error:
         raise ExportError(f"The video cannot be read ({describe_error(error)}): {path}") from error
 
 
 def _fragmented_index(path: Path) -> Index:
     """Read the index of a fragmented file (`moof`), with tables in each fragment, from libav's packets."""
+    import av  # the index of other files needs no libav
+
     found: list[tuple[int, int, bool, int]] = []
-    with av.open(str(path), format="mp4") as container:
-        stream = container.streams.video[0]
-        for packet in container.demux(stream):
-            if packet.size:
-                if packet.pos is None or packet.pts is None:
-                    raise ValueError("an image has no place or time")
-                found.append((packet.pos, packet.size, packet.is_keyframe, packet.pts))
-        time_base = float(stream.time_base or 0)
+    try:
+        with av.open(str(path), format="mp4") as container:
+            stream = container.streams.video[0]
+            for packet in container.demux(stream):
+                if packet.size:
+                    if packet.pos is None or packet.pts is None:
+                        raise ValueError("an image has no place or time")
+                    found.append((packet.pos, packet.size, packet.is_keyframe, packet.pts))
+            time_base = float(stream.time_base or 0)
+    except av.FFmpegError as error:
+        raise ValueError(describe_error(error)) from error
     offsets, sizes, are_keyframes, ticks = np.array(found, dtype=np.int64).reshape(-1, 4).T
     return offsets, sizes, are_keyframes.astype(np.bool_), (ticks * time_base).astype(np.float64)
 

@@ -15,7 +15,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import Box
-from demorec.datasets.lerobot.episode_table import are_on_grid
+from demorec.datasets.lerobot.episode_places import are_on_grid
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
@@ -42,14 +42,10 @@ class DatasetRecording(Episode):
     Reading episodes in order takes one pass.
 
     Args:
-        dataset: An open dataset.
-        number: Position of the episode in it, from 0.
+        number: Position of the episode in the dataset, from 0.
 
     Attributes:
-        path: The dataset's folder.
-        dataset, place: Dataset and location of the episode.
         known: The sidecar's data about it; empty if there are none.
-        num_frames: T.
 
     Methods and properties raise ExportError for unreadable files.
     """

@@ -1,24 +1,29 @@
-"""Rows of a dataset's tables by episode: in the data files, and in tables with an `episode_index`."""
+"""Rows of a dataset's tables by episode: in the data files, with images, and in tables with an `episode_index`."""
 
 from __future__ import annotations
 
 import hashlib
+import io
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.files import TableReader, column_numbers, open_table, table_batches
 from demorec.datasets.lerobot.language import column_digests
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
 from demorec.datasets.lerobot.paths import INFO_PATH
+
+if TYPE_CHECKING:
+    from demorec.mcap.video import Rgb
 
 _NUMBERS = ("float32", "float64", "int64", "bool")
 OWN_COUNTERS = ("episode_index", "frame_index")
@@ -33,15 +38,9 @@ class DataRows:
     timestamps are derived from the position of the rows.
 
     Args:
-        features: Features of the dataset.
         num_rows: Data file -> number of its episodes' rows.
-        names: Columns to read.
-        fps: Frames per second.
-        task_number: Returns the number of an episode's task.
+        task_number: Returns the number of the task of an episode whose rows have none.
         own: Columns that verify the rows, if a file has them.
-
-    Attributes:
-        names: Columns to read.
 
     Methods raise ExportError if the rows cannot be read, or belong to other episodes.
     """
@@ -235,3 +234,57 @@ class IndexedRows:
             return pa.RecordBatch.from_arrays(columns, schema=self._schema)
         except (ValueError, pa.ArrowException) as error:
             raise ExportError(f"The table has columns with other types ({describe_error(error)}): {path}") from error
+
+
+class StoredImages:
+    """The images of a camera feature in its column. Methods raise ExportError if an image cannot be read."""
+
+    def __init__(self, rows: DataRows) -> None:
+        self._rows = rows
+        (self._key,) = rows.names
+
+    def read(self, place: EpisodePlace, frames: Collection[int] | None = None) -> Iterator[Rgb]:
+        """Yield (H, W, 3) uint8 RGB of some frames of an episode, of all by default."""
+        columns = (batch.column(self._key) for batch in self._rows.batches(place))
+        yield from self.decode(place, columns if frames is None else _some_rows(columns, frames))
+
+    def decode(self, place: EpisodePlace, columns: Iterable[pa.Array]) -> Iterator[Rgb]:
+        """Yield (H, W, 3) uint8 RGB of some rows of an episode, from their column."""
+        from PIL import Image  # most datasets have videos
+
+        path = place.data
+        shape: tuple[int, ...] | None = None
+        for column in columns:
+            for item in column:
+                value = item.as_py()
+                data = value.get("bytes") if isinstance(value, dict) else value
+                try:
+                    image = self._decoded(data or b"")
+                    if shape not in (None, image.shape):
+                        raise ValueError(f"it has another size, {image.shape[1]}x{image.shape[0]} pixels")
+                except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
+                    raise ExportError(
+                        f"An image of {self._key} cannot be read ({describe_error(error)}): {path}"
+                    ) from error
+                shape = image.shape
+                yield image
+
+    def _decoded(self, data: bytes) -> Rgb:
+        from PIL import Image
+
+        if not data:
+            raise ValueError("it is not in the table")
+        with Image.open(io.BytesIO(data), formats=("JPEG", "PNG")) as image:
+            if image.width * image.height > MAX_PIXELS:
+                raise ValueError(f"{image.width}x{image.height} pixels, at most {MAX_PIXELS:,} are read")
+            if image.mode not in ("RGB", "RGBA", "L", "P", "1"):
+                raise ValueError(f"its pixels are {image.mode!r}, which is not 8-bit colour")
+            return np.asarray(image.convert("RGB"))
+
+
+def _some_rows(columns: Iterable[pa.Array], wanted: Collection[int]) -> Iterator[pa.Array]:
+    first = 0
+    for column in columns:
+        is_wanted = [first + row in wanted for row in range(len(column))]
+        yield column.filter(pa.array(is_wanted, pa.bool_()))
+        first += len(column)

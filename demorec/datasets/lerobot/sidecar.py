@@ -86,17 +86,10 @@ EPISODE_SCHEMA = pa.schema(
 )
 
 
-ATTEMPT_SCHEMA = pa.schema(
-    {
-        "episode_index": _WHOLE,
-        "source": _TEXT,
-        "run_episode_index": _WHOLE,
-        "attempt": _WHOLE,
-        "success": _FLAG,
-        "failure_phase": _TEXT,
-        "failure_reason": _TEXT,
-    }
-)
+_OF_ATTEMPT = (
+    "episode_index", "source", "run_episode_index", "attempt", "success", "failure_phase", "failure_reason",
+)  # fmt: skip
+ATTEMPT_SCHEMA = pa.schema([EPISODE_SCHEMA.field(name) for name in _OF_ATTEMPT])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -256,19 +249,13 @@ def attempt_row(recording: Recording) -> dict[str, Any]:
 
 
 class Attempts:
-    """The rows of a sidecar's table of attempts, grouped by episode.
-
-    Args:
-        paths: Tables of the sidecar.
+    """The rows of a sidecar's table of attempts, grouped by episode. Raises ExportError if a table cannot be read.
 
     Attributes:
         own: Episode -> the attempt that produced it.
         failed: Episode -> failed attempts before it.
         homeless: Failed attempts at episodes that are not in the dataset.
         failures: All failed attempts, in order.
-
-    Raises:
-        ExportError: A table cannot be read.
     """
 
     def __init__(self, paths: Sequence[Path]) -> None:

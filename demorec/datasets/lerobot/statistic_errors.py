@@ -42,7 +42,6 @@ class StatisticError(NamedTuple):
     Attributes:
         episode: Episode whose own statistics are wrong; None for those of the whole dataset.
         place: File with the statistics.
-        feature, quantity: Feature, and its quantity.
         error: Error in standard deviations; infinite if the quantity is missing.
     """
 
@@ -61,7 +60,6 @@ def statistic_errors(
     Those of the whole dataset are left out before v3.0, and if not all episodes are given.
 
     Args:
-        folder: The dataset.
         episodes: Episode number -> feature -> (T, ...) rows.
 
     Raises:

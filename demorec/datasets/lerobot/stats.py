@@ -111,11 +111,7 @@ def colour_levels() -> Array:
 
 
 def vector_statistics(columns: Mapping[str, NDArray[Any]]) -> dict[str, Statistics]:
-    """Statistics of one episode by feature, in one sort over all components.
-
-    Args:
-        columns: Feature -> (T,) or (T, D) numbers or bools.
-    """
+    """Statistics of the columns (T,) or (T, D) of one episode by feature, in one sort over all components."""
     blocks = {name: column.reshape(len(column), -1) for name, column in columns.items()}
     matrix = np.concatenate([block.T for block in blocks.values()], axis=0, dtype=np.float64)  # (components, T)
     count = matrix.shape[1]
@@ -168,14 +164,8 @@ _BATCH_ROWS = 2048
 
 
 def data_statistics(files: Iterable[Path], features: Mapping[str, DatasetFeature]) -> dict[str, Statistics]:
-    """Feature -> statistics over all rows; for arrays of several dimensions along the last one, as in LeRobot.
-
-    Args:
-        files: Parquet files with the columns of `features`.
-        features: All features; those that are not numeric are left out.
-
-    Raises:
-        ExportError: A column holds values that are not numbers, or has no rows.
+    """Feature -> statistics over all rows of Parquet files; for arrays of several dimensions along the last one, as in
+    LeRobot. Raises ExportError if a numeric column holds values that are not numbers, or has no rows.
     """
     paths = list(files)
     groups: dict[int, dict[str, int]] = {}

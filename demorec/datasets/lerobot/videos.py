@@ -25,7 +25,7 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
 from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
@@ -69,10 +69,9 @@ def _video_errors(path: Path) -> Iterator[None]:
 
 
 class VideoFile:
-    """The encoded images of an mp4 file.
+    """The encoded images of an mp4 file. Raises ExportError if it cannot be read.
 
     Attributes:
-        path: Path of the file.
         offsets, sizes, is_keyframe: (N,) of its images, in storage order.
         frames: (N,) int64, number of the frame in which each is shown.
         order: (N,) indices that sort `frames`.
@@ -82,9 +81,6 @@ class VideoFile:
         size, pixels: (width, height) and pixel format, as libav describes them.
         parameters: Parameter sets of the codec.
         has_long_lengths: Whether H.264 and HEVC units have four-byte lengths, as from all common writers.
-
-    Raises:
-        ExportError: The file cannot be read.
     """
 
     def __init__(self, path: Path, fps: float) -> None:
@@ -172,8 +168,6 @@ class EpisodeVideo:
     Args:
         open_file: Opens a video file, or returns an open one.
         key, feature: The camera.
-        place: The episode.
-        fps: Frames per second.
 
     Attributes:
         path: The mp4 file.

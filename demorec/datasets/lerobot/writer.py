@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import Closing
-from demorec.datasets.lerobot.boxes import BoxWriter, SeenByCamera
+from demorec.datasets.lerobot.boxes import BoxFile, SeenByCamera
 from demorec.datasets.lerobot.files import tables_in, write_text
 from demorec.datasets.lerobot.language import REPEATING, column_digests, is_language
 from demorec.datasets.lerobot.layout import (
@@ -150,11 +150,12 @@ class DatasetWriter(Closing):
         self._pixels: dict[str, PixelHistogram] = {}
         self._unseen: dict[str, list[Statistics]] = {}
         self._sidecar = None if start.configs is None else SidecarWriter(root, info, start.configs)
-        self._boxes = BoxWriter(root, fps=info.fps)
+        self._boxes: dict[str, BoxFile] = {}
 
     def close(self) -> None:
         """Release the files; unfinished ones are dropped, or left in place."""
-        self._boxes.close()
+        for boxes in self._boxes.values():
+            boxes.close()
         if self._sidecar is not None:
             self._sidecar.close()
         for video in self._videos.values():
@@ -212,7 +213,10 @@ class DatasetWriter(Closing):
             digest = episode_digest(episode.task, values, digests)
         if self._sidecar is not None and episode.record is not None:
             self._sidecar.add(self.num_episodes, digest, episode.record)
-        self._boxes.add(self.num_episodes, episode.boxes, frames)
+        for key, seen in episode.boxes.items():
+            if key not in self._boxes:
+                self._boxes[key] = BoxFile(self._root, key, self._info.fps)
+            self._boxes[key].add(self.num_episodes, seen, self.num_frames, frames)
         self.num_frames += frames
         self.num_episodes += 1
         return digest
@@ -279,10 +283,8 @@ class DatasetWriter(Closing):
         }
 
     def finish(self, export: Mapping[str, Any]) -> DatasetInfo:
-        """Close all files, write tasks, statistics and info.json; return the content of info.json.
-
-        Args:
-            export: Options and sources of the export, for the sidecar.
+        """Close all files, write tasks, statistics and info.json; return the content of info.json. `export` goes to the
+        sidecar.
         """
         for video in self._videos.values():
             video.close()
@@ -306,7 +308,8 @@ class DatasetWriter(Closing):
             total_tasks=len(self._tasks),
         )
         write_text(self._root / INFO_PATH, info.to_json())
-        self._boxes.finish()
+        for boxes in self._boxes.values():
+            boxes.finish()
         if self._sidecar is not None:
             self._sidecar.finish(export)
         return info

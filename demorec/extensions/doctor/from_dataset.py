@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, ExportError
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors

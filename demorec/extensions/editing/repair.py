@@ -15,10 +15,14 @@ import numpy as np
 
 from demorec.core.errors import ExportError, without_path
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.episode_table import (
+from demorec.datasets.lerobot.episode_places import (
     EpisodePlace,
+    EpisodeRun,
     are_on_grid,
+    episode_runs,
     has_episode_table,
+    images_by_rows,
+    placed,
     read_episode_table,
     read_tasks,
 )
@@ -26,7 +30,6 @@ from demorec.datasets.lerobot.files import column_numbers, open_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.paths import is_dataset_file
-from demorec.datasets.lerobot.row_episodes import EpisodeRun, episode_runs, images_by_rows, placed
 from demorec.datasets.lerobot.rows import DataRows
 from demorec.extensions.editing.plan import Plan
 from demorec.extensions.editing.repair_features import (

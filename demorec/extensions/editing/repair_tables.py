@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from demorec.core.errors import ExportError, without_path
-from demorec.datasets.lerobot.episode_table import EpisodePlace, read_tasks
+from demorec.datasets.lerobot.episode_places import EpisodePlace, read_tasks
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import OLD_STATS, range_errors

@@ -19,7 +19,7 @@ from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
 from demorec.core.replacing import check_replaceable
-from demorec.datasets.lerobot.episode_table import EpisodePlace, are_on_grid
+from demorec.datasets.lerobot.episode_places import EpisodePlace, are_on_grid
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder

@@ -17,7 +17,7 @@ from demorec.core.errors import ConfigError, ExportError, RecordingError, resour
 from demorec.core.files import sha256_of
 from demorec.datasets.lerobot.boxes import BOXES_DIR
 from demorec.datasets.lerobot.dataset_features import NOT_HELD, why_not_recorded
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.facts import PROGRESS_PATH
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import mistyped_features

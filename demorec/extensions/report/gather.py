@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, without_path
 from demorec.core.processes import in_turn
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.episode_table import EpisodePlace
+from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
