@@ -100,18 +100,19 @@ class _Export:
         aside.mkdir(exist_ok=True)
         found = self._noted(_read_recordings(self._found, self._options, progress, folder=aside))
         begun: list[ReadRecording] = []  # until the first episode, which decides the features
-        first = None
-        while first is None:
-            if (recording := next(found, None)) is None:
-                raise self._intake.nothing_to_export()
+        for recording in found:
             begun.append(recording)
-            first = recording.episode
+            if recording.episode is not None:
+                break
+        if not begun or (first := begun[-1].episode) is None:
+            raise self._intake.nothing_to_export()
         with DatasetWriter(folder, self._start(first)) as writer:
             for recording in chain(begun, found):
                 self._add(writer, recording)
             self._refuse_duplicates()
             self._refuse_silence()
-            finished = writer.finish(self._about_this_export())
+            stated = {name: getattr(self._options, name) for name in _STATED_OPTIONS}
+            finished = writer.finish({"demorec": version("demorec"), **stated, "language": list(self._options.spoken)})
         if self._options.progress:
             write_progress(folder)
         write_card(folder, finished, self._options, first.meanings, is_transcoded=bool(self._transcoded))
@@ -184,10 +185,6 @@ class _Export:
                 "These episodes have no language, since no source specifies subtasks "
                 "(in the mapping of an import, [subtasks] names their topic): leave --language out."
             )
-
-    def _about_this_export(self) -> dict[str, Any]:
-        options = {name: getattr(self._options, name) for name in _STATED_OPTIONS}
-        return {"demorec": version("demorec"), **options, "language": list(self._options.spoken)}
 
 
 def push_to_hub(folder: Path, repo_id: str, *, private: bool) -> str:

@@ -165,7 +165,7 @@ class TableReader:
 
 
 def read_table(path: Path, columns: Sequence[str] | None = None, *, schema: pa.Schema | None = None) -> pa.Table:
-    """Read some columns of a table, or all. Raises ExportError as in `open_table`, or if a type differs from `schema`."""
+    """Read some columns of a table, or all. Raises ExportError as in `open_table`, or if `schema` has other types."""
     found = open_table(path, columns).schema_arrow
     for name in columns or ():
         if schema is not None and found.field(name).type != schema.field(name).type:
