@@ -17,7 +17,7 @@ from demorec.core.geometry import Pose
 from demorec.datasets.lerobot.boxes import Box
 from demorec.datasets.lerobot.episode_places import are_on_grid
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.language import spoken_of
+from demorec.datasets.lerobot.language import EpisodeLanguage, spoken_of
 from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robot_of_motors
 from demorec.datasets.lerobot.videos import EpisodeVideo
 from demorec.episode.episode import Outcome, Table
@@ -243,6 +243,12 @@ class DatasetRecording(Episode):
 
     depth = distances
 
+    @cached_property
+    def spoken(self) -> EpisodeLanguage:
+        """Content of its language columns; empty if the dataset has none."""
+        rows = self.dataset.language_rows
+        return EpisodeLanguage() if rows is None else spoken_of(rows.batches(self.place), self.path)
+
     @property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
         """(first frame, subtask), in order; empty if unknown, or if a recording cannot hold one."""
@@ -257,8 +263,7 @@ class DatasetRecording(Episode):
     def _subtasks(self) -> tuple[dict[int, str], str]:
         texts: dict[int, str] = {}
         left_out = ""
-        rows = self.dataset.language_rows
-        for row in () if rows is None else spoken_of(rows.batches(self.place), self.path).persistent:
+        for row in self.spoken.persistent:
             text, begin = str(row.get("content")), row.get("timestamp")
             frame = begin * self.dataset.info.fps if isinstance(begin, float) else -1
             if row.get("style") != "subtask" or not 0 <= frame < self.num_frames:
