@@ -125,9 +125,10 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         found = recording.pixel_statistics(camera.name)
         pixels[key] = PixelHistogram(counts=found.counts, level_values=colour_levels(), num_images=found.num_images)
     language = language_of(episode)
+    language_columns = {} if options.language is None else language_arrays(language, len(episode.rows))
     data = EpisodeData(
         task=episode.info.instruction,
-        columns={**episode.columns, **language_arrays(language, len(episode.rows))},
+        columns={**episode.columns, **language_columns},
         videos=videos,
         video_info=video_infos,
         pixels=pixels,
