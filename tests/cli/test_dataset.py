@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from support.check import edit_json
 from support.commands import exit_code
+from support.export import files_of
 from support.foreign_dataset import write_foreign
 
 
@@ -58,10 +59,6 @@ def cups(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """Write a dataset `cups` of 5 episodes into the current folder."""
     monkeypatch.chdir(tmp_path)
     return write_foreign(tmp_path / "cups", episodes=5)
-
-
-def files_of(root: Path) -> dict[str, bytes]:
-    return {str(path.relative_to(root)): path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file()}
 
 
 def test_parts_are_written_neither_into_the_source_nor_over_existing_files(

@@ -9,14 +9,11 @@ from dataclasses import dataclass
 from itertools import chain
 from pathlib import Path
 
-import av
 import numpy as np
 import pytest
-from av.bitstream import BitStreamFilterContext
 from PIL import Image
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags
-from support.commands import exit_code
 
 from demorec.core.errors import ConfigError
 from demorec.extensions.imports.bag_files import BagError
@@ -203,22 +200,6 @@ def test_a_stream_with_a_gap(keep: Callable[[int], bool], told: str, tmp_path: P
         import_bags([_so101(tmp_path, notes)], _mapping(tmp_path), tmp_path / "run")
 
 
-def test_a_killed_import_continues(tmp_path: Path) -> None:
-    """The import is killed between two episodes of a bag, and within one."""
-    bag = _so101(tmp_path, bags.so101(2.0))
-    cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.7]]\n'
-    mapping, run = _mapping(tmp_path, ("[cameras.front]", cut + "[cameras.front]")), tmp_path / "run"
-    import_bags([bag], mapping, run)
-    whole = {path.name: path.read_bytes() for path in run.glob("episodes/*")}
-    assert len(whole) == 2
-    (run / "import.json").unlink()
-    second = run / "episodes/episode_000001.mcap"
-    second.with_name(f"{second.name}.part").write_bytes(second.read_bytes()[:5000])
-    second.unlink()
-    assert import_bags([bag], mapping, run).num_new == 1
-    assert {path.name: path.read_bytes() for path in run.glob("episodes/*")} == whole
-
-
 def test_an_incomplete_episode_is_dropped_if_the_mapping_asks_for_it(tmp_path: Path) -> None:
     notes = bags.changed(bags.so101(2.0), "/leader/joint_states", lambda k, note: None if 60 <= k < 80 else note)
     cut = '[episodes]\ncut = "times"\ntimes_s = [[0.1, 0.8], [1.0, 1.9]]\n'
@@ -313,56 +294,6 @@ def test_a_run_with_a_replaced_recording_is_refused(tmp_path: Path) -> None:
     shutil.copy(tmp_path / "other_run/episodes/episode_000000.mcap", run / "episodes/episode_000000.mcap")
     with pytest.raises(ConfigError, match="Another recording exists already"):
         import_bags([bag], mapping, run)
-
-
-@pytest.fixture(scope="module")
-def trossen_dataset(tmp_path_factory: pytest.TempPathFactory) -> tuple[bags.Notes, Path]:
-    """Messages with video, and the LeRobot dataset made from them."""
-    folder = tmp_path_factory.mktemp("dataset")
-    notes = bags.trossen(SECONDS)
-    bag = bags.write_trossen(bags.in_order(notes), folder / "bag.mcap")
-    text = bag_mappings.TROSSEN.replace("fps = 30", 'fps = 30\nrows = "/cameras/cam_high/image"')
-    import_bags([bag], bag_mappings.write_mapping(text, folder / "robot.toml"), folder / "run")
-    words = ("export", "lerobot", folder / "run", "--out", folder / "dataset", "--repo-id", "local/x", "--no-verify")
-    assert exit_code(*words) == 0
-    return notes, folder / "dataset"
-
-
-@pytest.mark.slow
-def test_a_lerobot_dataset_of_a_bag(trossen_dataset: tuple[bags.Notes, Path]) -> None:
-    """LeRobot reads the bag's numbers as float32; each row has the message that a brute-force search finds."""
-    from lerobot.datasets.lerobot_dataset import LeRobotDataset
-
-    notes, folder = trossen_dataset
-    dataset = LeRobotDataset("local/x", root=folder, video_backend="pyav")
-    images = bags.of_topic(notes, "/cameras/cam_high/image")
-    arms = [bags.of_topic(notes, f"{arm}/joints/state")[0].header_ns for arm in ("leader", "follower")]
-    images = [image for image in images if image.header_ns >= max(arms)]
-    assert len(dataset) == len(images) < SECONDS * 30
-    for row in range(len(dataset)):
-        time_ns = images[row].header_ns
-        item = dataset[row]
-        for feature, arm in (("observation.state", "follower"), ("action", "leader")):
-            told = [note for note in bags.of_topic(notes, f"{arm}/joints/state") if note.header_ns <= time_ns]
-            assert item[feature].numpy().tobytes() == told[-1].body["positions"].tobytes()
-
-
-@pytest.mark.slow
-def test_kept_packets_are_in_the_dataset_byte_for_byte(trossen_dataset: tuple[bags.Notes, Path]) -> None:
-    notes, folder = trossen_dataset
-    (video,) = (folder / "videos/observation.images.high").rglob("*.mp4")
-    with av.open(str(video)) as container:
-        stream = container.streams.video[0]
-        to_annex_b = BitStreamFilterContext("h264_mp4toannexb", stream)
-        found = [bytes(out) for packet in container.demux(stream) for out in to_annex_b.filter(packet) if out.size]
-    given = [bytes(note.body["data"]) for note in bags.of_topic(notes, "/cameras/cam_high/image")]
-    assert [_slices(packet) for packet in found] == [_slices(packet) for packet in given]
-
-
-def _slices(packet: bytes) -> list[bytes]:
-    """Coded images of an access unit, without parameter sets and with start codes of one length."""
-    units = [unit.rstrip(b"\0") for unit in packet.split(b"\0\0\1")[1:]]
-    return [unit for unit in units if unit[0] & 31 in (1, 5)]
 
 
 def _video(tmp_path: Path, *, gop: int, first: int) -> tuple[Path, Path]:

@@ -70,7 +70,6 @@ HOME = RobotContract.test_home_points_the_hand_down_with_the_fingers_across
 @pytest.mark.parametrize(
     ("change", "test", "words"),
     [
-        ({"tcp_link": "no_such_link"}, SPEC, "tcp_link names the link 'no_such_link', which the URDF lacks"),
         ({"velocity_limit": (1.0, 2.0)}, SPEC, "velocity_limit has 2 numbers for 7 arm joints"),
         ({"position_upper": (9.0,) * 7}, SPEC, "the limits of panda_joint1 are -2.8973 to 9 rad"),
         ({"home_q": (0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0)}, HOME, "at home_q is turned"),

@@ -17,7 +17,7 @@ from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 from support import bag_mappings, bags
 from support.commands import exit_code
-from support.drawn_datasets import ACTION, DRAWN, HEIGHT, REFERENCE, STATE, TOP, WIDTH, DrawnDataset, write_drawn
+from support.drawn_datasets import ACTION, DRAWN, HEIGHT, PLAIN, REFERENCE, STATE, TOP, WIDTH, DrawnDataset, write_drawn
 from support.export import recordings
 from support.stored_episodes import seconds, stored_episodes
 
@@ -35,11 +35,6 @@ PIXELS = {
 MEASURED = ("gray10le", "gray12le", "gray16be")
 """Formats of depth or another measurement, which 8-bit colour would not hold."""
 KINDS = st.sampled_from([(codec, pixels) for codec, formats in PIXELS.items() for pixels in formats])
-PLAIN = DrawnDataset(
-    version="v3.0", lengths=(5, 4), names="list", stored="float32", claimed="float32", is_variable=False, clock="grid",
-    time_type="float32", camera="h264", gop=3, is_fragmented=False, reference="", missing=(), num_files=1, extra=(),
-    has_unlisted=False,
-)  # fmt: skip
 
 
 def command(*words: object) -> tuple[int, str, str]:
@@ -57,7 +52,9 @@ def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
     kind: tuple[str, str], version: str, gop: int, is_fragmented: bool
 ) -> None:
     codec, pixels = kind
-    drawn = replace(PLAIN, camera=codec, pixels=pixels, version=version, gop=gop, is_fragmented=is_fragmented)
+    drawn = replace(
+        PLAIN, is_variable=False, camera=codec, pixels=pixels, version=version, gop=gop, is_fragmented=is_fragmented
+    )
     with tempfile.TemporaryDirectory() as folder:
         source, run = write_drawn(Path(folder) / "set", drawn), Path(folder) / "run"
         with av.open(str(next(source.rglob("*.mp4")))) as file:
