@@ -105,7 +105,7 @@ def _scan_topics(container: Container) -> dict[str, TopicScan]:
         times[topic].append(time_ns)
         if schemas[topic] in _STAMP_FIRST:
             stamps[topic].append(_stamp_ns(data))
-    for name in container.attachment_names:
+    for name in container.attachments:
         container.attachment(name)
     return {
         topic: TopicScan(

@@ -114,7 +114,7 @@ class Layout:
         value_slots: (K,) offsets of the values, of eight bytes each like the timestamps.
     """
 
-    dtype: Literal["<f8", "<i8"] = "<f8"
+    dtype: Literal["<f8", "<i8"]
     constant: NDArray[np.uint8]
     time_slots: NDArray[np.intp]
     value_slots: NDArray[np.intp]
@@ -143,15 +143,8 @@ class Layout:
         data = rows.tobytes()
         return [data[start : start + length] for start in range(4, count * width, width)]
 
-    def decode(self, messages: Sequence[bytes]) -> NDArray[Any]:
-        """Decode (N, K) values; ValueError unless every message matches this layout in all its constant bytes."""
-        length = len(self.constant)
-        if found := [len(message) for message in messages if len(message) != length]:
-            raise ValueError(f"a message of {found[0]} bytes where {length} were expected")
-        return self.decode_rows(np.frombuffer(b"".join(messages), dtype=np.uint8).reshape(len(messages), length))
-
-    def decode_rows(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
-        """Decode (N, K) values of messages of the right length, given as (N, L) bytes; raises as `decode`."""
+    def decode(self, rows: NDArray[np.uint8]) -> NDArray[Any]:
+        """Decode (N, K) values of messages (N, L); ValueError unless each matches this layout's constant bytes."""
         values = np.empty((len(rows), len(self.value_slots)), dtype=self.dtype)
         rest = rows.copy()
         column = 0
@@ -192,7 +185,6 @@ class Readers:
     """Readers of the types in a definition, which is data: one per type, however often it occurs.
 
     Args:
-        types: The definition.
         order: Byte order of numbers, "<" or ">".
         is_aligned: Whether numbers are aligned, as in CDR; those of ROS 1 are not.
         text: Function that decodes the bytes of a string.
@@ -214,7 +206,7 @@ class Readers:
         return self._message(kind, 0)[0]
 
     def _message(self, kind: str, depth: int) -> tuple[Reader, int]:
-        """Return the reader of a type at a nesting depth, and the depth of the types nested in it."""
+        """Return a reader, and the depth of the types nested in its type."""
         found = self._made.get(kind)
         if depth + (found[1] if found else 0) > _MAX_DEPTH:
             raise ValueError("its definition is nested too deeply")
@@ -255,9 +247,7 @@ class Readers:
             raise ValueError(f"it has a field of the unsupported type {kind}")
         number = struct.Struct(self._order + _CODES[kind])
         size, unpack = number.size, number.unpack_from
-        if not self._is_aligned or size == 1:
-            return lambda data, position: (unpack(data, position)[0], position + size)
-        mask = size - 1
+        mask = size - 1 if self._is_aligned else 0
 
         def read(data: memoryview, position: int) -> tuple[Any, int]:
             position = (position + mask) & ~mask
@@ -330,11 +320,7 @@ def _reader_of(schema: str, text: Callable[[bytes], str]) -> Reader:
 
 
 def decode(schema: str, data: bytes, *, text: Callable[[bytes], str] = strict_text) -> tuple[Values, int]:
-    """Decode a message of a recorded type; also returns the number of bytes left after it.
-
-    Raises:
-        ValueError: It is too short or of another encoding.
-    """
+    """Decode a message of a recorded type, and the number of bytes left after it; ValueError if it is damaged."""
     if data[:4] != HEADER:
         raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, not 00010000")
     return read_whole(_reader_of(schema, text), memoryview(data)[4:])

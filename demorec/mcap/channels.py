@@ -24,6 +24,11 @@ PHASE_EVENT = "phase"
 """Name of the events that the writer adds at each phase change, so that a log shows them."""
 
 
+def feature_topic(name: str) -> str:
+    """Topic of a feature of an episode that demorec did not simulate."""
+    return "/" + name.replace(".", "/")
+
+
 def object_topic(name: str) -> str:
     """Topic of a movable body's pose."""
     return f"/object/{name}/pose"

@@ -18,13 +18,17 @@ from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Foote
 
 from demorec.core.errors import RecordingError, ResourceError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular
-from demorec.mcap.chunks import RECORD_HEAD, Block, blocks_of, chunk_content, records_in
 from demorec.mcap.scan import (
     MESSAGE_HEAD,
     NO_SCHEMA,
+    RECORD_HEAD,
+    Block,
+    blocks_of,
+    chunk_content,
     read_channel,
     read_record,
     read_schema,
+    records_in,
 )
 
 _FOOTER_BYTES = RECORD_HEAD.size + 20
@@ -54,7 +58,9 @@ class Container:
 
     Attributes:
         channels: topic -> channel.
+        schemas: number -> schema.
         counts: topic -> number of messages.
+        metadata_index, attachments: name -> position in the file.
 
     Raises:
         RecordingError: The file does not exist, is not MCAP, is truncated, or has a wrong checksum.
@@ -93,19 +99,19 @@ class Container:
         footer_start = size - tail_bytes
         footer = read_record(self._content_at(footer_start, _FOOTER_BYTES, Opcode.FOOTER), Footer)
         if not len(MCAP_MAGIC) <= footer.summary_start < footer_start:
-            raise RecordingError(f"The recording is damaged or has no index: {self.path}")
+            raise ValueError("it has no index")
         # The checksum covers the summary and the footer up to the checksum itself.
         summary = self._read_at(footer.summary_start, footer_start - footer.summary_start + _FOOTER_BYTES - 4)
         if footer.summary_crc and zlib.crc32(summary) != footer.summary_crc:
-            raise RecordingError(f"The recording is damaged: the checksum of its index does not match: {self.path}")
+            raise ValueError("the checksum of its index does not match")
         self._parse_summary(summary[: footer_start - footer.summary_start])
 
     def _parse_summary(self, summary: bytes) -> None:
         channels: dict[int, Channel] = {}
         self.schemas = {0: NO_SCHEMA}
         self._chunks: list[ChunkIndex] = []
-        self._metadata: dict[str, MetadataIndex] = {}
-        self._attachments: dict[str, AttachmentIndex] = {}
+        self.metadata_index: dict[str, MetadataIndex] = {}
+        self.attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
         for opcode, start, end in records_in(summary, "the file's index"):
             content = summary[start:end]
@@ -119,10 +125,10 @@ class Container:
                 self._chunks.append(read_record(content, ChunkIndex))
             elif opcode == Opcode.METADATA_INDEX:
                 metadata = read_record(content, MetadataIndex)
-                self._metadata[metadata.name] = metadata
+                self.metadata_index[metadata.name] = metadata
             elif opcode == Opcode.ATTACHMENT_INDEX:
                 attachment = read_record(content, AttachmentIndex)
-                self._attachments[attachment.name] = attachment
+                self.attachments[attachment.name] = attachment
             elif opcode == Opcode.STATISTICS:
                 counts = dict(read_record(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
@@ -134,53 +140,39 @@ class Container:
 
     def _read_at(self, offset: int, length: int) -> bytes:
         if not 0 <= length <= self._size:
-            raise RecordingError(f"The recording is damaged: a record of {length} bytes: {self.path}")
+            raise ValueError(f"a record of {length} bytes")
         if self._file.closed:
             raise RecordingError(f"The recording was closed before it was read: {self.path}")
         self._file.seek(offset)
         data = self._file.read(length)
         if len(data) != length:
-            raise RecordingError(f"The recording is damaged or cut off: {self.path}")
+            raise ValueError("it is cut off")
         return data
 
     def _content_at(self, offset: int, length: int, opcode: Opcode) -> memoryview:
         data = self._read_at(offset, length)
         found, content_length = RECORD_HEAD.unpack_from(data)
         if found != opcode or content_length != length - RECORD_HEAD.size:
-            raise RecordingError(
-                f"The recording is damaged: no {opcode.name.capitalize()} at the place in its index: {self.path}"
-            )
+            raise ValueError(f"no {opcode.name.capitalize()} at the place in its index")
         return memoryview(data)[RECORD_HEAD.size :]
-
-    @property
-    def metadata_names(self) -> tuple[str, ...]:
-        """Names of all metadata records."""
-        return tuple(self._metadata)
 
     def metadata(self, name: str) -> dict[str, str] | None:
         """Return a metadata record, or None; the caller checks its seal."""
-        index = self._metadata.get(name)
+        index = self.metadata_index.get(name)
         if index is None:
             return None
         with damage_as_recording_error(self.path):
             record = read_record(self._content_at(index.offset, index.length, Opcode.METADATA), Metadata)
             return dict(record.metadata)
 
-    @property
-    def attachment_names(self) -> tuple[str, ...]:
-        """Names of all attachments."""
-        return tuple(self._attachments)
-
     def attachment(self, name: str) -> bytes:
         """Read the bytes of an attachment; KeyError if it does not exist."""
-        index = self._attachments[name]
+        index = self.attachments[name]
         with damage_as_recording_error(self.path):
             content = self._content_at(index.offset, index.length, Opcode.ATTACHMENT)
             stored = int.from_bytes(content[-4:], "little")
             if stored and zlib.crc32(content[:-4]) != stored:
-                raise RecordingError(
-                    f"The recording is damaged: the attachment {name!r} fails its checksum: {self.path}"
-                )
+                raise ValueError(f"the attachment {name!r} fails its checksum")
             return bytes(read_record(content, Attachment).data)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
@@ -194,14 +186,8 @@ class Container:
                         if channel in wanted:
                             yield wanted[channel], time_ns, content[start + MESSAGE_HEAD.size : end]
 
-    def blocks(self, topics: Collection[str]) -> dict[str, Block]:
-        """Read topic -> all its messages; their chunks are in memory together."""
-        wanted = self._ids(topics)
-        with damage_as_recording_error(self.path):
-            return blocks_of(self._unpacked(self._chunks_of(wanted.values())), wanted)
-
     def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
-        """Read as `blocks`, but one or a few chunks at a time, up to `num_bytes` unpacked.
+        """Yield topic -> its messages in one or a few chunks at a time, up to `num_bytes` unpacked.
 
         If no chunk has any, one result without messages is yielded.
         """
@@ -222,7 +208,6 @@ class Container:
         return {topic: self.channels[topic].id if topic in self.channels else -1 for topic in topics}
 
     def _chunks_of(self, channels: Collection[int]) -> list[ChunkIndex]:
-        """List the chunks with messages of any of these channels; the others are not read."""
         return [chunk for chunk in self._chunks if not chunk.message_index_offsets.keys().isdisjoint(channels)]
 
     def _unpacked(self, chunks: Iterable[ChunkIndex]) -> Iterator[bytes]:

@@ -10,14 +10,13 @@ import functools
 import math
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from demorec.core.errors import SceneError, describe_error
-from demorec.core.geometry import Pose
+from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba
 from demorec.robots.assets import asset_path, mesh_path, surface_file
 from demorec.robots.collada import read_collada
@@ -36,19 +35,8 @@ _KINDS: dict[str, Literal["box", "sphere", "cylinder"]] = {
 """Shape -> primitive; the ends of a capsule are added as spheres."""
 
 
-@dataclass(frozen=True, kw_only=True)
-class Primitive:
-    """A box, a cylinder along z, or a sphere.
-
-    Attributes:
-        kind: Kind of primitive.
-        size: box: full extents; cylinder: (radius, length); sphere: (radius,).
-        center: (x, y, z) in the frame of the shape.
-    """
-
-    kind: Literal["box", "cylinder", "sphere"]
-    size: tuple[float, ...]
-    center: tuple[float, float, float] = (0.0, 0.0, 0.0)
+_Primitive = tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...], Pose]
+"""Kind, size and pose. A box has full extents, a cylinder along z radius and length, a sphere its radius."""
 
 
 @functools.lru_cache(maxsize=8)
@@ -63,12 +51,7 @@ def robot_description(urdf: str, scale: float) -> str:
 
 
 def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
-    """As `robot_description`, from the text of a URDF with meshes below `folder`.
-
-    Raises:
-        SceneError: A mesh cannot be read.
-        ValueError: The text is not a URDF.
-    """
+    """As `robot_description`, from the text of a URDF with meshes below `folder`; ValueError if it is not a URDF."""
     source = parse_xml(text)
     robot = ET.Element("robot", name=source.get("name", "robot"))
     for link in read_links(text, scale=scale):
@@ -79,7 +62,7 @@ def self_contained(text: str, folder: Path, *, scale: float = 1.0) -> str:
         for index, shape in enumerate(shapes):
             visual = link.visuals[min(index, len(link.visuals) - 1)]
             for primitive in _primitives(shape, folder):
-                _add_visual(target, primitive, shape.link_from_shape, visual.rgba or _WHITE)
+                _add_visual(target, primitive, visual.rgba or _WHITE)
     for joint in source.findall("joint"):
         robot.append(_joint(joint, scale))
     return _text(robot)
@@ -89,72 +72,72 @@ def body_description(body: Body) -> str:
     """Make a URDF of one link, named like the body."""
     robot = ET.Element("robot", name=body.name)
     link = ET.SubElement(robot, "link", name=body.name)
-    for primitive, pose in _body_primitives(body):
-        _add_visual(link, primitive, pose, body.mean_color)
+    for primitive in _body_primitives(body):
+        _add_visual(link, primitive, body.mean_color)
     return _text(robot)
 
 
-def _body_primitives(body: Body) -> Iterator[tuple[Primitive, Pose]]:
+def _body_primitives(body: Body) -> Iterator[_Primitive]:
     shape = body.shape
     if shape.kind == "mesh":
-        yield _bounding_box(surface_file(shape), (shape.scale,) * 3), shape.body_from_mesh
+        yield _bounding_box(surface_file(shape), (shape.scale,) * 3, shape.body_from_mesh)
     elif shape.kind == "urdf":
         path = asset_path(shape.file)
         for link in read_links(path.read_text(), scale=shape.scale):
             for visual in link.visuals:
-                for primitive in _primitives(visual, path.parent):
-                    yield primitive, visual.link_from_shape
+                yield from _primitives(visual, path.parent)
     else:
-        yield Primitive(kind=_KINDS[shape.kind], size=shape.size), Pose()
+        yield _KINDS[shape.kind], shape.size, Pose()
         if shape.kind == "capsule":
             radius, length = shape.size
             for end in (-length / 2, length / 2):
-                yield Primitive(kind="sphere", center=(0.0, 0.0, end), size=(radius,)), Pose()
+                yield "sphere", (radius,), Pose(position=np.array((0.0, 0.0, end)))
 
 
-def _primitives(shape: UrdfShape, folder: Path) -> Iterator[Primitive]:
+def _primitives(shape: UrdfShape, folder: Path) -> Iterator[_Primitive]:
     """Convert a shape of a URDF to primitives in the link's frame."""
     if shape.kind == "mesh":
-        yield _bounding_box(mesh_path(folder, shape.file), shape.size)
+        yield _bounding_box(mesh_path(folder, shape.file), shape.size, shape.link_from_shape)
     elif shape.kind in _KINDS:
-        yield Primitive(kind=_KINDS[shape.kind], size=shape.size)
+        yield _KINDS[shape.kind], shape.size, shape.link_from_shape
+
+
+def _bounding_box(path: Path, scale: tuple[float, ...], frame: Pose) -> _Primitive:
+    """Compute the box around a mesh, along the axes of its file."""
+    try:
+        low, high = _mesh_bounds(path)
+    except (OSError, ValueError, LookupError, ET.ParseError) as error:
+        raise SceneError(f"A mesh of the scene cannot be read ({describe_error(error)}): {path}") from error
+    sides = np.maximum((high - low) * np.abs(scale), _MIN_SIDE_M)
+    return "box", tuple(sides.tolist()), frame @ Pose(position=(low + high) / 2 * scale)
 
 
 @functools.lru_cache(maxsize=256)
-def _bounding_box(path: Path, scale: tuple[float, ...]) -> Primitive:
-    """Compute the box around a mesh, along the axes of its file."""
-    try:
-        if path.suffix.lower() == ".obj":
-            found = read_obj(path)
-            if not len(found.faces):
-                raise ValueError("no triangles")
-            vertices = found.points
-        elif path.suffix.lower() == ".dae":  # trimesh needs another package for it
-            vertices = read_collada(path).points
-        else:
-            import trimesh  # slow import (1 s), not needed for the usual robot
+def _mesh_bounds(path: Path) -> tuple[Array, Array]:
+    if path.suffix.lower() == ".obj":
+        found = read_obj(path)
+        if not len(found.faces):
+            raise ValueError("no triangles")
+        vertices = found.points
+    elif path.suffix.lower() == ".dae":  # trimesh needs another package for it
+        vertices = read_collada(path).points
+    else:
+        import trimesh  # slow import (1 s), not needed for the usual robot
 
-            vertices = np.asarray(trimesh.load(path, force="mesh", process=False).vertices, dtype=np.float64)
-        low, high = vertices.min(axis=0), vertices.max(axis=0)
-    except (OSError, ValueError, LookupError, ET.ParseError) as error:
-        raise SceneError(f"A mesh of the scene cannot be read ({describe_error(error)}): {path}") from error
-    x, y, z = ((low + high) / 2 * scale).tolist()
-    sides = np.maximum((high - low) * np.abs(scale), _MIN_SIDE_M)
-    return Primitive(kind="box", center=(x, y, z), size=tuple(sides.tolist()))
+        vertices = np.asarray(trimesh.load(path, force="mesh", process=False).vertices, dtype=np.float64)
+    return vertices.min(axis=0), vertices.max(axis=0)
 
 
-def _add_visual(link: ET.Element, primitive: Primitive, frame: Pose, rgba: Sequence[float]) -> None:
-    pose = frame @ Pose(position=np.array(primitive.center))
+def _add_visual(link: ET.Element, primitive: _Primitive, rgba: Sequence[float]) -> None:
+    kind, size, pose = primitive
     visual = ET.SubElement(link, "visual")
     ET.SubElement(visual, "origin", xyz=_numbers(pose.position.tolist()), rpy=_numbers(_rpy(pose)))
     geometry = ET.SubElement(visual, "geometry")
-    if primitive.kind == "box":
-        ET.SubElement(geometry, "box", size=_numbers(primitive.size))
-    elif primitive.kind == "sphere":
-        ET.SubElement(geometry, "sphere", radius=_numbers(primitive.size))
+    if kind == "box":
+        ET.SubElement(geometry, "box", size=_numbers(size))
     else:
-        radius, length = primitive.size
-        ET.SubElement(geometry, "cylinder", radius=_numbers((radius,)), length=_numbers((length,)))
+        names = ("radius", "length")[: len(size)]
+        ET.SubElement(geometry, kind, {name: _numbers((value,)) for name, value in zip(names, size, strict=True)})
     material = ET.SubElement(visual, "material", name="color_" + "_".join(f"{round(v * 255):02x}" for v in rgba))
     ET.SubElement(material, "color", rgba=_numbers(rgba))
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 from demorec.core.errors import RecordingError, without_path
 from demorec.core.files import Closing
 from demorec.core.plain import to_json
-from demorec.episode.episode import Outcome
 from demorec.episode.info import DEPTH_UNITS, EpisodeInfo
 from demorec.episode.simulated import description_of, has_failed
 from demorec.episode.validity import find_problems
@@ -24,47 +23,37 @@ from demorec.mcap.container import Container, damage_as_recording_error
 from demorec.mcap.episode_layout import EpisodeLayout
 from demorec.mcap.images import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.lossless import decode_distances
+from demorec.mcap.messages import packet_reader
 from demorec.mcap.metadata import CameraStreams
 from demorec.mcap.streams import FrameStream
 from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
-
-_READERS = {"av1": messages.read_protobuf_video, "32FC1": messages.read_image}
-"""Codec -> function that extracts a packet from its message, if that is not a CompressedImage."""
 
 
 class EpisodeFile(Closing):
     """Context manager over the file of one episode: a `Recording` without its numbers."""
 
-    info: EpisodeInfo
-    outcome: Outcome | None
-    num_frames: int
-    is_recovered: bool
-    _cameras: Mapping[str, CameraStreams]
-    _layout: EpisodeLayout
-
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
         self._container = Container(self.path)
         try:
-            if (found := self._container.metadata(metadata.EPISODE)) is None:
-                raise RecordingError(
-                    f"The MCAP file is not a demorec recording, since it lacks episode metadata: {self.path}"
-                )
-            try:
-                self._read_metadata(found)
-            except RecordingError as error:
-                raise RecordingError(f"{without_path(error, self.path)}: {self.path}") from error
-        except BaseException:
+            self._read_metadata()
+        except BaseException as error:
             self.close()
+            if isinstance(error, RecordingError):
+                raise RecordingError(f"{without_path(error, self.path)}: {self.path}") from error
             raise
 
     def close(self) -> None:
         """Close the file; safe to call twice."""
         self._container.close()
 
-    def _read_metadata(self, found: Mapping[str, str]) -> None:
+    def _read_metadata(self) -> None:
         """Read everything that is known without reading the numbers."""
-        self.info, self._cameras, urdf_sha256 = metadata.read_episode_metadata(found)
+        found = self._container.metadata(metadata.EPISODE)
+        if found is None:
+            raise RecordingError("The MCAP file is not a demorec recording, since it lacks episode metadata")
+        self.info, cameras, urdf_sha256 = metadata.read_episode_metadata(found)
+        self._cameras = {camera.name: cameras[camera.name] for camera in self.info.cameras if camera.name in cameras}
         self._layout = EpisodeLayout(self.info)
         self._read_end()
         if self.num_frames and len(self._cameras) != len(self.info.cameras):
@@ -73,13 +62,10 @@ class EpisodeFile(Closing):
             self.info = self._with_urdf(urdf_sha256)
 
     def _read_end(self) -> None:
-        """Read the outcome; RecordingError unless its number of frames equals the number of messages."""
         outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
         self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
-        self.num_frames, self.is_recovered = (
-            self._container.counts.get(self._layout.frame_topic, 0),
-            recovered is not None,
-        )
+        self.num_frames = self._container.counts.get(self._layout.frame_topic, 0)
+        self.is_recovered = recovered is not None
         if recovered is not None:
             metadata.check_seal(metadata.RECOVERED, recovered)
         if self.outcome is None and not self.is_recovered:
@@ -108,17 +94,12 @@ class EpisodeFile(Closing):
     @property
     def cameras(self) -> tuple[str, ...]:
         """Names of the recorded colour cameras."""
-        return tuple(name for name, streams in self._cameras_in_order if streams.video.codec not in DEPTH_UNITS)
+        return tuple(name for name, streams in self._cameras.items() if streams.video.codec not in DEPTH_UNITS)
 
     @property
     def depth_cameras(self) -> tuple[str, ...]:
         """Names of the recorded cameras that measure distances, with or without colour."""
-        return tuple(name for name, streams in self._cameras_in_order if streams.depth)
-
-    @property
-    def _cameras_in_order(self) -> Iterator[tuple[str, CameraStreams]]:
-        names = (camera.name for camera in self.info.cameras if camera.name in self._cameras)
-        return ((name, self._cameras[name]) for name in names)
+        return tuple(name for name, streams in self._cameras.items() if streams.depth)
 
     def _camera(self, name: str) -> CameraStreams:
         if name not in self._cameras:
@@ -178,19 +159,18 @@ class EpisodeFile(Closing):
     def packets(self, camera: str) -> Iterator[VideoPacket]:
         """Yield the encoded images of a camera, in order; `frame_index` is the image number that frames refer to."""
         codec = self.video_settings(camera).codec
-        read = _READERS.get(codec, messages.read_compressed_image)
-        for number, (time_ns, data) in enumerate(self._read_images(video_topic(camera, codec), read)):
+        for number, (time_ns, data) in enumerate(self._read_images(video_topic(camera, codec), packet_reader(codec))):
             yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
 
     def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
         """Read as `_read`, for a topic of images; RecordingError unless they are at their due times."""
-        due_ns, count = self._layout.due_ns(self.num_frames), 0
+        due_ns = self._layout.due_ns(self.num_frames)
+        due = None if due_ns is None else iter(due_ns.tolist())
         for time_ns, image in self._read(topic, read):
-            if due_ns is not None and (count >= len(due_ns) or time_ns != due_ns[count]):
+            if due is not None and time_ns != next(due, None):
                 raise self._wrong_times(topic)
             yield time_ns, image
-            count += 1
-        if due_ns is not None and count != len(due_ns):
+        if due is not None and next(due, None) is not None:
             raise self._wrong_times(topic)
 
     def _wrong_times(self, topic: str) -> RecordingError:
@@ -205,10 +185,9 @@ class EpisodeFile(Closing):
     def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
         """Yield distances in order, as recorded: (H, W) uint16 millimetres or float32 metres."""
         codec, size = self._distance_codec(camera), self._size(camera)
-        read = _READERS.get(codec, messages.read_compressed_image)
-        topic = video_topic(camera, codec)
-        for _, distances in self._read_images(topic, lambda data: decode_distances(codec, read(data), size)):
-            yield distances
+        read = packet_reader(codec)
+        images = self._read_images(video_topic(camera, codec), lambda data: decode_distances(codec, read(data), size))
+        return (distances for _, distances in images)
 
     def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
         """Yield distances in metres, (H, W) float32; in simulations in steps of a millimetre, 0 for the background."""

@@ -1,11 +1,10 @@
-"""Topics of an episode's file, and the times of its messages and images."""
+"""Topics of an episode's file, the times of its messages and images, and its numbers as columns."""
 
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Callable, Mapping
-from functools import cached_property
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,14 +14,18 @@ from demorec.episode.episode import NO_IMAGE, Table, Trajectory, frame_time_ns
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import messages
 from demorec.mcap.channels import DELIBERATE_MISS, EVENTS, FRAMES, GRIPPER, PHASE, TF, camera_topic, video_topic
-from demorec.mcap.container import Container
-from demorec.mcap.sampled_streams import sampled_streams
-from demorec.mcap.simulated_streams import simulated_streams
-from demorec.mcap.streams import FrameStream, TimedMessages, frame_times, read_columns
+from demorec.mcap.container import Container, damage_as_recording_error
+from demorec.mcap.streams import frame_streams, frame_times
 
 if TYPE_CHECKING:
     from demorec.mcap.metadata import CameraStreams
     from demorec.mcap.scan import ScannedMessage
+
+_TABLE_BYTES = 1 << 20
+"""Size of chunks that are decoded together: decoding takes several times as much memory."""
+
+TimedMessages = list[tuple[int, bytes]]
+"""(time_ns, data) of messages that are not sent at each frame."""
 
 
 class EpisodeLayout:
@@ -30,22 +33,13 @@ class EpisodeLayout:
 
     In a simulated episode all messages and images are at the times of the frames. In any other one the cameras decide
     the times of images, and `/frames` lists the samples and images of each frame.
-
-    Attributes:
-        frame_topic: Topic with one message per frame.
-        event_topics: Topics of events.
     """
 
     def __init__(self, info: EpisodeInfo) -> None:
         self._info = info
         self._is_on_time = info.simulation is not None  # all messages at the times of the frames
+        self.streams = frame_streams(info)
         self.frame_topic = GRIPPER if self._is_on_time else FRAMES
-        self.event_topics = (EVENTS,) if self._is_on_time else ()
-
-    @cached_property
-    def streams(self) -> tuple[FrameStream, ...]:
-        """Streams that become columns; the first one of a simulated episode is dense."""
-        return tuple(simulated_streams(self._info) if self._is_on_time else sampled_streams(self._info))
 
     def due_ns(self, num_frames: int) -> NDArray[np.int64] | None:
         """Compute (T,) due times of all images; None if the cameras decide."""
@@ -57,28 +51,17 @@ class EpisodeLayout:
         """Read the numbers, and the messages of events, which are stored among them.
 
         Args:
-            container: The open file.
-            num_frames: T.
             image_topics: Recorded camera -> topic of its images, in the order of the description.
 
         Raises:
-            RecordingError: A stream is damaged or does not match the times of the frames, or a frame shows an unknown
-                image.
+            RecordingError: A stream is damaged or not at the times of the frames, or a frame shows an unknown image.
         """
-        due, changes = self.due_ns(num_frames), (PHASE, DELIBERATE_MISS) if self._is_on_time else ()
-        columns, others = read_columns(
-            container,
-            self.streams,
-            due_ns=due,
-            frame_topic=self.frame_topic,
-            others=(*changes, *self.event_topics),
-        )
+        due = self.due_ns(num_frames)
+        columns, others = self._columns(container, due, (PHASE, DELIBERATE_MISS, EVENTS) if self._is_on_time else ())
         if due is None:
-            image_stamps = _image_stamps(container, image_topics)
-            _check_images(columns["images"], image_stamps, container)
-            return Table(**columns, image_stamps=image_stamps), []
-        for name in ("sensed", "object_poses", "world_from_camera"):
-            columns.setdefault(name, {})
+            stamps = _image_stamps(container, image_topics)
+            _check_images(columns["images"], stamps, container)
+            return Table(**columns, image_stamps=stamps), []
         poses = columns.pop("world_from_camera")
         misses = _lasting(others[DELIBERATE_MISS], messages.read_boolean, due, False)
         trajectory = Trajectory(
@@ -89,6 +72,41 @@ class EpisodeLayout:
         )
         return trajectory, others[EVENTS]
 
+    def _columns(
+        self, container: Container, due_ns: NDArray[np.int64] | None, others: Sequence[str]
+    ) -> tuple[dict[str, Any], dict[str, TimedMessages]]:
+        """Read all streams, and other topics as undecoded messages, in one pass."""
+        found: dict[str, TimedMessages] = {topic: [] for topic in others}
+        times = defaultdict[str, list[NDArray[np.int64]]](list)
+        values = defaultdict[str, list[NDArray[Any]]](list)
+        topics = (*(stream.topic for stream in self.streams), *others)
+        with damage_as_recording_error(container.path):
+            for blocks in container.blocks_by_chunk(topics, num_bytes=_TABLE_BYTES):
+                for stream in self.streams:
+                    block = blocks[stream.topic]
+                    if stream.is_dense and due_ns is not None:
+                        block = block.select(np.isin(block.time_ns, due_ns))
+                    times[stream.topic].append(block.time_ns)
+                    values[stream.topic].append(stream.layout.decode(block.rows(len(stream.layout.constant))))
+                for topic, timed in found.items():
+                    timed += zip(blocks[topic].time_ns.tolist(), blocks[topic].messages(), strict=True)
+        time_ns = np.concatenate(times[self.frame_topic]) if due_ns is None else due_ns
+        if len(time_ns) > 1 and int(np.diff(time_ns).min()) <= 0:
+            raise RecordingError(f"The frames of the recording are not in chronological order: {container.path}")
+        kinds = (
+            ("sensed", "object_poses", "world_from_camera") if self._is_on_time else ("features", "stamps", "images")
+        )
+        columns: dict[str, Any] = {"time_ns": time_ns, **{kind: {} for kind in kinds}}
+        for stream in self.streams:
+            at = np.concatenate(times[stream.topic])
+            if not np.array_equal(at, time_ns):
+                raise RecordingError(
+                    f"The recording has {len(at)} messages on {stream.topic} at other times than its {len(time_ns)} "
+                    f"frames: {container.path}"
+                )
+            stream.add_columns(np.concatenate(values[stream.topic]), columns)
+        return columns, found
+
     def whole_frames(
         self, counts: Counter[str], cameras: Mapping[str, CameraStreams]
     ) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
@@ -96,13 +114,8 @@ class EpisodeLayout:
 
         In an episode that was not simulated, images precede their frames.
 
-        Args:
-            counts: Topic -> number of its messages.
-            cameras: Recorded cameras.
-
         Returns:
-            Number of frames; and a function that checks whether a message belongs to them, given its number in its
-            topic, from 1.
+            Number of frames; and whether a message belongs to them, given its number in its topic, from 1.
         """
         topics = {stream.topic for stream in self.streams if not stream.is_dense}
         if not self._is_on_time:

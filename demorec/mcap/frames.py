@@ -1,14 +1,25 @@
-"""Conversion of a trajectory to frames."""
+"""A recording's numbers as frames, as a pandas table, and a recording in one line."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import Literal
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
+from demorec.core.errors import MissingDependencyError
 from demorec.core.geometry import Array, Pose
-from demorec.episode.episode import Action, Event, Frame, JointSample, Observation, Trajectory
+from demorec.core.text import printable
+from demorec.episode.episode import Action, Event, Frame, JointSample, Observation, Outcome, Table, Trajectory
+from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import simulation_facts
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+_POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 
 
 def pose_of(row: Array) -> Pose:
@@ -75,9 +86,65 @@ def _samples_before_frames(samples: Iterable[JointSample], times: list[int]) -> 
     waiting: list[JointSample] = []
     for sample in samples:
         if sample.time_ns in number:
-            if waiting:
-                result[number[sample.time_ns]] = tuple(waiting)
+            result[number[sample.time_ns]] = tuple(waiting)
             waiting = []
         else:
             waiting.append(sample)
     return result
+
+
+def summary_line(info: EpisodeInfo, outcome: Outcome | None, num_frames: int) -> str:
+    """Summarise a recording in one line, without control characters."""
+    if outcome is None:
+        result = "unknown: recovered after a crash"
+    elif outcome.success is False:
+        phase = f" in phase {outcome.failure_phase}" if outcome.failure_phase else ""
+        result = f"{outcome.failure_reason}{phase}"
+    else:
+        result = "success" if outcome.success else "unknown"
+    task = simulation_facts(info).get("task", info.instruction)
+    return printable(
+        f"{num_frames} frames ({num_frames / info.fps:.1f} s at {info.fps} Hz), task {task} with {info.robot_name}, "
+        f"episode {info.episode_index}, attempt {info.attempt}, outcome {result}"
+    )
+
+
+def pandas_table(info: EpisodeInfo, numbers: Table | Trajectory) -> pd.DataFrame:
+    """Build the table of `Recording.to_pandas`."""
+    try:
+        import pandas as pd
+    except ImportError as error:
+        raise MissingDependencyError("A table of the frames", "pandas", "pip install pandas") from error
+    if isinstance(numbers, Trajectory):
+        table = _trajectory_columns(info, numbers)
+    else:
+        table = {"time_ns": numbers.time_ns}
+        for feature in info.features:
+            table |= _components(feature.name, numbers.features[feature.name], feature.names)
+    return pd.DataFrame(table, index=pd.RangeIndex(numbers.num_frames, name="frame_index"))
+
+
+def _trajectory_columns(info: EpisodeInfo, trajectory: Trajectory) -> dict[str, Any]:
+    robot = info.simulated.robot
+    joint_state = ("joint_position", "joint_velocity", "joint_effort")
+    parts: dict[str, Sequence[str]] = dict.fromkeys(joint_state, robot.joint_names)
+    parts |= dict.fromkeys(("action_joint_target", "command_joint_target"), robot.arm_joints)
+    table: dict[str, Any] = {}
+    for field in fields(trajectory):
+        name, value = field.name, getattr(trajectory, field.name)
+        if name == "sensed":
+            for quantity, rows in value.items():
+                table |= _components(quantity, rows, info.sensors[quantity].names)
+        elif isinstance(value, Mapping):
+            for key, poses in value.items():
+                table |= _components(f"{name}.{key}", poses, _POSE)
+        elif np.ndim(value) == 2:
+            table |= _components(name, value, parts.get(name, _POSE))
+        else:
+            table[name] = value
+    return table
+
+
+def _components(name: str, rows: NDArray[np.float64], parts: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Split (T, D) rows into columns named by component."""
+    return {f"{name}.{part}": rows[:, number] for number, part in enumerate(parts)}

@@ -17,10 +17,8 @@ _SPS_BYTES = 24
 def deep_gray(codec: str, pixel_format: str, parameters: bytes) -> str:
     """Name the pixel format of a video that holds a measurement; "" for colour.
 
-    Args:
-        codec: Codec by recordings' name.
-        pixel_format: FFmpeg's name. It decodes H.264 without chroma to a colour format.
-        parameters: Parameter sets of the video, as in an access unit or in an mp4 file.
+    FFmpeg's `pixel_format` is a colour format for H.264 without chroma, so the video's parameter sets are read too, as
+    in an access unit or in an mp4 file.
     """
     if codec == "h264" and (depth := _luma_bits_without_chroma(parameters)) > 8:
         return f"gray{depth}le"

@@ -40,8 +40,7 @@ class PixelStatistics:
 
 
 class PixelCounter:
-    """Counts every other image (90 of 180 frames, where LeRobot's writer uses 100) and subsamples large ones as it
-    does.
+    """Counts every other image (90 of 180 frames, where LeRobot's writer uses 100), and subsamples large ones.
 
     LeRobot (`compute_stats.py`) spreads its sample evenly over an episode of known length; here the length is not known
     yet. Only every fourth row of an image is counted, a different quarter each time.
@@ -95,14 +94,10 @@ class CameraWriter:
     """Encodes the images of one camera, and keeps their messages until they are written.
 
     Args:
-        camera: The camera.
         video: Encoding of colour images, unless they arrive encoded.
-        fps: Frames per second of the episode.
         beside: Streams of images that accompany each colour image: "depth", "segmentation".
 
     Attributes:
-        camera: The camera.
-        streams: Recorded streams and their encoding.
         num_ready: Number of images that have left the encoder.
         last_ns: Timestamp of the last image.
     """
@@ -160,7 +155,6 @@ class CameraWriter:
         return taken
 
     def _messages(self, time_ns: int, packet: bytes) -> list[Message]:
-        """Build the messages of one image, colour or distances."""
         camera, codec, frame_id = self.camera, self.streams.video.codec, self._frame_id
         topic = video_topic(camera.name, codec)
         if codec == "av1":

@@ -13,8 +13,8 @@ import numpy as np
 from demorec.core.geometry import Array, Pose
 from demorec.episode.episode import Event
 from demorec.mcap.cdr import decode, encode
-from demorec.mcap.chunks import Block
 from demorec.mcap.ros2 import DEFINITIONS
+from demorec.mcap.scan import Block
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 POSE = "geometry_msgs/msg/PoseStamped"
@@ -106,6 +106,11 @@ def read_compressed_image(data: bytes) -> bytes:
     if len(image) != length:
         raise ValueError("a truncated image")
     return image
+
+
+def packet_reader(codec: str) -> Callable[[bytes], bytes]:
+    """Return the function that extracts a camera's packet from its message."""
+    return {"av1": read_protobuf_video, "32FC1": read_image}.get(codec, read_compressed_image)
 
 
 def _compressed_image_start(data: bytes) -> int:
@@ -220,17 +225,10 @@ Value = bool | int | float | str | bytes
 
 
 def message_fields(schema: str, data: bytes) -> dict[str, Value]:
-    """Decode any message by the definition of its type, to name differences.
+    """Decode a recording's message to its fields, in order: `pose.position.x` or `position[3]` -> value.
 
-    Returns name of each field, such as `pose.position.x` or `position[3]`, -> its value, in order. A sequence also has
-    its length, as `position.length`; octets (an encoded image) are one value.
-
-    Args:
-        schema: Type of the message, one that recordings use.
-        data: The message.
-
-    Raises:
-        ValueError: The message is not of this type, or the type is unknown.
+    A sequence also has its length, as `position.length`; octets (an encoded image) are one value. ValueError unless the
+    message is of this type, which recordings use.
     """
     if schema == PROTOBUF_VIDEO:
         return dict(protobuf_fields(data))

@@ -28,11 +28,9 @@ _CHECKSUM = "crc32"
 
 @dataclass(frozen=True, kw_only=True)
 class CameraStreams:
-    """The recorded streams of one camera.
+    """The recorded streams of one camera: the coding of its images, and whether depth and segmentation were recorded.
 
-    Attributes:
-        video: Coding of the colour images.
-        depth, segmentation: Whether these were recorded; the images of a depth camera are its depth.
+    The images of a depth camera are its depth.
     """
 
     video: VideoSettings
@@ -61,7 +59,7 @@ def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) ->
 
 
 def urdf_sha256(urdf: str) -> str:
-    """Compute SHA-256 (hex) of a URDF; "" if empty."""
+    """Compute SHA-256 (hex); "" if empty."""
     return hashlib.sha256(urdf.encode()).hexdigest() if urdf else ""
 
 
@@ -72,7 +70,7 @@ def outcome_metadata(outcome: Outcome) -> dict[str, str]:
 
 
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams], str]:
-    """Parse the record of `episode_metadata`; returns info without URDF, cameras, and the URDF's SHA-256.
+    """Parse the record of `episode_metadata`: info without URDF, cameras, and the URDF's SHA-256.
 
     Raises:
         RecordingError: The record is damaged, or has another format version.
@@ -94,7 +92,6 @@ def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dic
 
 
 def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> None:
-    """Raise ValueError unless the recorded cameras, if any, match the description."""
     if cameras and cameras.keys() != {camera.name for camera in info.cameras}:
         raise ValueError("the recorded cameras differ from the description")
     for camera in info.cameras if cameras else ():

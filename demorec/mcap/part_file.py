@@ -43,7 +43,6 @@ class _Disk(io.FileIO):
         self.error: OSError | None = None
 
     def write(self, data: bytes) -> int:  # type: ignore[override]
-        """Write all data, unless an earlier write failed."""
         rest = memoryview(data)
         try:
             while rest and self.error is None:
@@ -55,14 +54,12 @@ class _Disk(io.FileIO):
         return len(data)
 
     def seek(self, offset: int, whence: int = 0) -> int:
-        """Move the file position."""
         self._place = offset + (0, self._place, self._end)[whence]
         if self.error is None:
             super().seek(self._place)
         return self._place
 
     def sync(self) -> None:
-        """Flush everything to disk."""
         try:
             os.fsync(self.fileno())
         except OSError as error:
@@ -76,13 +73,11 @@ class PartFile:
         path: The finished file.
         part: Path of the unfinished file, if not NAME.part.
         overwrite: Whether `path`, or an unfinished recording of its name, may be replaced by the new one.
-        is_worthless: Whether an unfinished recording of a dead writer contains nothing that could not be made again, so
-            that it may always be replaced.
+        is_worthless: Whether an unfinished recording of a dead writer could be made again, so that it may be replaced.
 
     Raises:
-        ConfigError: A file of that name, or an unfinished one, exists and must not be replaced; or no file can be
-            created there.
-        RecordingError: The file cannot be written.
+        ConfigError: A file of that name, or an unfinished one, exists and must not be replaced.
+        RecordingError: The file cannot be written; raised by all methods.
     """
 
     def __init__(
@@ -96,21 +91,20 @@ class PartFile:
         self.path, self.part = path, part or path.with_name(f"{path.name}.part")
         check_replaceable(path, RECORDING, overwrite=overwrite)
         self._before = snapshot(path)
+        # Held until the file is renamed or closed: other processes must not mistake it for a dead one's.
+        self._lock: int | None = None
         try:
-            # Held until the file is renamed or closed: other processes must not mistake it for a dead one's.
-            self._lock: int | None = _lock_part(self.part)
-            try:
-                if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
-                    raise ConfigError(
-                        "An unfinished recording of that name exists; recover it, delete it, or use --overwrite: "
-                        f"{self.part}"
-                    )
-                self._disk = _Disk(self.part)
-            except BaseException:
-                os.close(self._lock)
-                self._lock = None
+            self._lock = _lock_part(self.part)
+            if os.fstat(self._lock).st_size and not overwrite and not is_worthless(self.part):
+                raise ConfigError(
+                    "An unfinished recording of that name exists; recover it, delete it, or use --overwrite: "
+                    f"{self.part}"
+                )
+            self._disk = _Disk(self.part)
+        except BaseException as error:
+            self._unlock()
+            if not isinstance(error, OSError):
                 raise
-        except OSError as error:
             reason = describe_error(error)
             raise write_error("The recording", error, path, RecordingError, reason=reason) from error
         self._channels: dict[str, foxglove.Channel] = {}
@@ -155,11 +149,7 @@ class PartFile:
             self._mcap.write_metadata(name, dict(values))
 
     def flush(self) -> None:
-        """End the chunk; afterwards everything logged is with the operating system and survives this process.
-
-        Raises:
-            RecordingError: The disk is full or gone.
-        """
+        """End the chunk; afterwards everything logged is with the operating system and survives this process."""
         with self._disk_errors():
             self._mcap.flush()
 
@@ -173,11 +163,7 @@ class PartFile:
             raise self._unwritable(self._disk.error) from self._disk.error
 
     def end(self) -> None:
-        """Write the index and make NAME.part durable, complete but not renamed; safe to call twice.
-
-        Raises:
-            RecordingError: The disk is full.
-        """
+        """Write the index and make NAME.part durable, complete but not renamed; safe to call twice."""
         if self._is_open:
             self._is_open = False
             try:
@@ -192,9 +178,12 @@ class PartFile:
         try:
             self.end()
         finally:
-            if self._lock is not None:
-                os.close(self._lock)
-                self._lock = None
+            self._unlock()
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def discard(self) -> None:
         """Abandon the file and remove it; safe to call twice, and after `publish`."""
@@ -204,12 +193,7 @@ class PartFile:
             self.close()
 
     def publish(self) -> None:
-        """End the file and rename it.
-
-        Raises:
-            ConfigError: A file of that name has appeared meanwhile, or differs from the one to replace.
-            RecordingError: The disk is full.
-        """
+        """End the file and rename it; ConfigError if another file has taken the name meanwhile."""
         try:
             self.end()
             if self._before and snapshot(self.path) == self._before:
@@ -226,7 +210,7 @@ class PartFile:
 
 
 def name_taken(path: Path, kept: Path) -> ConfigError:
-    """Build the error for a recording with a name taken by another file, and the path where the recording stays."""
+    """Build the error for a recording whose name another file has taken; it stays at `kept`."""
     return ConfigError(
         f"Another file has appeared while this recording was made, and is left unchanged ({path}); the recording is "
         f"kept as {kept}"
@@ -234,14 +218,7 @@ def name_taken(path: Path, kept: Path) -> ConfigError:
 
 
 def _lock_part(part: Path) -> int:
-    """Open an unfinished file for writing, locked until the descriptor is closed or the process dies.
-
-    The content left by a dead process is kept; the caller decides about it.
-
-    Raises:
-        ConfigError: Another process is writing it, or it is not an unfinished recording.
-        OSError: It cannot be written.
-    """
+    """Open an unfinished file, with what a dead process left, locked until closed; ConfigError if in use or foreign."""
     while True:
         if os.path.lexists(part) and (part.is_symlink() or not part.is_file()):
             raise ConfigError(f"This is not an unfinished file and is in the way; move it elsewhere: {part}")
@@ -250,15 +227,14 @@ def _lock_part(part: Path) -> int:
         except BlockingIOError as error:
             raise ConfigError(f"Another process is writing this file; wait until it is done: {part}") from error
         try:
-            # Its previous owner may have renamed the file between the two calls.
-            if not part.exists() or not os.path.samestat(os.fstat(handle), part.stat()):
-                os.close(handle)
-                continue
-            if os.fstat(handle).st_nlink > 1:  # killed during the renaming
+            found = os.fstat(handle)
+            if found.st_nlink > 1:  # killed during the renaming
                 part.unlink()
+            # Its previous owner may have renamed the file between the two calls.
+            if not part.exists() or not os.path.samestat(found, part.stat()):
                 os.close(handle)
                 continue
-            if os.fstat(handle).st_size and not RECORDING.recognises(part):
+            if found.st_size and not RECORDING.recognises(part):
                 raise ConfigError(
                     f"This is not the unfinished beginning of {RECORDING.name}; move it elsewhere: {part}"
                 )

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
-from itertools import chain, islice, repeat
+from itertools import islice, repeat
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,13 +20,13 @@ from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointS
 from demorec.episode.info import NOT_SIMULATED
 from demorec.episode.protocol import Box, SceneMotion
 from demorec.episode.simulated import simulated_table
-from demorec.mcap import channels, messages, notebook
-from demorec.mcap.chunks import Block
+from demorec.mcap import channels, messages
 from demorec.mcap.container import damage_as_recording_error
 from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.frames import frames_of, pose_of
+from demorec.mcap.episode_layout import TimedMessages
+from demorec.mcap.frames import frames_of, pandas_table, pose_of, summary_line
 from demorec.mcap.lossless import LabelDecoder, from_labels
-from demorec.mcap.streams import FrameStream, TimedMessages
+from demorec.mcap.scan import Block
 from demorec.mcap.transforms import measured_motion
 from demorec.mcap.video import Rgb, is_keyframe
 from demorec.robots.urdf import check_primitives
@@ -37,9 +38,9 @@ if TYPE_CHECKING:
 class Recording(EpisodeFile):
     """Context manager over one recording, and the sequence of its frames; one chunk is in memory at a time.
 
-    `for frame in recording` yields numbers and images together; `recording[120]`, `recording[-1]` and `recording[::30]`
-    select frames; `table` and `trajectory` return all numbers at once, which is much faster if images are not needed.
-    Frames exist only for simulations: other episodes have just a `table`.
+    `for frame in recording` yields numbers and images together; `recording[120]` and `recording[-1]` select a frame;
+    `table` and `trajectory` return all numbers at once, which is much faster if images are not needed. Frames exist
+    only for simulations: other episodes have just a `table`.
 
     Attributes:
         path: Path of the file.
@@ -58,8 +59,7 @@ class Recording(EpisodeFile):
 
     @cached_property
     def _table(self) -> Table:
-        numbers = self._numbers
-        return simulated_table(numbers, self.info) if isinstance(numbers, Trajectory) else numbers
+        return simulated_table(self._numbers, self.info) if isinstance(self._numbers, Trajectory) else self._numbers
 
     def trajectory(self) -> Trajectory:
         """Read the simulation, one row per frame, bit-exact.
@@ -87,8 +87,7 @@ class Recording(EpisodeFile):
 
     @cached_property
     def _numbers_and_events(self) -> tuple[Table | Trajectory, TimedMessages]:
-        """Numbers and events, read once: exports and checks use them repeatedly."""
-        topics = {name: self._image_topic(name) for name, _ in self._cameras_in_order}
+        topics = {name: self._image_topic(name) for name in self._cameras}
         with damage_as_recording_error(self.path):
             return self._layout.read(self._container, self.num_frames, topics)
 
@@ -130,21 +129,18 @@ class Recording(EpisodeFile):
         """Yield every recorded joint state of a simulation in order of time: at and between the frames."""
         for stream in self.streams:
             if stream.is_dense:
-                yield from self._joint_samples(stream)
-
-    def _joint_samples(self, stream: FrameStream) -> Iterator[JointSample]:
-        read = self._read(stream.topic, lambda data: stream.layout.decode([data]).reshape(3, -1))
-        for time_ns, (position, velocity, effort) in read:
-            yield JointSample(time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort)
+                for blocks in self._container.blocks_by_chunk((stream.topic,)):
+                    block = blocks[stream.topic]
+                    with damage_as_recording_error(self.path):
+                        states = np.split(stream.layout.decode(block.rows(len(stream.layout.constant))), 3, axis=1)
+                    for time_ns, position, velocity, effort in zip(block.time_ns.tolist(), *states, strict=True):
+                        yield JointSample(
+                            time_ns=time_ns, joint_position=position, joint_velocity=velocity, joint_effort=effort
+                        )
 
     def events(self) -> Iterator[tuple[int, Event]]:
         """Yield (time_ns, event) in order of time; phase changes are in `phases`."""
-        # They are stored among the numbers, and may have been read with them already.
-        if "_numbers_and_events" in vars(self):
-            found: Iterable[tuple[int, bytes]] = self._numbers_and_events[1]
-        else:
-            found = chain.from_iterable(self._read(topic, bytes) for topic in self._layout.event_topics)
-        for time_ns, data in found:
+        for time_ns, data in self._numbers_and_events[1]:
             with damage_as_recording_error(self.path):
                 event = messages.read_log(data)
             if event.name != channels.PHASE_EVENT:
@@ -153,7 +149,7 @@ class Recording(EpisodeFile):
     def coded_images(self, cameras: Sequence[str]) -> dict[str, Block]:
         """Read camera -> all its encoded images in one pass; they are in memory together."""
         topics = {camera: self._image_topic(camera) for camera in cameras}
-        found = self._container.blocks(tuple(topics.values()))
+        (found,) = self._container.blocks_by_chunk(tuple(topics.values()), num_bytes=sys.maxsize)
         images, due_ns = {}, self._layout.due_ns(self.num_frames)
         for camera, topic in topics.items():
             if due_ns is not None and not np.array_equal(found[topic].time_ns, due_ns):
@@ -169,14 +165,11 @@ class Recording(EpisodeFile):
 
     def segmentation(self, camera: str) -> Iterator[NDArray[np.int32]]:
         """Yield segmentation images, (H, W) int32 as in `CameraImages`, one per frame; see `segment_names`."""
-        topic, decoder = self._segmentation_topic(camera), LabelDecoder(self._size(camera))
-        for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
-            yield labels
-
-    def _segmentation_topic(self, camera: str) -> str:
         if not self.has_segmentation(camera):
             raise RecordingError(f"The recording has no segmentation images of the camera {camera!r}: {self.path}")
-        return channels.camera_topic(camera, "segmentation")
+        topic, decoder = channels.camera_topic(camera, "segmentation"), LabelDecoder(self._size(camera))
+        for _, labels in self._read_images(topic, lambda data: decoder.decode(messages.read_compressed_image(data))):
+            yield labels
 
     def segment_names(self) -> dict[int, str]:
         """Return segmentation value -> name of the body, or ROBOT/LINK; empty if segmentation was not recorded."""
@@ -229,7 +222,7 @@ class Recording(EpisodeFile):
         Raises:
             MissingDependencyError: pandas is not installed.
         """
-        return notebook.table_of(self.info, self._numbers)
+        return pandas_table(self.info, self._numbers)
 
     def __len__(self) -> int:
         return self.num_frames
@@ -239,15 +232,7 @@ class Recording(EpisodeFile):
         for frame in frames_of(self.trajectory(), self.events(), self.joint_samples()):
             yield replace(frame, images=next(images))
 
-    @overload
-    def __getitem__(self, index: int) -> Frame: ...
-
-    @overload
-    def __getitem__(self, index: slice) -> list[Frame]: ...
-
-    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
-        if isinstance(index, slice):
-            return [self[number] for number in range(self.num_frames)[index]]
+    def __getitem__(self, index: int) -> Frame:
         frame = self._frames[index]
         first = frame.frame_index
         colors = {name: self.images_at(name, [first]) for name in self.cameras}  # from the preceding keyframe on
@@ -281,12 +266,7 @@ class Recording(EpisodeFile):
             }
 
     def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r}: {notebook.line_of(self)})"
-
-    def _repr_html_(self) -> str:
-        moments = np.linspace(0, self.num_frames - 1, 5).round().astype(int).tolist()
-        filmed = [camera for camera in self.cameras if self.num_frames and self.num_images(camera)]
-        return notebook.page_of(self, {camera: self.images_at(camera, moments) for camera in filmed})
+        return f"Recording({str(self.path)!r}: {summary_line(self.info, self.outcome, self.num_frames)})"
 
     def digest(self) -> str:
         """Compute SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
@@ -305,7 +285,7 @@ class Recording(EpisodeFile):
                 result.update(vector.tobytes())
         for time_ns, event in self.events():
             result.update(f"{time_ns} {to_json(event)}".encode())
-        for name, streams in self._cameras_in_order:
+        for name, streams in self._cameras.items():
             result.update(name.encode())
             for packet in self.packets(name):
                 result.update(hashlib.sha256(packet.data).digest())

@@ -33,7 +33,6 @@ class Recovered:
     """Result of a recovery.
 
     Attributes:
-        path: The indexed recording.
         num_frames: Number of frames kept.
         is_complete: Whether only the name was missing.
         reason: Reason why reading stopped; "" if the file was complete.
@@ -86,12 +85,8 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     except BaseException:
         file.discard()  # everything in it is in the source
         raise
-    return Recovered(
-        path=target,
-        num_frames=survey.num_frames,
-        is_complete=survey.outcome is not None,
-        reason="" if survey.outcome is not None else survey.reason,
-    )
+    is_complete = survey.outcome is not None
+    return Recovered(path=target, num_frames=survey.num_frames, is_complete=is_complete, reason=survey.reason)
 
 
 def is_whole(source: Path) -> bool:
@@ -104,12 +99,7 @@ def is_whole(source: Path) -> bool:
 
 
 def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
-    """Check whether an unfinished recording is still empty, or was derived from the same origin.
-
-    Args:
-        part: File left by a crash.
-        origin: Origin of the recording that is about to replace it, as in its info.
-    """
+    """Check whether an unfinished recording is still empty, or was derived from the given origin."""
     for item in _items(part):
         if isinstance(item, Metadata) and item.name == metadata.EPISODE:
             info, _, _ = metadata.read_episode_metadata(item.metadata)
@@ -122,21 +112,13 @@ def can_be_made_again(part: Path, *, origin: str | Origin) -> bool:
 
 
 class _Survey(NamedTuple):
-    """Complete content of a file.
+    """Complete content of a file."""
 
-    Attributes:
-        episode: Metadata of the episode.
-        outcome: Metadata of the outcome, if complete.
-        reason: Reason why reading stopped.
-        num_frames: Number of frames present in all streams.
-        keeps: Whether a message belongs to these frames, given its number in its topic, from 1.
-    """
-
-    episode: dict[str, str]
-    outcome: dict[str, str] | None
-    reason: str
-    num_frames: int
-    keeps: Callable[[ScannedMessage, int], bool]
+    episode: dict[str, str]  # its metadata
+    outcome: dict[str, str] | None  # metadata of the outcome, if complete
+    reason: str  # why reading stopped; "" if complete
+    num_frames: int  # present in all streams
+    keeps: Callable[[ScannedMessage, int], bool]  # whether a message belongs to them, given its number, from 1
 
 
 def _items(source: Path) -> Iterator[ScannedMessage | Metadata | str | None]:
@@ -175,9 +157,9 @@ def _survey(source: Path) -> _Survey:
         episode, outcome = found[metadata.EPISODE], found.get(metadata.OUTCOME)
         info, cameras, _ = metadata.read_episode_metadata(episode)
         num_frames, keeps = EpisodeLayout(info).whole_frames(counts, cameras)
-        reason = reason or "the end is missing"
         if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
             outcome = None
+        reason = "" if outcome is not None else reason or "the end is missing"
         if num_frames:
             return _Survey(episode, outcome, reason, num_frames, keeps)
     raise RecordingError(

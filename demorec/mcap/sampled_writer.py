@@ -5,14 +5,12 @@ Images are written before the frames that show them, so that all frames left by 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.config import VideoConfig
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.core.registry import nearest_match
@@ -20,64 +18,27 @@ from demorec.episode.episode import SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
-from demorec.mcap.channels import SUBTASK
+from demorec.mcap.channels import SUBTASK, feature_topic
 from demorec.mcap.images import CameraWriter
 from demorec.mcap.lossless import DEPTH_TYPES
-from demorec.mcap.sampled_streams import sampled_streams
 from demorec.mcap.transforms import FrameTree, joint_places, joint_positions
-from demorec.mcap.writer import BatchWriter, PendingFrame, check_description
+from demorec.mcap.writer import BatchWriter
 from demorec.robots.urdf import Urdf
 
 
 class SampledWriter(BatchWriter):
-    """Context manager that writes an episode of another robot or program; arguments and errors as in `BatchWriter`.
+    """Context manager that writes an episode of another robot or program; arguments and errors as in `BatchWriter`."""
 
-    Args:
-        begins: Whether `info` is complete. Otherwise only file and encoders are opened, and `begin` must follow.
-    """
-
-    def __init__(
-        self,
-        path: Path,
-        info: EpisodeInfo,
-        *,
-        video: VideoConfig | None = None,
-        overwrite: bool = False,
-        begins: bool = True,
-        keeps_part: bool = True,
-    ) -> None:
-        self._begins = begins
-        super().__init__(path, info, video=video, overwrite=overwrite, keeps_part=keeps_part)
-        if begins:
-            self._describe(info)
-
-    def _prepare(self, info: EpisodeInfo) -> None:
-        if self._begins:
-            check_description(info)
+    def _prepare(self, info: EpisodeInfo) -> FrameTree | None:
+        self._check = SampledFrameCheck(info)
         self._cameras = {camera.name: CameraWriter(camera, self._video, info.fps) for camera in info.cameras}
-
-    def begin(self, info: EpisodeInfo) -> None:
-        """Complete the description, of which only the cameras were known; before the first image and frame.
-
-        Raises:
-            ConfigError: The description is invalid.
-            RecordingError: The disk is full; the episode's file is removed.
-        """
-        check_description(info)
-        self._describe(info)
-
-    def _describe(self, info: EpisodeInfo) -> None:
-        self._info, self._check = info, SampledFrameCheck(info)
-        *features, frames = sampled_streams(info)
         self._places = joint_places(info.features)
-        self._tree = FrameTree(Urdf.parse(info.urdf), [*self._places], info.cameras) if info.urdf else None
-        self._streams = (*features, *(self._tree.streams(self._state) if self._tree else ()), frames)
-        self._write_description()
+        return FrameTree(Urdf.parse(info.urdf), [*self._places], info.cameras) if info.urdf else None
 
-    def _state(self, frames: Sequence[SampledFrame]) -> tuple[Array, Array]:
-        """Return joint positions (N, n), and no poses of bodies (N, 0)."""
-        features = {name: np.array([frame.samples[name].vector for frame in frames]) for name in frames[0].samples}
-        return joint_positions(self._places, features), np.empty((len(frames), 0))
+    def _state(self, vectors: Mapping[str, Array]) -> tuple[Array, Array]:
+        features = {name: vectors[feature_topic(name)] for name in self._check.features}
+        positions = joint_positions(self._places, features)
+        return positions, np.empty((len(positions), 0))
 
     def image(self, camera: str, stamp_ns: int, data: NDArray[Any] | bytes) -> int:
         """Add the next image of a camera; return its number, which frames refer to.
@@ -100,14 +61,13 @@ class SampledWriter(BatchWriter):
         """Add the next frame.
 
         Raises:
-            RecordingError: Frames are out of order; features are missing, unknown, or of a wrong length or type;
-                numbers are not finite; images have not arrived; or the disk is full.
+            RecordingError: Frames are out of order; features are missing, unknown, of a wrong length or type, or not
+                finite; images have not arrived; or the disk is full.
         """
         self._check.check_frame(frame)
         self._check.note_frame(frame)
         text = frame.subtask
-        changes = [(SUBTASK, messages.STRING, encode(messages.STRING, text))] if text else []
-        self._add(PendingFrame(frame.time_ns, frame, frame.images, changes, []))
+        self._add(frame, frame.images, [(SUBTASK, messages.STRING, encode(messages.STRING, text))] if text else [], [])
 
     def flush(self) -> None:
         """See `BatchWriter`."""
@@ -126,7 +86,6 @@ class SampledFrameCheck:
     """Validates images and frames in order of arrival, and keeps track of the accepted ones.
 
     Attributes:
-        features: Features of the episode by name.
         image_stamps: Camera -> timestamp of the last accepted image.
     """
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -13,12 +12,20 @@ from demorec.episode.episode import CameraImages, Event, Frame, JointSample, fra
 from demorec.episode.info import Camera, EpisodeInfo
 from demorec.mcap import messages
 from demorec.mcap.cdr import encode
-from demorec.mcap.channels import DELIBERATE_MISS, EVENTS, PHASE, PHASE_EVENT, Message
+from demorec.mcap.channels import (
+    DELIBERATE_MISS,
+    EVENTS,
+    JOINT_STATES,
+    PHASE,
+    PHASE_EVENT,
+    Message,
+    object_topic,
+)
 from demorec.mcap.images import CameraWriter
 from demorec.mcap.metadata import CameraStreams
-from demorec.mcap.simulated_streams import FrameValues, simulated_streams
+from demorec.mcap.streams import joint_state
 from demorec.mcap.transforms import FrameTree
-from demorec.mcap.writer import BatchWriter, PendingFrame, check_description
+from demorec.mcap.writer import BatchWriter
 from demorec.robots.assets import asset_path
 from demorec.robots.urdf import Urdf
 
@@ -29,11 +36,9 @@ class EpisodeWriter(BatchWriter):
     Depth and segmentation are recorded for the cameras that have them in the first frame.
     """
 
-    def _prepare(self, info: EpisodeInfo) -> None:
+    def _prepare(self, info: EpisodeInfo) -> FrameTree:
         self._phase: str | None = None
         self._is_miss: bool | None = None
-        check_description(info)
-        self._check = FrameCheck(info)
         robot, scene = info.simulated.robot, info.simulated.scene
         urdf = Urdf.load(asset_path(robot.urdf), scale=scene.robot.scale)
         known = {joint.name for joint in urdf.joints if joint.kind != "fixed"}
@@ -42,9 +47,8 @@ class EpisodeWriter(BatchWriter):
                 f"The robot {robot.name!r} has no joints {', '.join(wrong)}; its URDF has "
                 f"{', '.join(sorted(known))}: {robot.urdf}"
             )
-        self._tree = FrameTree(urdf, robot.joint_names, info.cameras, scene)
         self._objects = [body.name for body in scene.movable]
-        self._streams = (*simulated_streams(info), *self._tree.streams(self._state))
+        return FrameTree(urdf, robot.joint_names, info.cameras, scene)
 
     def write(self, frame: Frame) -> None:
         """Add the next frame with its images.
@@ -59,46 +63,53 @@ class EpisodeWriter(BatchWriter):
                 f"Frame {frame.frame_index} at {frame.time_ns} ns arrived instead of frame {due[0]} at {due[1]} ns: "
                 "write frames in order, each once."
             )
-        self._check(frame)
+        self._check_names(frame)
         if not self._is_described:
-            self._open_cameras(frame)
-            self._write_description()
-        cameras = {name: check_images(frame, one.camera, one.streams) for name, one in self._cameras.items()}
-        numbers = {
-            name: self._cameras[name].add(
+            self._open_cameras(frame.images)
+        for name, writer in self._cameras.items():
+            _check_images(frame, writer.camera, writer.streams, frame.images[name])
+        numbers = {}
+        for name, writer in self._cameras.items():
+            images = frame.images[name]
+            numbers[name] = writer.add(
                 frame.time_ns, images.color, depth=images.depth, segmentation=images.segmentation
             )
-            for name, images in cameras.items()
-        }
-        dense = self._dense(frame.joint_samples)
-        self._add(PendingFrame(frame.time_ns, FrameValues.of(frame), numbers, self._changes(frame), dense))
+        dense = [(sample.time_ns, self._dense(sample)) for sample in frame.joint_samples]
+        self._add(frame, numbers, self._changes(frame), dense)
 
     def flush(self) -> None:
         """See `BatchWriter`."""
         if frames := self._write_frames():
             self._write_images({name: number + 1 for name, number in frames[-1].images.items()})
 
-    def _open_cameras(self, first: Frame) -> None:
+    def _check_names(self, frame: Frame) -> None:
+        seen, info = frame.observation, self._info
+        for what, found, known in (
+            ("poses of the objects", seen.object_poses, self._objects),
+            ("images of the cameras", frame.images, [camera.name for camera in info.cameras]),
+            ("numbers of the sensors", seen.sensed, list(info.sensors)),
+        ):
+            if found.keys() != set(known):
+                raise RecordingError(
+                    f"Frame {frame.frame_index} has {what} {', '.join(sorted(found)) or 'none'}, the scene has "
+                    f"{', '.join(sorted(known)) or 'none'}."
+                )
+
+    def _open_cameras(self, first: Mapping[str, CameraImages]) -> None:
         for camera in self._info.cameras:
-            if (images := first.images.get(camera.name)) is None:
-                raise RecordingError(f"Frame 0 has no image of the camera {camera.name!r}.")
-            beside = [kind for kind in ("depth", "segmentation") if getattr(images, kind) is not None]
+            beside = [kind for kind in ("depth", "segmentation") if getattr(first[camera.name], kind) is not None]
             self._cameras[camera.name] = CameraWriter(camera, self._video, self._info.fps, beside=beside)
 
-    def _state(self, frames: Sequence[FrameValues]) -> tuple[Array, Array]:
-        """Return joint positions (N, n_joints), and world_from_object of all movable bodies (N, 7 k)."""
-        positions = np.array([frame.observation.joint_position for frame in frames])
-        poses = [frame.observation.object_poses[name].vector() for frame in frames for name in self._objects]
-        return positions, np.array(poses).reshape(len(frames), 7 * len(self._objects))
+    def _state(self, vectors: Mapping[str, Array]) -> tuple[Array, Array]:
+        joints = vectors[JOINT_STATES]
+        poses = [vectors[object_topic(name)] for name in self._objects]
+        return np.split(joints, 3, axis=1)[0], np.concatenate([np.empty((len(joints), 0)), *poses], axis=1)
 
-    def _dense(self, samples: tuple[JointSample, ...]) -> list[tuple[int, bytes]]:
+    def _dense(self, sample: JointSample) -> bytes:
         """Encode joint states between the frames in the layout of those at the frames."""
-        if not samples:
-            return []
-        values = np.array([(s.joint_position, s.joint_velocity, s.joint_effort) for s in samples])
-        times = [sample.time_ns for sample in samples]
-        encoded = self._streams[0].layout.encode(np.array(times, dtype=np.int64), values.reshape(len(samples), -1))
-        return list(zip(times, encoded, strict=True))
+        values = self._vector(self._streams[0], joint_state(sample))
+        (data,) = self._streams[0].layout.encode(np.array([sample.time_ns]), values[np.newaxis])
+        return data
 
     def _changes(self, frame: Frame) -> list[Message]:
         if frame.phase == self._phase and frame.is_deliberate_miss == self._is_miss and not frame.events:
@@ -118,75 +129,16 @@ class EpisodeWriter(BatchWriter):
         return result + [(EVENTS, messages.LOG, messages.log(frame.time_ns, event)) for event in events]
 
 
-class FrameCheck:
-    """Checks one episode frame by frame; takes microseconds, since it is part of every recording."""
-
-    def __init__(self, info: EpisodeInfo) -> None:
-        self._joints, self._arm = (len(info.simulated.robot.joint_names),), (len(info.simulated.robot.arm_joints),)
-        self._objects = {body.name for body in info.simulated.scene.movable}
-        self._cameras = {camera.name for camera in info.simulated.scene.cameras}
-        self._sensed = {name: (len(feature.names),) for name, feature in info.sensors.items()}
-
-    def __call__(self, frame: Frame) -> None:
-        """Raise RecordingError if a frame is invalid; images are checked when they are encoded."""
-        poses, images = frame.observation.object_poses, frame.images
-        for what, found, known, fits in (
-            ("poses of the objects", poses, self._objects, poses.keys() == self._objects),
-            ("images of the cameras", images, self._cameras, images.keys() <= self._cameras),
-        ):
-            if not fits:
-                raise RecordingError(
-                    f"Frame {frame.frame_index} has {what} {', '.join(sorted(found)) or 'none'}, the scene has "
-                    f"{', '.join(sorted(known)) or 'none'}."
-                )
-        vectors = list(self._vectors(frame))
-        for owner, name, vector, shape in vectors:
-            if vector is None or vector.shape != shape:
-                given = f"no {name}" if vector is None else f"a {name} of shape {vector.shape}"
-                raise RecordingError(
-                    f"Frame {frame.frame_index} has {given} in its {owner}, it must be of shape {shape}."
-                )
-        if not np.isfinite(np.concatenate([vector for _, _, vector, _ in vectors])).all():
-            owner, name = next((owner, name) for owner, name, vector, _ in vectors if not np.isfinite(vector).all())
-            raise RecordingError(f"Frame {frame.frame_index} has a {name} in its {owner} that is not finite.")
-
-    def _vectors(self, frame: Frame) -> Iterator[tuple[str, str, Any, tuple[int, ...]]]:
-        """Yield owner, name, numbers and expected shape of each vector; None for missing numbers."""
-        seen = frame.observation
-        for state in (seen, *frame.joint_samples):
-            owner = f"joint sample at {state.time_ns} ns" if isinstance(state, JointSample) else "observation"
-            for name in ("joint_position", "joint_velocity", "joint_effort"):
-                yield owner, name, getattr(state, name), self._joints
-        for name in ("gripper_width", "contact_force"):
-            yield "observation", name, np.array([getattr(seen, name)]), (1,)
-        for name, shape in self._sensed.items():
-            yield "observation", name, seen.sensed.get(name), shape
-        for owner, action in (("action", frame.action), ("command", frame.command)):
-            yield owner, "joint_target", action.joint_target, self._arm
-            yield owner, "gripper_target", np.array([action.gripper_target]), (1,)
-            yield owner, "base_from_tcp_target", action.base_from_tcp_target.vector(), (7,)
-        yield "observation", "base_from_tcp", seen.base_from_tcp.vector(), (7,)
-        for pose in seen.object_poses.values():
-            yield "observation", "object_poses", pose.vector(), (7,)
-        for camera, images in frame.images.items():
-            yield f"image of {camera}", "world_from_camera", images.world_from_camera.vector(), (7,)
-
-
-def check_images(frame: Frame, camera: Camera, streams: CameraStreams) -> CameraImages:
-    """Return a frame's images of a camera; RecordingError unless they match the recorded streams and size."""
-    images = frame.images.get(camera.name)
-    if images is None:
-        raise RecordingError(f"Frame {frame.frame_index} has no image of the camera {camera.name!r}.")
-    size = (camera.height, camera.width)
+def _check_images(frame: Frame, camera: Camera, streams: CameraStreams, images: CameraImages) -> None:
     for kind, pixels, is_recorded in (
         ("colour", images.color, True),
         ("depth", images.depth, streams.depth),
         ("segmentation", images.segmentation, streams.segmentation),
     ):
+        size = (camera.height, camera.width)
         if (pixels is not None) != is_recorded or (pixels is not None and pixels.shape[:2] != size):
             found = "is missing" if pixels is None else f"has shape {pixels.shape}"
             raise RecordingError(
                 f"The {kind} image of the camera {camera.name!r} at frame {frame.frame_index} {found}: every frame has "
                 f"the same images of {camera.width}x{camera.height} pixels."
             )
-    return images

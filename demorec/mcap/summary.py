@@ -18,18 +18,11 @@ from demorec.mcap.recording import Recording, open_recording
 def summarize(path: Path, named: NamedRoles = NO_NAMES) -> dict[str, Any]:
     """Read a whole recording and summarise its content, as printed by `demorec info --json`.
 
-    Every recording has the same keys. `task`, `root_seed` and `physics_hz` are None for an episode that demorec did not
-    simulate; `success` is None if unknown or a crash cut the episode off (`is_recovered`). `seconds` is the length,
-    `rate` the mean frames per second (0 for a single frame), `oldest` the age of the oldest sample or image in a frame,
-    in seconds. `depth` and `segmentation` report whether these were recorded: for a simulated camera in addition to
-    colour, for a depth camera alone.
-
-    Args:
-        path: Path of the recording.
-        named: Features with a role named by the user, in a recording that demorec did not simulate.
+    Every recording has the same keys; what is unknown is None. `seconds` is the length, `rate` the mean frames per
+    second (0 for a single frame), `oldest` the age of the oldest sample or image in a frame, in seconds.
 
     Raises:
-        ConfigError: It lacks a feature that the user named, or is simulated.
+        ConfigError: The recording lacks a feature that the user named, or is simulated.
         RecordingError: It is not a recording, or damaged.
     """
     with open_recording(path) as recording:

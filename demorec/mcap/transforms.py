@@ -7,8 +7,7 @@ are on `/tf` at each time step, the rest on `/tf_static`.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -19,16 +18,11 @@ from demorec.episode.protocol import SceneMotion
 from demorec.episode.scene import Scene
 from demorec.mcap import messages
 from demorec.mcap.cdr import Slot, layout
-from demorec.mcap.channels import TF
-from demorec.mcap.streams import FrameStream
+from demorec.mcap.streams import POSE_SLOTS, WORLD
 from demorec.robots.urdf import Urdf, joint_motion
 
-WORLD = "world"
 RERUN_ROOT = "tf#/"
 """Rerun's name of its scene's root: without this row its 3D view cannot connect any frame to it."""
-
-POSE_SLOTS = ((Slot.VALUE,) * 3, (Slot.VALUE,) * 4)
-"""Position and quaternion xyzw in a layout."""
 
 Row = tuple[str, str, Pose]
 """Parent frame, child frame, parent_from_child."""
@@ -43,13 +37,13 @@ class FrameTree:
     """Coordinate frames of one episode with a robot description; an unrecorded joint stays at 0.
 
     Args:
-        urdf: The robot.
         joints: Names of the recorded joints.
         cameras: Cameras; those with a mount become frames.
         scene: Pose of the robot, and bodies.
 
     Attributes:
         static: Rows that never change.
+        layout: Layout of the messages on `/tf`; None if nothing moves.
     """
 
     def __init__(
@@ -61,7 +55,9 @@ class FrameTree:
     ) -> None:
         bodies = () if scene is None else scene.bodies
         self._joints = MovingJoints(urdf, joints)
-        self._moving = (*self._joints.moving, *((WORLD, body.name) for body in bodies if body.movable))
+        moving = (*self._joints.moving, *((WORLD, body.name) for body in bodies if body.movable))
+        rows = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in moving)
+        self.layout = layout(messages.TRANSFORMS, rows) if rows else None
         self.static: tuple[Row, ...] = (
             (RERUN_ROOT, WORLD, Pose()),
             (WORLD, urdf.root, Pose() if scene is None else scene.robot.world_from_base),
@@ -74,36 +70,19 @@ class FrameTree:
             ),
         )
 
-    def streams(self, state: Callable[[Sequence[Any]], tuple[Array, Array]]) -> tuple[FrameStream, ...]:
-        """Build the stream of the moving frames, which becomes no column; empty if nothing moves.
-
-        Args:
-            state: Joint positions (N, n) in the order of `joints`, and world_from_object of all movable bodies
-                (N, 7 k), given N frames.
-        """
-        if not self._moving:
-            return ()
-
-        def rows(frames: Sequence[Any]) -> Array:
-            positions, poses = state(frames)
-            return np.concatenate((self._joints.values(positions).reshape(len(frames), -1), poses), axis=1)
-
-        values = tuple(((Slot.TIME, parent), child, POSE_SLOTS) for parent, child in self._moving)
-        return (FrameStream(TF, messages.TRANSFORMS, layout(messages.TRANSFORMS, values), rows, lambda values: {}),)
+    def rows(self, positions: Array, poses: Array) -> Array:
+        """Compute the moving frames (N, 7 m), given joint positions (N, n) and poses of movable bodies (N, 7 k)."""
+        return np.concatenate((self._joints.values(positions).reshape(len(positions), -1), poses), axis=1)
 
 
 class MovingJoints:
-    """parent_from_child of all recorded moving joints at once; the others stay at 0.
+    """parent_from_child of the recorded moving joints at once; the others stay at 0.
 
-    Args:
-        urdf: The robot.
-        names: Names of the recorded joints, in the order of the vectors.
+    A revolute joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
 
     Attributes:
         moving: (parent, child) of the moving joints.
         static: Rows of the others.
-
-    A revolute joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
     """
 
     def __init__(self, urdf: Urdf, names: Sequence[str]) -> None:

@@ -11,11 +11,11 @@ import io
 import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from fractions import Fraction
 from itertools import chain
 from pathlib import Path
-from typing import Literal, Protocol, cast
+from typing import Literal, cast
 
 import av
 import numpy as np
@@ -55,54 +55,37 @@ class VideoSettings:
     Attributes:
         codec: Codec of the bit stream; for depth the encoding of its distances.
         encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that arrived encoded.
-        width, height: Pixels.
-        fps: Images per second.
         pix_fmt: FFmpeg's name of the pixel format.
         gop: Images from one keyframe to the next; 0 if unknown, for packets that arrived encoded.
-        crf: Constant rate factor; None for jpeg.
-        preset: Encoder preset; "" for jpeg.
+        crf, preset: Constant rate factor and preset of the encoder; None and "" for jpeg.
         options: Further encoder options, as passed to FFmpeg.
         jpeg_quality: 1..100; None unless the codec is jpeg.
     """
 
     codec: Codec
-    encoder: str
+    encoder: str = ""
     width: int
     height: int
     fps: int
     pix_fmt: str
     gop: int
-    crf: int | None
-    preset: str
-    options: dict[str, str]
+    crf: int | None = None
+    preset: str = ""
+    options: dict[str, str] = field(default_factory=dict)
     jpeg_quality: int | None = None
 
 
 def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
     """Build the settings of packets that arrived encoded, with unknown encoder."""
-    return VideoSettings(
-        codec=codec,
-        encoder="",
-        width=width,
-        height=height,
-        fps=fps,
-        pix_fmt=_PIXEL_FORMATS.get(codec, "yuv420p"),
-        gop=1 if codec in _PIXEL_FORMATS else 0,
-        crf=None,
-        preset="",
-        options={},
-    )
+    pix_fmt, gop = _PIXEL_FORMATS.get(codec, "yuv420p"), 1 if codec in _PIXEL_FORMATS else 0
+    return VideoSettings(codec=codec, width=width, height=height, fps=fps, pix_fmt=pix_fmt, gop=gop)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class VideoPacket:
     """One encoded image: an H.264 or H.265 access unit (Annex B), an AV1 temporal unit (OBUs) or a JPEG file.
 
-    Attributes:
-        frame_index: Frame that it shows.
-        time_ns: Time of that frame.
-        data: The bytes; parameter sets precede every keyframe.
-        is_keyframe: Whether it can be decoded without the packets before it.
+    Parameter sets precede every keyframe, which can be decoded without the packets before it.
     """
 
     frame_index: int
@@ -124,35 +107,19 @@ def size_problem(video: VideoConfig, width: int, height: int) -> str:
     )
 
 
-def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
-    """Make an encoder as configured; RecordingError if this build of FFmpeg lacks the codec."""
-    made = _JpegEncoder if video.codec == "jpeg" else _StreamEncoder
-    return made(video, width, height, fps)
-
-
-class Encoder(Protocol):
-    """Encodes the images of one camera, in order."""
-
-    settings: VideoSettings
-
-    def encode(self, image: Rgb) -> list[bytes]:
-        """Encode one image; return the packets that are ready, oldest first."""
-
-    def finish(self) -> list[bytes]:
-        """Return the remaining packets."""
-
-
 class _JpegEncoder:
     def __init__(self, video: VideoConfig, width: int, height: int, fps: int) -> None:
         settings = settings_of_coded(video.codec, width, height, fps)
         self.settings = replace(settings, jpeg_quality=video.jpeg_quality)
 
     def encode(self, image: Rgb) -> list[bytes]:
+        """Encode one image; return the packets that are ready, oldest first."""
         buffer = io.BytesIO()
         Image.fromarray(image).save(buffer, format="JPEG", quality=self.settings.jpeg_quality, subsampling="4:2:0")
         return [buffer.getvalue()]
 
     def finish(self) -> list[bytes]:
+        """Return the remaining packets."""
         return []
 
 
@@ -188,12 +155,8 @@ class _StreamEncoder:
             context.color_primaries, context.color_trc = _PRIMARIES_BT709, _TRANSFER_SRGB
             context.gop_size = video.gop
             context.thread_count = 1
-            context.options = {
-                "g": str(video.gop),
-                "crf": str(self.settings.crf),
-                "preset": self.settings.preset,
-                **options,
-            }
+            quality = {"g": str(video.gop), "crf": str(self.settings.crf), "preset": self.settings.preset}
+            context.options = {**quality, **options}
             with ordinary_scheduling():
                 context.open()
         except (av.FFmpegError, ValueError) as error:
@@ -212,6 +175,16 @@ class _StreamEncoder:
 
     def finish(self) -> list[bytes]:
         return _bare(self._context.encode(None))
+
+
+Encoder = _JpegEncoder | _StreamEncoder
+"""Encoder of the images of one camera, in order."""
+
+
+def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
+    """Make an encoder as configured; RecordingError if this build of FFmpeg lacks the codec."""
+    made = _JpegEncoder if video.codec == "jpeg" else _StreamEncoder
+    return made(video, width, height, fps)
 
 
 def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
@@ -294,10 +267,7 @@ def is_keyframe(codec: str, data: bytes) -> bool:
 
 
 def nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
-    """Yield type and offset of the NAL units of an access unit, up to the first slice; parameter sets precede it.
-
-    At most `_MAX_UNITS` are examined.
-    """
+    """Yield type and offset of an access unit's NAL units, up to the first slice, `_MAX_UNITS` at most."""
     position = data.find(b"\x00\x00\x01")
     for _ in range(_MAX_UNITS):
         if not 0 <= position < len(data) - 3:

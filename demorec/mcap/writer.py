@@ -16,24 +16,25 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike, NDArray
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.core.files import Closing
-from demorec.episode.episode import Outcome, SampledFrame
+from demorec.core.geometry import Array
+from demorec.episode.episode import Frame, Outcome, SampledFrame
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import scene_of
 from demorec.episode.validity import find_problems
 from demorec.mcap import messages, metadata
 from demorec.mcap.cdr import encode
-from demorec.mcap.channels import LABELS, TF_STATIC, Message, camera_topic, description_topic
+from demorec.mcap.channels import LABELS, TF, TF_STATIC, Message, camera_topic, description_topic
 from demorec.mcap.description import body_description, robot_description
 from demorec.mcap.images import CameraWriter
 from demorec.mcap.lossless import segment_names, to_labels
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recover import can_be_made_again
-from demorec.mcap.simulated_streams import FrameValues
-from demorec.mcap.streams import FrameStream
+from demorec.mcap.streams import FrameStream, frame_streams
 from demorec.mcap.transforms import FrameTree, camera_frame
 
 _SECOND_NS = 1_000_000_000
@@ -42,11 +43,12 @@ _BACKDROP_METRES = 3.0
 """
 
 
-class PendingFrame(NamedTuple):
+class _PendingFrame(NamedTuple):
     """A queued frame without its images."""
 
     time_ns: int
-    values: FrameValues | SampledFrame
+    stamps: list[int]  # of each stream
+    vectors: list[NDArray[np.generic]]  # of each stream
     images: Mapping[str, int]  # camera -> number of the image that the frame shows
     changes: list[Message]  # written only when something changes
     dense: list[tuple[int, bytes]]  # time_ns and data of messages on the dense stream since the previous frame
@@ -54,8 +56,6 @@ class PendingFrame(NamedTuple):
 
 class BatchWriter(Closing, ABC):
     """Context manager that writes one episode in batches of a second.
-
-    Frames must not be changed after being passed.
 
     Args:
         path: The file to create; its folder must exist.
@@ -73,9 +73,6 @@ class BatchWriter(Closing, ABC):
         RecordingError: The file cannot be written.
     """
 
-    _tree: FrameTree | None
-    _streams: Sequence[FrameStream]
-
     def __init__(
         self,
         path: Path,
@@ -85,31 +82,56 @@ class BatchWriter(Closing, ABC):
         overwrite: bool = False,
         keeps_part: bool = True,
     ) -> None:
+        if wrong := find_problems(info):
+            raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
         self.num_frames = 0
         self._info, self._video, self._keeps_part = info, video or VideoConfig(), keeps_part
         self._cameras: dict[str, CameraWriter] = {}
-        self._pending: list[PendingFrame] = []
+        self._pending: list[_PendingFrame] = []
         self._is_described = False
-        self._prepare(info)
+        self._streams = frame_streams(info)
+        self._tree = self._prepare(info)
         self._file = PartFile(path, overwrite=overwrite, is_worthless=partial(can_be_made_again, origin=info.origin))
 
     @abstractmethod
-    def _prepare(self, info: EpisodeInfo) -> None:
-        """Prepare for an episode before a file is opened. Raises ConfigError if the description is invalid."""
+    def _prepare(self, info: EpisodeInfo) -> FrameTree | None:
+        """Prepare for an episode before a file is opened; None without the robot's URDF."""
+
+    @abstractmethod
+    def _state(self, vectors: Mapping[str, Array]) -> tuple[Array, Array]:
+        """Return joint positions (N, n) and world_from_object of all movable bodies (N, 7 k), given topic -> (N, K)."""
 
     @abstractmethod
     def flush(self) -> None:
-        """Write all complete frames, which then survive the end of this process.
+        """Write all complete frames, which then survive the end of this process; RecordingError if the disk is full."""
 
-        Raises:
-            RecordingError: The disk is full or gone.
-        """
-
-    def _add(self, frame: PendingFrame) -> None:
-        self._pending.append(frame)
+    def _add(
+        self,
+        frame: Frame | SampledFrame,
+        images: Mapping[str, int],
+        changes: list[Message],
+        dense: list[tuple[int, bytes]],
+    ) -> None:
+        """Queue a frame; RecordingError if its numbers are not those of the streams."""
+        if not self._is_described:
+            self._write_description()
+        stamps = [stream.stamp_ns(frame) for stream in self._streams]
+        vectors = [self._vector(stream, stream.values(frame)) for stream in self._streams]
+        self._pending.append(_PendingFrame(frame.time_ns, stamps, vectors, images, changes, dense))
         self.num_frames += 1
         if len(self._pending) >= self._info.fps or frame.time_ns - self._pending[0].time_ns >= _SECOND_NS:
             self.flush()
+
+    def _vector(self, stream: FrameStream, parts: Sequence[ArrayLike]) -> NDArray[np.generic]:
+        vector = np.concatenate(parts)
+        count = len(stream.layout.value_slots)
+        if len(vector) != count:
+            raise RecordingError(
+                f"Frame {self.num_frames} has {len(vector)} numbers for {stream.topic}, it must have {count}."
+            )
+        if not np.isfinite(vector).all():
+            raise RecordingError(f"Frame {self.num_frames} has a number for {stream.topic} that is not finite.")
+        return vector
 
     def _write_description(self) -> None:
         """Write the latched messages; on failure the file is removed."""
@@ -118,7 +140,7 @@ class BatchWriter(Closing, ABC):
         try:
             self._file.metadata(metadata.EPISODE, metadata.episode_metadata(self._info, streams))
             has_labels = any(camera.segmentation for camera in streams.values())
-            for topic, schema, data in latched_messages(self._info, self._tree, has_labels=has_labels):
+            for topic, schema, data in _latched_messages(self._info, self._tree, has_labels=has_labels):
                 self._file.log(topic, schema, data, 0, latched=True)
             self._file.flush()
         except BaseException:
@@ -134,27 +156,33 @@ class BatchWriter(Closing, ABC):
         if any(taken):
             self._file.flush()
 
-    def _write_frames(self) -> list[PendingFrame]:
+    def _write_frames(self) -> list[_PendingFrame]:
         """Write the frames with fully encoded images, and return them."""
         frames = list(takewhile(self._has_its_images, self._pending))
         if not frames:
             return frames
-        time_ns = [frame.time_ns for frame in frames]
-        values = [frame.values for frame in frames]
         logs = [self._file.logger(stream.topic, stream.schema) for stream in self._streams]
-        encoded = [stream.encode(values, time_ns) for stream in self._streams]
-        for time, frame, *rows in zip(time_ns, frames, *encoded, strict=True):
+        encoded, found = [], {}
+        for number, stream in enumerate(self._streams):
+            stamps = np.array([frame.stamps[number] for frame in frames], dtype=np.int64)
+            found[stream.topic] = np.array([frame.vectors[number] for frame in frames])
+            encoded.append(stream.layout.encode(stamps, found[stream.topic]))
+        if self._tree is not None and self._tree.layout is not None:
+            times = np.array([frame.time_ns for frame in frames], dtype=np.int64)
+            logs.append(self._file.logger(TF, messages.TRANSFORMS))
+            encoded.append(self._tree.layout.encode(times, self._tree.rows(*self._state(found))))
+        for frame, *rows in zip(frames, *encoded, strict=True):
             for sample_ns, sample in frame.dense:
                 logs[0](sample, log_time=sample_ns)
             for log, data in zip(logs, rows, strict=True):
-                log(data, log_time=time)
+                log(data, log_time=frame.time_ns)
             for topic, schema, data in frame.changes:
-                self._file.log(topic, schema, data, time)
+                self._file.log(topic, schema, data, frame.time_ns)
         self._file.flush()
         del self._pending[: len(frames)]
         return frames
 
-    def _has_its_images(self, frame: PendingFrame) -> bool:
+    def _has_its_images(self, frame: _PendingFrame) -> bool:
         return all(number < self._cameras[name].num_ready for name, number in frame.images.items())
 
     def finish(self, outcome: Outcome) -> Path:
@@ -197,20 +225,8 @@ class BatchWriter(Closing, ABC):
         self._file.discard()
 
 
-def check_description(info: EpisodeInfo) -> None:
-    """Raise ConfigError if an episode cannot be recorded."""
-    if wrong := find_problems(info):
-        raise ConfigError(f"The episode cannot be recorded: {'; '.join(wrong)}.")
-
-
-def latched_messages(info: EpisodeInfo, tree: FrameTree | None, *, has_labels: bool) -> Iterator[Message]:
-    """Yield the messages that apply to the whole episode, written before the first frame.
-
-    Args:
-        info: Description of the episode.
-        tree: Coordinate frames; None for a robot without a URDF.
-        has_labels: Whether there are segmentation images.
-    """
+def _latched_messages(info: EpisodeInfo, tree: FrameTree | None, *, has_labels: bool) -> Iterator[Message]:
+    """Yield the messages that apply to the whole episode."""
     scene = scene_of(info)
     if tree is not None:
         yield TF_STATIC, messages.TRANSFORMS, messages.transforms(tree.static)

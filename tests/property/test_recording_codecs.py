@@ -101,7 +101,9 @@ def test_layouts_give_what_another_decoder_reads(names: list[str], data: st.Data
         assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(time, 10**9)
         assert list(read.name) == names
         assert [*read.position, *read.velocity, *read.effort] == row.tolist()
-    assert joints.decode(messages).tobytes() == rows.tobytes()
+    assert (
+        joints.decode(np.stack([np.frombuffer(message, np.uint8) for message in messages])).tobytes() == rows.tobytes()
+    )
 
 
 @settings(max_examples=100)
@@ -155,9 +157,9 @@ def test_pngs_of_others_are_refused() -> None:
 
     buffer = io.BytesIO()
     Image.new("RGB", (4, 4)).save(buffer, format="PNG")
-    with pytest.raises(ValueError, match="not a 16-bit PNG file"):
+    with pytest.raises(ValueError, match="segmentation image"):
         decode_labels(buffer.getvalue(), (4, 4))
-    with pytest.raises(ValueError, match="not a 16-bit PNG file"):
+    with pytest.raises(ValueError, match="segmentation image"):
         decode_labels(b"x" * 100, (4, 4))
 
 
@@ -170,9 +172,9 @@ def test_damaged_pngs_are_refused() -> None:
     for spoilt in (bytes(flipped), good[: len(good) // 2], good[:40]):
         with pytest.raises(ValueError, match="a damaged segmentation image"):
             decode_labels(spoilt, (48, 64))
-    with pytest.raises(ValueError, match="truncated segmentation image"):
+    with pytest.raises(ValueError, match="segmentation image"):
         decode_labels(good[:20], (48, 64))
-    with pytest.raises(ValueError, match="of 64x48 pixels"):  # before anything is unpacked
+    with pytest.raises(ValueError, match="other than 16 bits of 4x4 pixels"):
         decode_labels(good, (4, 4))
 
 

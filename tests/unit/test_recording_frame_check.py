@@ -42,11 +42,11 @@ def pose_of_nan(pose: Pose) -> Pose:
 FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     "seven joints for nine": (
         lambda f: observed(f, joint_position=f.observation.joint_position[:7]),
-        r"joint_position of shape \(7,\) in its observation, it must be of shape \(9,\)",
+        "25 numbers for /joint_states, it must have 27",
     ),
     "a sample of another length": (
         lambda f: replace(f, joint_samples=(replace(f.joint_samples[0], joint_velocity=np.zeros(3)),)),
-        r"joint_velocity of shape \(3,\) in its joint sample",
+        "21 numbers for /joint_states, it must have 27",
     ),
     "no objects": (lambda f: observed(f, object_poses={}), "poses of the objects none, the scene has cube"),
     "an unknown object": (
@@ -59,36 +59,36 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
     ),
     "no wrench": (
         lambda f: observed(f, sensed={}),
-        r"no wrench in its observation, it must be of shape \(6,\)",
+        "numbers of the sensors none, the scene has wrench",
     ),
     "a NaN in the wrench": (
         lambda f: observed(f, sensed={**f.observation.sensed, "wrench": with_nan(f.observation.sensed["wrench"])}),
-        "wrench in its observation that is not finite",
+        "a number for /wrench that is not finite",
     ),
     "a NaN in a pose": (
         lambda f: observed(f, base_from_tcp=pose_of_nan(f.observation.base_from_tcp)),
-        "base_from_tcp in its observation that is not finite",
+        "a number for /ee_pose that is not finite",
     ),
     "a NaN in an object's pose": (
         lambda f: observed(f, object_poses={n: pose_of_nan(p) for n, p in f.observation.object_poses.items()}),
-        "object_poses in its observation that is not finite",
+        "a number for /object/cube/pose that is not finite",
     ),
     "a NaN in a command": (
         lambda f: moved(f, joint_target=with_nan(f.command.joint_target)),
-        "joint_target in its command that is not finite",
+        "a number for /command that is not finite",
     ),
     "a NaN in a sample": (
         lambda f: replace(
             f,
             joint_samples=(replace(f.joint_samples[0], joint_effort=with_nan(f.joint_samples[0].joint_effort)),),
         ),
-        "joint_effort in its joint sample at .* ns that is not finite",
+        "a number for /joint_states that is not finite",
     ),
     "a NaN in a camera's pose": (
         lambda f: replace(
             f, images={n: replace(i, world_from_camera=pose_of_nan(i.world_from_camera)) for n, i in f.images.items()}
         ),
-        "world_from_camera in its image of front that is not finite",
+        "a number for /camera/front/pose that is not finite",
     ),
 }
 

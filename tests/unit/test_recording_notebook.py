@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import base64
-import io
-from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 from support.docs import run_examples
 from support.external import make_external, write_external
 from support.present import present
@@ -94,44 +90,15 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
     assert table.shape == (NUM_FRAMES, numbers)
 
 
-class Page(HTMLParser):
-    """Collects the text and images of a page, and the elements that were opened and closed."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.texts: list[str] = []
-        self.images: list[bytes] = []
-        self.tags: set[str] = set()
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.add(tag)
-        if tag == "img":
-            self.images.append(base64.b64decode(present(dict(attrs)["src"]).partition("base64,")[2]))
-
-    def handle_data(self, data: str) -> None:
-        self.texts.append(data)
-
-
-def test_the_page_of_a_notebook(path: Path) -> None:
-    with Recording(path) as recording:
-        page = Page(recording._repr_html_())
-        line = repr(recording)
-    text = " ".join(page.texts)
-    for what in ("pick up the red cube", "47 frames (1.6 s at 30 Hz)", "pick_place with panda", "success", path.name):
-        assert what in text
-    assert "47 frames (1.6 s at 30 Hz)" in line
-    assert "\n" not in line
-    images = [np.asarray(Image.open(io.BytesIO(data))) for data in page.images]
-    assert [frame_number(image) for image in images] == 2 * [0, 12, 23, 34, 46]
-
-
-def test_foreign_text_has_no_effect_in_a_page_or_a_line(tmp_path: Path, path: Path) -> None:
-    evil = tmp_path / "<script>alert(1)<\\script>\x1b[2J.mcap"
+def test_foreign_text_has_no_effect_in_a_line(tmp_path: Path, path: Path) -> None:
+    evil = tmp_path / "a\x1b[2J.mcap"
     evil.write_bytes(path.read_bytes())
     with Recording(evil) as recording:
-        assert Page(recording._repr_html_()).tags <= {"table", "tr", "th", "td", "img"}
-        assert "\x1b" not in repr(recording) + recording._repr_html_()
+        line = repr(recording)
+    assert "\x1b" not in line
+    assert "\n" not in line
+    assert "47 frames (1.6 s at 30 Hz), task pick_place with panda" in line
+    assert "success" in line
 
 
 def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> None:
@@ -151,7 +118,6 @@ def test_an_external_recording_works_in_notebooks(tmp_path: Path) -> None:
         forces = [frame.samples["observation.force"].vector for frame in given.frames]
         assert np.array_equal(table[[f"observation.force.{axis}" for axis in "xyz"]].to_numpy(), np.array(forces))
         assert "stack the cups with two_joints" in repr(recording)
-        assert recording._repr_html_().count("<img") == 2 * 5
         with pytest.raises(RecordingError, match="needs the scene of an episode that demorec simulated"):
             next(iter(recording))
     with pytest.raises(RecordingError, match=f"needs the scene of an episode that demorec simulated.*: {tmp_path}"):

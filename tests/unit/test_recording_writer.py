@@ -75,7 +75,7 @@ def test_images_are_complete(tmp_path: Path) -> None:
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
         writer.write(frames[0])
         wrist = frames[1].images["wrist"]
-        with pytest.raises(RecordingError, match="no image of the camera 'wrist'"):
+        with pytest.raises(RecordingError, match="images of the cameras front, the scene has front, wrist"):
             writer.write(replace(frames[1], images={"front": frames[1].images["front"]}))
     with EpisodeWriter(tmp_path / "b.mcap", info) as writer:
         writer.write(frames[0])

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import replace
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from types import TracebackType
@@ -22,7 +23,7 @@ from demorec.episode.episode import Outcome, Sample, SampledFrame
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin
 from demorec.episode.validity import find_problems
 from demorec.mcap import SampledWriter
-from demorec.mcap.recorder.encoder import BackgroundEncoder, Buffers, WaitingImages, WhenFull
+from demorec.mcap.recorder.encoder import BackgroundEncoder, WaitingImages, WhenFull
 from demorec.mcap.recorder.vectors import (
     NamedVectors,
     RobotLike,
@@ -48,28 +49,25 @@ _REAL_TIME = VideoConfig(preset="ultrafast")
 class RecordedEpisode(AbstractContextManager["RecordedEpisode"]):
     """Context manager over one episode, created by `Recorder.episode`.
 
-    An exception that ends the `with` block marks the episode as failed, Ctrl-C does not; all received data is kept in
-    both cases. An episode without frames leaves no file.
+    An exception that ends the `with` block marks the episode as failed, Ctrl-C does not; all received data is kept. An
+    episode without frames leaves no file.
 
     Attributes:
         success: Whether it succeeded, to be set by the caller; None if unknown.
         drops: "frames" -> number of frames dropped because the encoder could not keep up, if that is allowed.
         num_frames: Number of accepted frames.
+        is_open: Whether it accepts more frames.
     """
 
-    def __init__(self, run: Recorder, info: EpisodeInfo, encoder: BackgroundEncoder) -> None:
+    def __init__(self, run: Recorder, info: EpisodeInfo) -> None:
         self.success: bool | None = None
         self.drops: dict[str, int] = {}
         self.num_frames = 0
+        self.is_open = True
         self._run = run
         self._info = info
-        self._encoder: BackgroundEncoder | None = encoder
         self._check: SampledFrameCheck | None = None
-
-    @property
-    def is_open(self) -> bool:
-        """Whether it accepts more frames."""
-        return self._encoder is not None
+        self._encoder: BackgroundEncoder | None = None
 
     def __exit__(
         self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
@@ -110,22 +108,24 @@ class RecordedEpisode(AbstractContextManager["RecordedEpisode"]):
             RecordingError: The data cannot be recorded, the encoder cannot keep up and drops are not allowed, or the
                 disk is full.
         """
-        if self._encoder is None:
+        if not self.is_open:
             raise RecordingError("The episode has ended: begin another with recorder.episode().")
-        if self._encoder.error is not None:
+        if self._encoder is not None and self._encoder.error is not None:
             raise _as_recording_error(self._encoder.error)
         time_ns = self._run.clock() if time_ns is None else time_ns
         vectors = named_vectors(observation, action)
         if self._check is None:
-            self._encoder.info = self._run.described(self._info, vectors)
-            self._check = SampledFrameCheck(self._encoder.info)
+            self._info = self._run.described(self._info, vectors)
+            self._check = SampledFrameCheck(self._info)
         check = self._check
         frame = SampledFrame(time_ns=time_ns, samples=_samples(check, vectors, time_ns, stamps or {}))
         waiting = _waiting(check, images or {}, time_ns)
-        new = {camera: (stamp, pixels) for camera, (stamp, pixels) in waiting.items() if pixels is not None}
+        new = [(camera, stamp, pixels) for camera, (stamp, pixels) in waiting.items() if pixels is not None]
         check.check_frame(frame)
-        for camera, (stamp_ns, pixels) in new.items():
-            check.check_image(camera, stamp_ns, pixels)
+        for image in new:
+            check.check_image(*image)
+        if self._encoder is None:
+            self._encoder = self._run.open_encoder(self._info)
         if not self._encoder.put(frame, waiting):
             if self._run.when_full == "drop":
                 self.drops[FRAMES] = self.drops.get(FRAMES, 0) + 1
@@ -134,7 +134,7 @@ class RecordedEpisode(AbstractContextManager["RecordedEpisode"]):
                 f"The encoder cannot keep up ({self._encoder.capacity} frames are waiting): choose faster encoding "
                 '(video=VideoConfig(codec="jpeg")), smaller or fewer images, or when_full="drop" or "wait".'
             )
-        for camera, (stamp_ns, _) in new.items():
+        for camera, stamp_ns, _ in new:
             check.note_image(camera, stamp_ns)
         check.note_frame(frame)
         self.num_frames += 1
@@ -159,11 +159,9 @@ class RecordedEpisode(AbstractContextManager["RecordedEpisode"]):
         encoder = self._end()
         if encoder is None:
             return None
-        if self.num_frames == 0:
-            encoder.writer.discard()
-            return None
-        if encoder.error is not None:
-            encoder.writer.close()
+        if encoder.error is not None or encoder.writer is None:
+            if encoder.writer is not None:
+                encoder.writer.close()
             raise _as_recording_error(encoder.error)
         outcome = Outcome(success=self.success, num_frames=self.num_frames, drops=self.drops, failure_reason=reason)
         path = encoder.writer.finish(outcome)
@@ -173,11 +171,12 @@ class RecordedEpisode(AbstractContextManager["RecordedEpisode"]):
     def discard(self) -> None:
         """End the episode and delete its data; safe to call twice, and after `finish`."""
         encoder = self._end()
-        if encoder is not None:
+        if encoder is not None and encoder.writer is not None:
             encoder.writer.discard()
 
     def _end(self) -> BackgroundEncoder | None:
-        """Stop accepting frames; returns the encoder, unless the episode has already been ended."""
+        """Stop accepting frames; returns the encoder once, and none if there were no frames."""
+        self.is_open = False
         encoder, self._encoder = self._encoder, None
         if encoder is not None:
             encoder.end()
@@ -261,7 +260,6 @@ class Recorder(Closing):
         self._video.validate()
         self.clock, self.when_full = clock, when_full
         self._check_request()
-        self._buffers = Buffers(self._cameras)
         self._stack = ExitStack()
         self._open: RecordedEpisode | None = None
         self._folder: ExternalFolder = self._stack.enter_context(open_external_run(Path(folder)))
@@ -294,13 +292,13 @@ class Recorder(Closing):
         return len(self._folder.episodes)
 
     def episode(self, task: str = "") -> RecordedEpisode:
-        """Begin an episode; its file and encoders are opened now, so that no frame waits for that.
+        """Begin an episode; its file is created with the first frame.
 
         Args:
             task: Task of this episode, replaces the recorder's.
 
         Raises:
-            RecordingError: An episode is already being recorded, or the disk is full.
+            RecordingError: An episode is already being recorded.
             ConfigError: The task text is missing.
         """
         if self._open is not None and self._open.is_open:
@@ -309,12 +307,7 @@ class Recorder(Closing):
         if not instruction.strip():
             raise ConfigError("The episode has no task text: give Recorder(task=...) or recorder.episode(task=...).")
         info = self._info(self._features, self._folder.next_index, instruction)
-        path = episode_path(self.path, info.episode_index)
-        writer = SampledWriter(path, info, video=self._video, begins=False)
-        encoder = BackgroundEncoder(
-            writer, self._buffers, cameras=info.cameras, fps=info.fps, waits=self.when_full == "wait"
-        )
-        self._open = RecordedEpisode(self, info, encoder)
+        self._open = RecordedEpisode(self, info)
         return self._open
 
     # ------------------------------------------------------------------------------- for the episode
@@ -326,6 +319,16 @@ class Recorder(Closing):
             raise ConfigError(f"This cannot be recorded: {'; '.join(wrong)}.")
         self._folder.check_fits(info)
         return info
+
+    def open_encoder(self, info: EpisodeInfo) -> BackgroundEncoder:
+        """Begin the file of a described episode."""
+        path = episode_path(self.path, info.episode_index)
+        return BackgroundEncoder(
+            partial(SampledWriter, path, info, video=self._video),
+            cameras=info.cameras,
+            fps=info.fps,
+            waits=self.when_full == "wait",
+        )
 
     def add(self, recording: Path) -> None:
         """Add a finished recording to the run."""
@@ -366,7 +369,8 @@ def _camera(name: str, camera: tuple[int, int] | Camera) -> Camera:
         raise ConfigError(f"The camera {name!r} is {camera!r}; give (height, width) in pixels.") from None
 
 
-def _as_recording_error(error: BaseException) -> RecordingError:
+def _as_recording_error(error: BaseException | None) -> RecordingError:
     if isinstance(error, RecordingError):
         return error
-    return RecordingError(f"The episode cannot be recorded any more ({describe_error(error)}).")
+    reason = "unknown" if error is None else describe_error(error)
+    return RecordingError(f"The episode cannot be recorded any more ({reason}).")

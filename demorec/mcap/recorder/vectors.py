@@ -7,10 +7,9 @@ vector, or of vectors by feature names. An action has the same forms, but is alw
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from numbers import Real
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,11 +33,7 @@ _PREFIX = "observation."
 
 
 def named_vectors(observation: Vectors, action: Vectors | None) -> NamedVectors:
-    """Convert and copy the data.
-
-    Raises:
-        RecordingError: Values are not vectors of numbers, or a mapping mixes vectors and single numbers.
-    """
+    """Convert and copy the data; RecordingError unless it is vectors of numbers, or one mapping of numbers."""
     found: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {}
     if isinstance(observation, Mapping) and not _is_of_numbers(STATE, observation):
         for key, value in observation.items():
@@ -112,14 +107,8 @@ def features_of(vectors: NamedVectors, robot: RobotFacts) -> tuple[Feature, ...]
         names = given or _element_names(len(vector), known)
         # LeRobot's robots call the position of a joint "JOINT.pos".
         joints = tuple(joint if (joint := element.removesuffix(".pos")) in known else "" for element in names)
-        found.append(
-            Feature(
-                name=name,
-                dtype="float32" if vector.dtype == np.float32 else "float64",
-                names=names,
-                joints=joints if any(joints) else (),
-            )
-        )
+        dtype: Literal["float32", "float64"] = "float32" if vector.dtype == np.float32 else "float64"
+        found.append(Feature(name=name, dtype=dtype, names=names, joints=joints if any(joints) else ()))
     return tuple(found)
 
 
@@ -135,32 +124,18 @@ def _element_names(count: int, joints: tuple[str, ...]) -> tuple[str, ...]:
 RobotLike = str | Path | RobotSpec | Sequence[str]
 
 
-@dataclass(frozen=True, kw_only=True)
-class RobotFacts:
-    """Known facts about the robot.
-
-    Attributes:
-        name: Name of the robot.
-        urdf: Its description as text, "" if unknown; from a file, every mesh is replaced by its box, so that it can be
-            drawn without other files.
-        joints: Names of all moving joints, in the order of the vectors, if known.
-    """
+class RobotFacts(NamedTuple):
+    """Known facts about the robot; from a file, the meshes of its URDF are boxes, drawn without other files."""
 
     name: str
     urdf: str = ""
-    joints: tuple[str, ...] = ()
+    joints: tuple[str, ...] = ()  # all moving ones, in the order of the vectors
 
 
 def robot_facts(robot: RobotLike) -> RobotFacts:
-    """Collect the facts about a robot given by name, URDF or joints.
-
-    Raises:
-        ConfigError: The URDF is unreadable or invalid, or the joint names are invalid.
-    """
+    """Collect the facts about a robot given by name, URDF or joints; ConfigError if these are invalid."""
     if isinstance(robot, RobotSpec):
-        joints = robot.joint_names
-        urdf = robot_description(robot.urdf, 1.0)
-        return RobotFacts(name=robot.name, urdf=urdf, joints=joints)
+        return RobotFacts(robot.name, robot_description(robot.urdf, 1.0), robot.joint_names)
     if isinstance(robot, Path) or (isinstance(robot, str) and robot.endswith(".urdf")):
         path = Path(robot)
         try:
@@ -172,11 +147,11 @@ def robot_facts(robot: RobotLike) -> RobotFacts:
             return _described(robot, None)
         if not robot.strip():
             raise ConfigError("The robot's name is empty: give a name, a URDF, or the names of its joints.")
-        return RobotFacts(name=robot)
+        return RobotFacts(robot)
     joints = tuple(robot)
     if not joints or not all(isinstance(joint, str) and joint for joint in joints):
         raise ConfigError(f"The robot is {joints!r}: give a name, a URDF, or the names of its joints.")
-    return RobotFacts(name="robot", joints=joints)
+    return RobotFacts("robot", joints=joints)
 
 
 def _described(text: str, path: Path | None) -> RobotFacts:
@@ -190,4 +165,4 @@ def _described(text: str, path: Path | None) -> RobotFacts:
     except (ValueError, SceneError) as error:
         raise ConfigError(f"The robot's URDF cannot be used ({describe_error(error)}){where}") from error
     moving = tuple(joint.name for joint in urdf.joints if joint.kind != "fixed")
-    return RobotFacts(name=name, urdf=text, joints=moving)
+    return RobotFacts(name, text, moving)

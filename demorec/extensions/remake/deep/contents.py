@@ -100,9 +100,9 @@ class Contents:
         """Read a whole file; RecordingError if it is damaged."""
         found = cls()
         with closing(Container(path)) as container:
-            for name in container.metadata_names:
+            for name in container.metadata_index:
                 found.metadata[name] = container.metadata(name) or {}
-            for name in container.attachment_names:
+            for name in container.attachments:
                 found.attachments[name] = container.attachment(name)
             for topic, channel in container.channels.items():
                 schema = container.schemas[channel.schema_id]
