@@ -55,10 +55,7 @@ def frames_of(
 ) -> Iterator[Frame]:
     """Yield every frame without its images, bit-exact: numbers, phase, events, and the joint samples before it.
 
-    Args:
-        trajectory: Numbers of a recording.
-        events: Its events, each with its time_ns.
-        joint_samples: Its joint states, including those of the frames.
+    `events` have their time_ns; `joint_samples` include those of the frames.
     """
     times = trajectory.time_ns.tolist()
     found: dict[int, list[Event]] = {}

@@ -39,10 +39,7 @@ class CameraStreams:
 
 
 def episode_metadata(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> dict[str, str]:
-    """Build the record that makes an MCAP file a recording; its first values are for human readers.
-
-    The URDF is a message; the record has its SHA-256.
-    """
+    """Build the record that makes an MCAP file a recording; its first values are for human readers."""
     return sealed(
         {
             "instruction": info.instruction,

@@ -106,7 +106,6 @@ class EpisodeWriter(BatchWriter):
         return np.split(joints, 3, axis=1)[0], np.concatenate([np.empty((len(joints), 0)), *poses], axis=1)
 
     def _dense(self, sample: JointSample) -> bytes:
-        """Encode joint states between the frames in the layout of those at the frames."""
         values = self._vector(self._streams[0], joint_state(sample))
         (data,) = self._streams[0].layout.encode(np.array([sample.time_ns]), values[np.newaxis])
         return data

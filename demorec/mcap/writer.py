@@ -148,7 +148,6 @@ class BatchWriter(Closing, ABC):
             raise
 
     def _write_images(self, until: Mapping[str, int]) -> None:
-        """Write the images of each camera before a number, in the order of their timestamps."""
         taken = [self._cameras[name].take(number) for name, number in until.items()]
         for stamp_ns, found in merge(*taken, key=lambda image: image[0]):
             for topic, schema, data in found:

@@ -37,18 +37,15 @@ WaitingImages = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
 
 
 class BackgroundEncoder:
-    """Thread that opens a writer and feeds it from a queue.
+    """Thread that opens a writer and feeds it from a queue, in which up to half a second of frames may wait.
 
     Args:
-        open_writer: Opens the writer.
-        cameras: Cameras of the episode; they determine the capacity.
-        fps: Nominal frames per second: up to half a second of frames may wait, if memory allows.
         waits: Whether `put` waits for room.
 
     Attributes:
         writer: Writer of the episode, once it is open; used only by the thread until `end` returns.
         error: Error that ended the thread, if any.
-        capacity: Maximum number of waiting frames.
+        capacity: Maximum number of waiting frames, which memory limits.
     """
 
     def __init__(
@@ -69,10 +66,7 @@ class BackgroundEncoder:
         self._thread.start()
 
     def put(self, frame: SampledFrame, images: WaitingImages) -> bool:
-        """Copy a frame's images and queue both; False if the queue is full and `waits` is off.
-
-        Only one thread may put frames.
-        """
+        """Copy a frame's images and queue both, from one thread; False if the queue is full and `waits` is off."""
         while self._queue.full():
             if not self._waits:
                 return False
