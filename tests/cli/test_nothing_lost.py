@@ -31,6 +31,7 @@ from demorec.core.replacing import (
     REPORT_MARK,
     RERUN_FILE,
     check_replaceable,
+    settle_parts,
 )
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.lerobot.options import ExportOptions
@@ -249,6 +250,20 @@ def test_episodes_that_were_not_generated_are_not_overwritten(
     assert {name: data for name, data in files_of(folder).items() if name != ".lock"} == before
 
 
+def test_a_failed_overwrite_restores_the_run(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    import demorec.generate.folder as module
+
+    def fail(*arguments: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    before = {name: data for name, data in files_of(run).items() if name != ".lock"}
+    monkeypatch.setattr(module, "save_run_file", fail)
+    with pytest.raises(DemorecError, match="No space left"):
+        run_fake(run, num_episodes=2, seed=1, overwrite=True)
+    assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
+    assert not (run / ".demorec-replaced").exists()
+
+
 @pytest.mark.parametrize("aside", ["notes.txt", "what-this-is.txt", ""])
 def test_a_third_party_folder_with_the_name_of_set_aside_files_stays(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], aside: str
@@ -265,6 +280,37 @@ def test_a_third_party_folder_with_the_name_of_set_aside_files_stays(
         assert exit_code("generate", "--num-episodes", 1, "--out", folder, *flags) == 2
         assert len(capsys.readouterr().err.splitlines()) == 1
         assert files_of(folder) == before
+
+
+@pytest.mark.parametrize("moment", ["before", "moving", "moved", "made"])
+def test_a_crash_while_overwriting_loses_nothing(tmp_path: Path, moment: str) -> None:
+    """The four states that a kill inside `replaced_parts` can leave, built by hand."""
+    names = ("run.json", "episodes", "failed")
+    old = {"run.json": b"old", "episodes/a": b"old a", "failed/b": b"old b"}
+    for name, data in old.items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    aside = tmp_path / ".demorec-replaced"
+    aside.mkdir()
+    (aside / "what-this-is.txt").touch()
+    for name in {"before": (), "moving": names[:2], "moved": names, "made": names}[moment]:
+        (tmp_path / name).rename(aside / name)
+    if moment in ("moved", "made"):
+        (tmp_path / "episodes").mkdir()
+    if moment == "made":
+        (tmp_path / "run.json").write_bytes(b"new")
+    settle_parts(tmp_path, names)
+    assert files_of(tmp_path) == ({"run.json": b"new"} if moment == "made" else old)
+    assert not aside.exists()
+
+
+def test_a_third_party_folder_does_not_count_as_set_aside_files(tmp_path: Path) -> None:
+    (tmp_path / ".demorec-replaced").mkdir()
+    (tmp_path / ".demorec-replaced" / "mine").touch()
+    (tmp_path / "run.json").touch()
+    with pytest.raises(ConfigError, match="not made by demorec"):
+        settle_parts(tmp_path, ("run.json",))
+    assert (tmp_path / ".demorec-replaced" / "mine").exists()
 
 
 # An evaluation.
