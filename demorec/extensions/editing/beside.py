@@ -7,7 +7,7 @@ written.
 from __future__ import annotations
 
 import filecmp
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ import pyarrow.parquet as pq
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
-from demorec.core.plain import parse_json, to_json
+from demorec.core.plain import listed, parse_json, to_json
 from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
 from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
 from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
@@ -204,14 +204,10 @@ def _cut_phases(row: Mapping[str, Any], cut: EpisodeSlice) -> list[dict[str, Any
 def left_out(plan: Plan) -> tuple[str, ...]:
     """One phrase for each omission with its reason in brackets, except the user's choices."""
     found: dict[str, set[str]] = {}
-    copied = copied_files(plan)
-    for number, source in enumerate(plan.sources):
-        for name, reason in _files(plan, number, source.root, copied):
+    for number in range(len(plan.sources)):
+        for name, reason in _files(plan, number):
             found.setdefault(reason, set()).add(name)
-    phrases = []
-    for reason, names in found.items():
-        more = f" and {len(names) - MAX_NAMES} more" if len(names) > MAX_NAMES else ""
-        phrases.append(f"{', '.join(sorted(names)[:MAX_NAMES])}{more} ({reason})")
+    phrases = [f"{listed(sorted(names), MAX_NAMES, ', ')} ({reason})" for reason, names in found.items()]
     return (*phrases, *_scenes(plan), *_descriptions(plan), *_attempts(plan), *_facts(plan))
 
 
@@ -267,35 +263,34 @@ def _files_below(root: Path) -> list[str]:
     return [name for name in names if not name.startswith(_OF_OTHER_TOOLS)]
 
 
-def _files(plan: Plan, number: int, root: Path, copied: Collection[str]) -> Iterator[tuple[str, str]]:
-    for path in filter(Path.exists, plan.sources[number].num_rows):
+def _files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
+    """Yield (name, reason) of the files of a source, and columns of its rows, that the result omits."""
+    source = plan.sources[number]
+    for path in filter(Path.exists, source.num_rows):
         for name in open_table(path).schema_arrow.names:
-            if name not in plan.sources[number].info.features:
+            if name not in source.info.features:
                 yield name, f"{INFO_PATH} does not list this column of the data files"
+    copied, used = copied_files(plan), _used_files(source)
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
-    used = _used_files(plan.sources[number])
-    for name in _files_below(root):
-        path = root / name
+    is_merged = len(plan.sources) > 1
+    for name in _files_below(source.root):
+        path = source.root / name
         if name in copied or path in used:
             continue
         if _is_stray_table(name) and not is_dataset_file(name):
             yield name, "LeRobot gives no table this name"
         elif not is_dataset_file(name):
-            differs = "not the same in all datasets" if len(plan.sources) > 1 else "unknown to demorec"
+            differs = "not the same in all datasets" if is_merged else "unknown to demorec"
             yield name, f"{differs}: copy it if it still applies"
-        elif name.startswith(("data/", "videos/")):
+        elif name.startswith(("data/", "videos/", "images/")):
             yield name, "no episode of the dataset is in this file"
-        elif name in _ABOUT_THE_WHOLE and len(plan.sources) > 1:
+        elif (name in _ABOUT_THE_WHOLE and is_merged) or (name == PROGRESS_PATH and not keeps_progress):
             yield name, "not the same in all datasets"
-        elif name.startswith("images/"):
-            yield name, "no row has it"
         elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
             yield name, "the other datasets have other moving cameras"
         elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
             yield name, "its camera is left out"
-        elif name == PROGRESS_PATH and not keeps_progress:
-            yield name, "not all datasets have progress with the same columns"
         elif name.startswith("meta/temporal_proportions_") and not (
             name == PROPORTIONS_PATH and keeps_progress and _has_stages(plan)
         ):

@@ -1,4 +1,4 @@
-"""Plans that cut episodes into parts: at frames, at jumps of the data, or around pauses."""
+"""Cuts of a plan's episodes: at frames, at jumps of the data, around pauses, or at idle ends."""
 
 from __future__ import annotations
 
@@ -7,13 +7,11 @@ from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError, OptionError
 from demorec.core.geometry import Array
 from demorec.core.registry import check_choice
 from demorec.datasets.lerobot.files import column_numbers
-from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
@@ -27,52 +25,51 @@ class WatchedNumbers:
     """Numbers that define motion, episode by episode.
 
     Args:
-        source: The dataset.
-        features: Features to watch; empty for the state without grippers.
+        plan: Plan of a whole dataset.
+        features: Features to watch; empty for the state.
+        option: The option that names features, for the error message.
+        grippers: Whether to watch the grippers of the state.
 
     Raises:
         ConfigError: No such numeric feature, or the state is unknown.
     """
 
-    def __init__(self, source: LeRobotFolder, features: Sequence[str] = ()) -> None:
-        numeric = [
-            name
-            for name, feature in source.info.features.items()
-            if feature.is_numeric and name not in AUTOMATIC_FEATURES
-        ]
+    def __init__(self, plan: Plan, features: Sequence[str], option: str, *, grippers: bool = False) -> None:
+        (source,) = plan.sources
+        own = source.info.features.items()
+        numeric = [name for name, feature in own if feature.is_numeric and name not in AUTOMATIC_FEATURES]
         for feature in features:
             check_choice("feature of numbers", feature, numeric)
         self._names = features or source.roles.state
         if not self._names:
-            raise ConfigError(f"No state was found: name a feature by --feature: {source.root}")
-        self._is_watched: NDArray[np.bool_] | None = None if features else ~source.roles.grippers()
-        self._source, self._rows = source, source.rows(self._names)
+            raise ConfigError(f"No state was found: name a feature by --{option}: {source.root}")
+        self._is_watched = slice(None) if features or grippers else ~source.roles.grippers()
+        self._places, self._rows = source.places, source.rows(self._names)
 
     def episode(self, number: int) -> Array:
         """(T, D) numbers of an episode."""
-        table = self._rows.read(self._source.places[number])
+        table = self._rows.read(self._places[number])
         columns = [column_numbers(table.column(name).combine_chunks()) for name in self._names]
-        values = np.hstack(columns).astype(np.float64)
-        return values if self._is_watched is None else values[:, self._is_watched]
+        return np.asarray(np.hstack(columns).astype(np.float64)[:, self._is_watched])
 
-    def ranges(self) -> Array:
-        """(D,) difference between largest and smallest number over the dataset."""
+    def least(self, option: str, ratio: float) -> Array:
+        """(D,) minimum change: a ratio of the difference between largest and smallest number over the dataset."""
+        if not 0 < ratio <= 1:
+            raise OptionError(option, f"is {ratio}, allowed are ratios above 0 and up to 1.")
         low, high = np.inf, -np.inf
-        for number in range(len(self._source.places)):
+        for number in range(len(self._places)):
             values = self.episode(number)
             low = np.fmin(low, np.fmin.reduce(values))
             high = np.fmax(high, np.fmax.reduce(values))
-        return np.asarray(high - low)
+        return np.asarray(ratio * (high - low))
 
 
-def cut_at(source: LeRobotFolder, frames: Mapping[int, Sequence[int]]) -> Plan:
-    """All episodes, some cut before given frames: number of an episode -> first frames of further parts."""
-    plan = Plan.whole(source)
+def cut_at(plan: Plan, frames: Mapping[int, Sequence[int]]) -> Plan:
+    """Cut episodes before given frames: number of an episode -> first frames of further parts."""
     for number, begins in frames.items():
+        root = plan.sources[0].root
         if not 0 <= number < len(plan.cuts):
-            raise ConfigError(
-                f"Episode {number} does not exist, the dataset has 0 to {len(plan.cuts) - 1}: {source.root}"
-            )
+            raise ConfigError(f"Episode {number} does not exist, the dataset has 0 to {len(plan.cuts) - 1}: {root}")
         length = plan.cuts[number].last
         if wrong := [frame for frame in begins if not 0 < frame < length]:
             raise ConfigError(
@@ -81,18 +78,17 @@ def cut_at(source: LeRobotFolder, frames: Mapping[int, Sequence[int]]) -> Plan:
     return _in_parts(plan, {number: _between(plan.cuts[number].last, begins) for number, begins in frames.items()})
 
 
-def cut_at_jumps(source: LeRobotFolder, features: Sequence[str], threshold: float) -> Plan:
-    """All episodes, cut where numbers jump.
+def cut_at_jumps(plan: Plan, features: Sequence[str], threshold: float) -> Plan:
+    """Cut episodes where numbers jump.
 
     Args:
-        source: The dataset.
+        plan: Plan of a whole dataset.
         features: Features to watch; empty for the state without grippers.
         threshold: A jump is a step between frames that exceeds all steps near it by more than this ratio of its range
-        over the dataset; in motion, neighbouring steps are similar.
+            over the dataset; in motion, neighbouring steps are similar.
     """
-    _check_share("jump_threshold", threshold)
-    plan, watched = Plan.whole(source), WatchedNumbers(source, features)
-    least = threshold * watched.ranges()
+    watched = WatchedNumbers(plan, features, "feature")
+    least = watched.least("jump_threshold", threshold)
     parts = {}
     for number, cut in enumerate(plan.cuts):
         steps = np.abs(np.diff(watched.episode(number), axis=0))
@@ -101,23 +97,21 @@ def cut_at_jumps(source: LeRobotFolder, features: Sequence[str], threshold: floa
     return _in_parts(plan, parts)
 
 
-def without_pauses(
-    source: LeRobotFolder, features: Sequence[str], *, min_frames: int, threshold: float, margin: int
-) -> Plan:
-    """All episodes without pauses; each part between two pauses becomes an episode.
+def without_pauses(plan: Plan, features: Sequence[str], seconds: float, threshold: float, margin: int) -> Plan:
+    """Remove pauses; each part between two pauses becomes an episode.
 
     Args:
-        source: The dataset.
+        plan: Plan of a whole dataset.
         features: Features to watch; empty for the state without grippers.
-        min_frames: Minimum length of a pause.
+        seconds: Minimum length of a pause.
         threshold: Maximum change of each number during a pause, as a ratio of its range over the dataset.
         margin: Still frames to keep at either end of a pause.
     """
-    _check_share("still_threshold", threshold)
+    min_frames = round(seconds * plan.info.fps)
     if min_frames < 2:
-        raise OptionError("pauses", f"is shorter than two frames at {source.info.fps} frames per second.")
-    plan, watched = Plan.whole(source), WatchedNumbers(source, features)
-    least = threshold * watched.ranges()
+        raise OptionError("pauses", f"is shorter than two frames at {plan.info.fps} frames per second.")
+    watched = WatchedNumbers(plan, features, "feature")
+    least = watched.least("still_threshold", threshold)
     parts = {}
     for number, cut in enumerate(plan.cuts):
         kept: list[Span] = []
@@ -129,6 +123,32 @@ def without_pauses(
         kept = [span for span in [*kept, (begin, cut.last)] if span[1] > span[0]]
         parts[number] = kept or [(0, cut.last)]  # no motion at all: that is a decision for `drop`
     return _in_parts(plan, parts)
+
+
+def without_idle_ends(plan: Plan, feature: str | None, threshold: float, margin: int) -> Plan:
+    """Cut off the still frames at the beginning and the end of each episode.
+
+    Args:
+        plan: Plan of a whole dataset.
+        feature: Feature to watch; None for the state.
+        threshold: Maximum change of each number in still frames, as a ratio of its range over the dataset.
+        margin: Still frames to keep at either end.
+    """
+    watched = WatchedNumbers(plan, () if feature is None else (feature,), "idle-feature", grippers=True)
+    least = watched.least("idle_threshold", threshold)
+    cuts = []
+    for cut in plan.cuts:
+        values = watched.episode(cut.episode)
+        # Compared with the initial and final values, so that slow motion counts as well.
+        away_from_start = np.flatnonzero((np.abs(values - values[0]) > least).any(axis=1))
+        away_from_end = np.flatnonzero((np.abs(values - values[-1]) > least).any(axis=1))
+        if not len(away_from_start):
+            cuts.append(cut)  # no motion at all: that is a decision for `drop`
+            continue
+        first = max(0, int(away_from_start[0]) - 1 - margin)
+        last = min(cut.last, int(away_from_end[-1]) + 2 + margin)
+        cuts.append(replace(cut, first=first, last=max(last, first + 1)))
+    return plan.with_cuts(cuts)
 
 
 def _largest_near(steps: Array) -> Array:
@@ -152,15 +172,9 @@ def _pauses(values: Array, least: Array, min_frames: int) -> Iterator[Span]:
         begin = end
 
 
-def _check_share(option: str, value: float) -> None:
-    if not 0 < value <= 1:
-        raise OptionError(option, f"is {value}, allowed are ratios above 0 and up to 1.")
-
-
 def _between(length: int, begins: Sequence[int]) -> list[Span]:
     """Parts of an episode that begin at 0 and at these frames."""
-    edges = [0, *sorted(set(begins)), length]
-    return list(pairwise(edges))
+    return list(pairwise([0, *sorted(set(begins)), length]))
 
 
 def _in_parts(plan: Plan, parts: Mapping[int, Sequence[Span]]) -> Plan:

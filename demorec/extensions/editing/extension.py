@@ -9,22 +9,22 @@ EXTENSION = Extension(
     summary="edit, cut, repair and compare LeRobot datasets",
     commands={
         "dataset": CommandRow(
-            target="demorec.extensions.editing.commands:DatasetCommand", group="edit", limits="reading"
+            target="demorec.extensions.editing.command:DatasetCommand", group="edit", limits="reading"
         )
     },
     operations={
-        "select": "demorec.extensions.editing.commands.operations:Select",
-        "drop": "demorec.extensions.editing.commands.operations:Drop",
-        "trim": "demorec.extensions.editing.commands.operations:Trim",
-        "cut": "demorec.extensions.editing.commands.damage:Cut",
-        "split": "demorec.extensions.editing.commands.operations:Split",
-        "merge": "demorec.extensions.editing.commands.operations:Merge",
-        "rename": "demorec.extensions.editing.commands.operations:Rename",
-        "drop-features": "demorec.extensions.editing.commands.operations:DropFeatures",
-        "set-task": "demorec.extensions.editing.commands.operations:SetTask",
-        "reorder": "demorec.extensions.editing.commands.operations:Reorder",
-        "shuffle": "demorec.extensions.editing.commands.operations:Shuffle",
-        "repair": "demorec.extensions.editing.commands.damage:Repair",
-        "diff": "demorec.extensions.editing.commands.diff:Diff",
+        "select": "demorec.extensions.editing.selection:Select",
+        "drop": "demorec.extensions.editing.selection:Drop",
+        "trim": "demorec.extensions.editing.operations:Trim",
+        "cut": "demorec.extensions.editing.operations:Cut",
+        "split": "demorec.extensions.editing.selection:Split",
+        "merge": "demorec.extensions.editing.operations:Merge",
+        "rename": "demorec.extensions.editing.operations:Rename",
+        "drop-features": "demorec.extensions.editing.operations:DropFeatures",
+        "set-task": "demorec.extensions.editing.selection:SetTask",
+        "reorder": "demorec.extensions.editing.selection:Reorder",
+        "shuffle": "demorec.extensions.editing.selection:Shuffle",
+        "repair": "demorec.extensions.editing.operations:Repair",
+        "diff": "demorec.extensions.editing.operations:Diff",
     },
 )

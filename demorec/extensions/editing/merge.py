@@ -25,10 +25,9 @@ import numpy as np
 
 from demorec.core.errors import ConfigError, describe_error
 from demorec.core.files import read_text_limited
-from demorec.core.registry import check_choice, nearest_match
+from demorec.core.registry import check_choice
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature
-from demorec.extensions.editing.operations import joined
+from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.extensions.editing.plan import FeatureMapping, Plan
 
 _UNITS = ("rad", "degree", "normalised")
@@ -37,42 +36,39 @@ _KEYS = ("path", "robot_type", "drop", "feature")
 _FEATURE_KEYS = ("from", "elements", "unit", "low", "high")
 
 
-class DatasetsDifferError(ConfigError):
-    """Datasets that cannot be merged unchanged.
-
-    Args:
-        sentence: All differences.
-        mapping: Lines of a mapping that resolves the differences between datasets with the same rate, as far as
-        possible.
-    """
-
-    def __init__(self, sentence: str, mapping: Sequence[str]) -> None:
-        super().__init__(sentence, mapping)
-        self.mapping = mapping
-
-    def __str__(self) -> str:
-        return str(self.args[0])
-
-
-def merge(sources: Sequence[LeRobotFolder], mapping: Path | None = None) -> Plan:
-    """All episodes of all datasets, in sequence.
-
-    Raises:
-        DatasetsDifferError: They differ; it has all differences, and a mapping that resolves them as far as possible.
-        ConfigError: The mapping cannot be used.
-    """
+def mapped_plans(sources: Sequence[LeRobotFolder], mapping: Path | None) -> list[Plan]:
+    """Plan each dataset as the mapping describes it; ConfigError if the mapping cannot be used."""
     if len(sources) < 2:
         raise ConfigError("Name two or more datasets to merge.")
     entries = {} if mapping is None else _read(mapping, [source.root for source in sources])
     plans: list[Plan] = []
     for source in sources:
-        entry = entries.get(source.root.resolve(), {})
-        plans.append(_mapped(Plan.whole(source), entry, plans[0] if plans else None, mapping))
-    wrong = [text for plan in plans[1:] for text in _differences(plans[0], plan)]
-    if wrong:
-        raise DatasetsDifferError(f"These datasets differ: {'; '.join(wrong)}.", list(_suggested(plans)))
-    mappings = [{name: plan.mappings[0][name] for name in plans[0].mappings[0]} for plan in plans]
-    return joined([replace(plan, mappings=(mapping,)) for plan, mapping in zip(plans, mappings, strict=True)])
+        try:
+            entry = entries.get(source.root.resolve(), {})
+            plans.append(_mapped(Plan.whole(source), entry, plans[0] if plans else None))
+        except (ConfigError, ValueError, TypeError, KeyError, AttributeError) as error:
+            raise ConfigError(
+                f"The mapping of {source.root} cannot be used ({describe_error(error)}): {mapping}"
+            ) from error
+    return plans
+
+
+def differences(plans: Sequence[Plan]) -> list[str]:
+    """Describe the differences that prevent a merge."""
+    return [text for plan in plans[1:] for text in _differences(plans[0], plan)]
+
+
+def joined(plans: Sequence[Plan]) -> Plan:
+    """Concatenate plans of one source each with the same features."""
+    cuts = [replace(cut, source=number) for number, plan in enumerate(plans) for cut in plan.cuts]
+    others = [plan.info.other for plan in plans]
+    shared = {name: value for name, value in others[0].items() if all(other.get(name) == value for other in others)}
+    return Plan(
+        sources=tuple(source for plan in plans for source in plan.sources),
+        cuts=tuple(cuts),
+        info=replace(plans[0].info, other=shared),
+        mappings=tuple({name: plan.mappings[0][name] for name in plans[0].mappings[0]} for plan in plans),
+    )
 
 
 def _read(path: Path, roots: Sequence[Path]) -> dict[Path, dict[str, Any]]:
@@ -89,58 +85,41 @@ def _read(path: Path, roots: Sequence[Path]) -> dict[Path, dict[str, Any]]:
     return entries
 
 
-def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None, path: Path | None) -> Plan:
+def _mapped(plan: Plan, entry: Mapping[str, Any], first: Plan | None) -> Plan:
     """Plan a dataset by its entry in the mapping."""
     for key in entry:
         check_choice("key of a mapping", key, _KEYS)
-    features, mappings = dict(plan.info.features), dict(plan.mappings[0])
-    for name in entry.get("drop", ()):
-        if name not in mappings:
-            raise ConfigError(
-                f"The mapping drops {name!r}, which does not exist.{nearest_match(name, mappings)}: {path}"
-            )
-        del features[name], mappings[name]
+    if dropped := entry.get("drop"):
+        plan = plan.without_features(dropped)
     wanted = entry.get("feature", {})
-    used = {item.get("from", name) for name, item in wanted.items()}
-    for name in used - set(wanted):  # renamed
-        features.pop(name, None)
-        mappings.pop(name, None)
+    plan = plan.renamed({item["from"]: name for name, item in wanted.items() if item.get("from", name) != name})
+    features, mappings = dict(plan.info.features), dict(plan.mappings[0])
     for name, item in wanted.items():
         for key in item:
             check_choice("key of a feature in a mapping", key, _FEATURE_KEYS)
-        model = first.info.features.get(name) if first is not None else None
-        try:
-            features[name], mappings[name] = _converted(plan.info.features, name, item, model)
-        except (ValueError, TypeError, KeyError) as error:
-            raise ConfigError(f"The mapping of {name} cannot be used ({describe_error(error)}): {path}") from error
-    fixed = {name: features.pop(name) for name in AUTOMATIC_FEATURES}
-    mapped = plan.with_features({**features, **fixed}, mappings)
-    return replace(mapped, info=replace(mapped.info, robot_type=entry.get("robot_type", mapped.info.robot_type)))
+        if set(item) - {"from"}:
+            model = features[name] if first is None else first.info.features.get(name, features[name])
+            features[name], mappings[name] = _converted(features[name], mappings[name], item, model)
+    plan = plan.with_features(features, mappings)
+    return replace(plan, info=replace(plan.info, robot_type=entry.get("robot_type", plan.info.robot_type)))
 
 
 def _converted(
-    there: Mapping[str, DatasetFeature], name: str, item: Mapping[str, Any], model: DatasetFeature | None
+    own: DatasetFeature, mapping: FeatureMapping, item: Mapping[str, Any], model: DatasetFeature
 ) -> tuple[DatasetFeature, FeatureMapping]:
-    """A feature of the merged dataset and its mapping, from an entry and the first dataset's feature of that name."""
-    origin = item.get("from", name)
-    if origin not in there:
-        raise ValueError(f"there is no feature {origin!r}")
-    own = there[origin]
-    if set(item) <= {"from"}:
-        return own, FeatureMapping(feature=origin)
-    if not _is_vector(own) or (model is not None and not _is_vector(model)):
+    """A converted feature of the merged dataset, which has one like `model`, and its mapping."""
+    if not _is_vector(own, model):
         raise ValueError("only vectors of numbers are converted")
-    target = model or own
     elements = None
     if "elements" in item:
         elements = tuple(own.elements.index(text) for text in item["elements"])
-        if model is None:
-            target = replace(own, shape=(len(elements),), names=tuple(item["elements"]), written_names=None)
+        if model is own:
+            model = replace(own, shape=(len(elements),), names=tuple(item["elements"]), written_names=None)
     width = own.shape[0] if elements is None else len(elements)
-    if width != target.shape[0]:
-        raise ValueError(f"it has a different number of elements than {target.shape[0]}")
+    if width != model.shape[0]:
+        raise ValueError(f"it has a different number of elements than {model.shape[0]}")
     scale, offset = _unit(item, width)
-    return target, FeatureMapping(feature=origin, elements=elements, scale=scale, offset=offset)
+    return model, replace(mapping, elements=elements, scale=scale, offset=offset)
 
 
 def _unit(item: Mapping[str, Any], width: int) -> tuple[Any, Any]:
@@ -173,8 +152,11 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
             yield f"{name} of {root} has {what} {value}, not {first}"
 
 
-def _suggested(plans: Sequence[Plan]) -> Iterator[str]:
-    """Lines of a mapping: features that some datasets cannot provide are dropped, elements are put in one order."""
+def suggested_mapping(plans: Sequence[Plan]) -> Iterator[str]:
+    """Yield the lines of a mapping that resolves the differences between datasets with the same rate, where possible.
+
+    Features that some datasets cannot provide are dropped, elements are put in one order.
+    """
     plans = [plan for plan in plans if plan.info.fps == plans[0].info.fps]
     if len(plans) < 2:
         return

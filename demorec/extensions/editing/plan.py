@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.errors import ConfigError
+from demorec.core.registry import check_choice
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import mistyped_features
 from demorec.datasets.lerobot.layout import (
@@ -19,8 +20,12 @@ from demorec.datasets.lerobot.layout import (
     VIDEO_PATH,
     DatasetFeature,
     DatasetInfo,
+    is_task_reference,
 )
 from demorec.episode.features import ACTION, STATE
+
+_KNOWN_REFERENCE = "annotation."
+"""Prefix of GR00T's columns with task numbers."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -122,6 +127,33 @@ class Plan:
                 return False
         return True
 
+    @property
+    def kept_tasks(self) -> tuple[str, ...]:
+        """First tasks of the new dataset; none if no column refers to tasks by number."""
+        if not any(reference_columns(source.info) for source in self.sources):
+            return ()
+        return tuple(dict.fromkeys(task for source in self.sources for task in source.tasks))
+
+    def task_numbers(self, number: int) -> NDArray[np.int64]:
+        """(N,) numbers of a source's tasks among `kept_tasks`, for the columns that refer to them.
+
+        Raises:
+            ConfigError: Numbers change, and a column of unknown kind may refer to them.
+        """
+        source = self.sources[number]
+        if not (references := reference_columns(source.info)):
+            return np.zeros(0, np.int64)
+        kept = {task: place for place, task in enumerate(self.kept_tasks)}
+        numbers = np.array([kept[task] for task in source.tasks], dtype=np.int64)
+        taken = {mapping.feature for mapping in self.mappings[number].values()}
+        lost = [name for name in references if name in taken and not name.startswith(_KNOWN_REFERENCE)]
+        if lost and (numbers != np.arange(len(numbers))).any():
+            raise ConfigError(
+                f"The column {lost[0]} may hold task numbers, which would change: leave it out first (demorec "
+                f"dataset drop-features), or give the datasets the same tasks: {source.root}"
+            )
+        return numbers
+
     def takes_all_of(self, number: int) -> bool:
         """Whether all episodes of a source are included."""
         return {cut.episode for cut in self.cuts if cut.source == number} == set(
@@ -134,6 +166,45 @@ class Plan:
             raise ConfigError("No episode would be left: choose others.")
         return replace(self, cuts=tuple(cuts))
 
+    def with_episodes(self, numbers: Sequence[int]) -> Plan:
+        """Keep some episodes of a plan with one source, in this order."""
+        return self.with_cuts([self.cuts[number] for number in numbers])
+
     def with_features(self, features: Mapping[str, DatasetFeature], mappings: Mapping[str, FeatureMapping]) -> Plan:
         """Replace the features of a plan with one source."""
         return replace(self, info=replace(self.info, features=dict(features)), mappings=(mappings,))
+
+    def renamed(self, names: Mapping[str, str]) -> Plan:
+        """Rename features of a plan with one source; ConfigError for names that are unknown, fixed or taken."""
+        self._check_features(names)
+        for name in names.values():
+            if not name.isprintable() or "/" in name or not name or name.startswith(".") or ".." in name:
+                raise ConfigError(
+                    f"A feature cannot be called {name!r}: letters, digits, dots and underscores, no slash."
+                )
+        new = [names.get(name, name) for name in self.info.features]
+        if twice := [name for name in new if new.count(name) > 1]:
+            raise ConfigError(f"Two features would be called {twice[0]!r}.")
+        return self.with_features(
+            {names.get(name, name): feature for name, feature in self.info.features.items()},
+            {names.get(name, name): mapping for name, mapping in self.mappings[0].items()},
+        )
+
+    def without_features(self, names: Collection[str]) -> Plan:
+        """Leave out features of a plan with one source; ConfigError for unknown ones, or if none is left."""
+        self._check_features(names)
+        mappings = {name: mapping for name, mapping in self.mappings[0].items() if name not in names}
+        if not mappings:
+            raise ConfigError("No feature would be left.")
+        return self.with_features(
+            {name: feature for name, feature in self.info.features.items() if name not in names}, mappings
+        )
+
+    def _check_features(self, names: Collection[str]) -> None:
+        for name in names:
+            check_choice("feature that can be changed", name, list(self.mappings[0]))
+
+
+def reference_columns(info: DatasetInfo) -> tuple[str, ...]:
+    """Find the row columns that may refer to the table of tasks by number, such as GR00T's `annotation.*`."""
+    return tuple(name for name, feature in info.features.items() if is_task_reference(name, feature))

@@ -31,16 +31,16 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.paths import is_dataset_file
 from demorec.datasets.lerobot.rows import DataRows
-from demorec.extensions.editing.plan import Plan
-from demorec.extensions.editing.repair_features import (
+from demorec.extensions.editing.corrections import (
     Repaired,
     repaired_cameras,
     repaired_features,
     repaired_rate,
     stated_info,
+    stated_splits,
+    table_changes,
     usable_info,
 )
-from demorec.extensions.editing.repair_tables import stated_splits, table_changes
 
 _Images = list[tuple[Path, int] | None]
 
@@ -91,13 +91,6 @@ class RepairedDataset(LeRobotFolder):
     def notes(self) -> tuple[str, ...]:
         """The changes."""
         return tuple(self.changes)
-
-    def plan(self) -> Plan:
-        """All episodes with their instructions."""
-        plan = Plan.whole(self)
-        return plan.with_cuts(
-            [replace(cut, task=self.instructions.get(number, "")) for number, cut in enumerate(plan.cuts)]
-        )
 
     def rows(self, names: Sequence[str]) -> DataRows:
         """Read some columns of the data files, if they exist."""

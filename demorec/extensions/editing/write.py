@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
-from dataclasses import replace
+from collections.abc import Iterable, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,10 +13,8 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from PIL import Image
 
-from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
-from demorec.core.replacing import check_replaceable
 from demorec.datasets.lerobot.episode_places import EpisodePlace, are_on_grid
 from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
 from demorec.datasets.lerobot.files import column_numbers
@@ -27,7 +23,6 @@ from demorec.datasets.lerobot.inspect import episode_statistics
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, language_arrays, spoken_of
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.datasets.lerobot.mp4 import EncodedVideo
-from demorec.datasets.lerobot.paths import DATASET
 from demorec.datasets.lerobot.rows import IndexedRows
 from demorec.datasets.lerobot.stats import NAMES, PixelHistogram, Statistics, colour_levels
 from demorec.datasets.lerobot.videos import EpisodeVideo
@@ -40,38 +35,14 @@ from demorec.extensions.editing.beside import (
     kept_export,
     write_kept_progress,
 )
-from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan
-from demorec.extensions.editing.task_references import kept_tasks, new_task_numbers, reference_columns, renumbered
+from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
 
 if TYPE_CHECKING:
     from demorec.mcap.video import Rgb
 
-_RESULT = replace(DATASET, advice="choose --overwrite or another --out")
 _NUMBERS = tuple(name for name in NAMES if name != "count")
 _EPISODES_AT_ONCE = 64
 _OF_THE_END = ("next.done", "next.success", "next.reward")
-
-
-def new_datasets(
-    outs: Sequence[Path], sources: Sequence[LeRobotFolder], *, overwrite: bool
-) -> AbstractContextManager[Sequence[Path]]:
-    """Yield a folder for each new dataset; all appear together when the block ends without an error.
-
-    Args:
-        outs: Paths of the datasets.
-        sources: Source datasets, which are never replaced.
-        overwrite: Whether existing datasets may be replaced.
-
-    Raises:
-        ConfigError: A path exists and may not be replaced.
-        ExportError: They cannot be written; existing datasets are unchanged.
-    """
-    return atomic_write_all(outs, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
-
-
-def check_target(out: Path, sources: Sequence[LeRobotFolder], *, overwrite: bool) -> None:
-    """Raise ConfigError if `new_datasets` would, because `out` exists."""
-    check_replaceable(Path.cwd() / out, _RESULT, overwrite=overwrite, sources=[source.root for source in sources])
 
 
 def write_plan(
@@ -94,7 +65,9 @@ def write_plan(
         OSError: The dataset cannot be written.
     """
     readers = [_Reader(plan, number, decode=decode) for number in range(len(plan.sources))]
-    start = DatasetStart(info=plan.info, facts=_fact_types(plan), tasks=kept_tasks(plan), configs=kept_configs(plan))
+    # For conflicting types the first source's.
+    facts = {name: kind for source in reversed(plan.sources) for name, kind in source.fact_types.items()}
+    start = DatasetStart(info=plan.info, facts=facts, tasks=plan.kept_tasks, configs=kept_configs(plan))
     with DatasetWriter(folder, start) as writer:
         around = 0
         for done, cut in enumerate(plan.cuts, start=1):
@@ -115,14 +88,6 @@ def write_plan(
     return sum(reader.num_decoded for reader in readers), around
 
 
-def _fact_types(plan: Plan) -> dict[str, pa.DataType]:
-    """Fact columns of all sources; for conflicting types the first source's."""
-    found: dict[str, pa.DataType] = {}
-    for source in plan.sources:
-        found = {**source.fact_types, **found}
-    return found
-
-
 class _Reader:
     """Reader of one source's episodes for the plan."""
 
@@ -136,7 +101,7 @@ class _Reader:
         self._names = [name for name in info.features if name in names and not info.features[name].is_video]
         self._rows = self.source.rows([*self._names, "task_index", "timestamp"])
         self._references = reference_columns(info)
-        self._task_numbers = new_task_numbers(plan, number) if self._references else np.zeros(0, np.int64)
+        self._task_numbers = plan.task_numbers(number)
         schema = pa.schema([("episode_index", pa.int64()), *self.source.fact_types.items()])
         tables = self.source.episode_tables if self.source.fact_types else ()
         self._fact_rows = IndexedRows(tables, schema, rows=_EPISODES_AT_ONCE)
@@ -164,7 +129,7 @@ class _Reader:
                 continue
             if mapping.feature in self._references:
                 values = column_numbers(self._column(rows, mapping, feature))
-                columns[name] = renumbered(values, self._task_numbers)
+                columns[name] = self._renumbered(values)
                 annotated.update(task for number, task in enumerate(self.source.tasks) if number in values)
                 continue
             if feature.is_video:
@@ -196,6 +161,13 @@ class _Reader:
             record=self._sidecar.record(cut) if self._has_sidecar else None,
             boxes=self._sidecar.boxes(cut),
         )
+
+    def _renumbered(self, values: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Replace task numbers; other values stay."""
+        is_task = (values >= 0) & (values < len(self._task_numbers))
+        found = values.copy()
+        found[is_task] = self._task_numbers[values[is_task]]
+        return found
 
     def _timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[Any] | None:
         """(T,) timestamps of a cut; None for multiples of 1/fps.

@@ -60,16 +60,15 @@ def _write(
     depth_left_out: tuple[str, ...] = ()
     for done, path in enumerate(found, start=1):
         with open_recording(path) as recording:
-            if is_wanted(recording, options):
-                if goes_in(recording, options):
-                    episode = ExportEpisode(recording, options)
-                    intake.take(path, episode.traits())
-                    _add(data, intake.num_taken - 1, episode)
-                    depth_left_out = depth_left_out or episode.depth_left_out
-                    num_frames += len(episode.rows)
-                    file.flush()
-                else:
-                    intake.leave_out(recording.outcome)
+            if is_wanted(recording, options) and goes_in(recording, options):
+                episode = ExportEpisode(recording, options)
+                intake.take(path, episode.traits())
+                _add(data, intake.num_taken - 1, episode)
+                depth_left_out = depth_left_out or episode.depth_left_out
+                num_frames += len(episode.rows)
+                file.flush()
+            elif is_wanted(recording, options):
+                intake.leave_out(recording.outcome)
         if progress is not None:
             progress(done, len(found))
     if not intake.num_taken:
@@ -102,22 +101,14 @@ _ROBOSUITE = {
 
 
 def _add(data: h5py.Group, number: int, episode: Hdf5Episode) -> None:
-    """Append an episode: numbers at once, images one at a time.
-
-    Raises:
-        ConfigError: The episode has no actions, or two of its streams would get the same name.
-        ExportError: It has no frames, a number that is not finite, or frames without an image.
-        RecordingError: The recording is damaged.
-    """
-    demo = data.create_group(f"demo_{number}")
+    """Append an episode: numbers at once, images one at a time."""
     # A separate function, because its return closes the groups, which affects where HDF5 places the following bytes.
-    _fill(demo, episode)
+    _fill(data.create_group(f"demo_{number}"), episode)
     if number == 0:
         data.attrs.update(_attributes(episode))
 
 
 def _fill(demo: h5py.Group, episode: Hdf5Episode) -> None:
-    """Write the numbers and images of an episode."""
     observations, images = _observation_names(episode), _image_names(episode)
     count = len(episode.rows)
     demo.attrs["num_samples"] = count
@@ -146,19 +137,16 @@ def _fill(demo: h5py.Group, episode: Hdf5Episode) -> None:
 def _add_masks(root: h5py.Group, num_episodes: int, valid_share: float) -> None:
     """Write the names of the episodes for training and for validation."""
     share = Fraction(valid_share).limit_denominator(1_000_000)
-    numbers = range(num_episodes)
-    valid = [number for number in numbers if int((number + 1) * share) > int(number * share)]
-    train = [number for number in numbers if number not in set(valid)]
-    for name, chosen in (("train", train), ("valid", valid)):
-        root[f"mask/{name}"] = np.array([f"demo_{number}" for number in chosen], dtype="S")
+    chosen: dict[str, list[str]] = {"train": [], "valid": []}
+    for number in range(num_episodes):
+        is_valid = int((number + 1) * share) > int(number * share)
+        chosen["valid" if is_valid else "train"].append(f"demo_{number}")
+    for name, episodes in chosen.items():
+        root[f"mask/{name}"] = np.array(episodes, dtype="S")
 
 
 def _action_features(episode: Hdf5Episode) -> tuple[str, ...]:
-    """Find the features of the action by role, not by name; several are joined in this order.
-
-    Raises:
-        ConfigError: The episode has no actions.
-    """
+    """Find the features of the action by role, not by name; several are joined in this order."""
     if ACTION in episode.names:
         return (ACTION,)
     roles = roles_of_recording(episode.info, NO_NAMES)
@@ -169,11 +157,7 @@ def _action_features(episode: Hdf5Episode) -> tuple[str, ...]:
 
 
 def _observation_names(episode: Hdf5Episode) -> dict[str, tuple[str, slice]]:
-    """Return observation -> feature and element slice, with robosuite's names, or "force" for "observation.force".
-
-    Raises:
-        ConfigError: The episode has no actions, or two streams would get the same name.
-    """
+    """Return observation -> feature and element slice, with robosuite's names, or "force" for "observation.force"."""
     actions = _action_features(episode)
     known = {} if episode.scene is None else _ROBOSUITE
     found = [
@@ -201,11 +185,8 @@ def _image_names(episode: Hdf5Episode) -> list[str]:
 def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
     """Return the attributes of `data`: arguments of robomimic's environment, rate and observation names."""
     info, options = episode.info, episode.options
-    arguments: dict[str, object] = {
-        "robot": info.robot_name,
-        "fps": episode.fps,
-        "cameras": [camera.name for camera in episode.cameras if not camera.is_depth],
-    }
+    colour = [camera.name for camera in episode.cameras if not camera.is_depth]
+    arguments: dict[str, object] = {"robot": info.robot_name, "fps": episode.fps, "cameras": colour}
     name = _NO_ENVIRONMENT
     if episode.scene is not None:
         name = environment_name(info.simulated.task)
@@ -246,13 +227,9 @@ def _add_images(
     group: h5py.Group, name: str, shape: tuple[int, ...], images: Iterable[NDArray[np.generic]], compression: int
 ) -> None:
     """Write (T, H, W, 3) uint8 colour or (T, H, W, 1) float32 depth images; each image is one chunk."""
-    stored = group.create_dataset(
-        name,
-        shape,
-        np.uint8 if shape[-1] == 3 else np.float32,
-        chunks=(1, *shape[1:]),
-        compression="gzip" if compression else None,
-        compression_opts=compression or None,
-    )
+    kind, zipped = np.uint8 if shape[-1] == 3 else np.float32, {}
+    if compression:
+        zipped = {"compression": "gzip", "compression_opts": compression}
+    stored = group.create_dataset(name, shape, kind, chunks=(1, *shape[1:]), **zipped)
     for index, image in enumerate(images):
         stored[index] = image.reshape(shape[1:])

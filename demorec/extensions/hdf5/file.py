@@ -103,17 +103,13 @@ class _Storage(io.FileIO):
                 return super().truncate(size)
         except BaseException as error:
             self.error = error
-        return 0 if size is None else size
+        return size or 0
 
 
 class NewFile(AbstractContextManager["NewFile"]):
-    """Context manager for an HDF5 file at a new path.
+    """Context manager for an HDF5 file at a new path, with the group `root`.
 
-    Attributes:
-        root: Its root group.
-
-    Raises:
-        OSError: It cannot be written; also raised by `flush` and at the end of the block.
+    An OSError is raised by `flush`, or at the end of the block.
     """
 
     def __init__(self, path: Path) -> None:

@@ -39,7 +39,6 @@ from demorec.runs.run_file import (
     Attempt,
     DamagedRunFileError,
     RunFile,
-    is_external_run,
     load_any_run_file,
 )
 
@@ -85,11 +84,8 @@ def gather(
     """
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
-        report = _dataset_report(path, camera, diagnosis, named, advance)
-    else:
-        report = _recordings_report(found, camera, diagnosis, workers, named, advance)
-    unchecked = () if diagnosis is not None else ("No checks were run (--no-checks).",)
-    return replace(report, diagnosis=diagnosis, missing=(*report.missing, *unchecked))
+        return _dataset_report(path, camera, diagnosis, named, advance)
+    return _recordings_report(found, camera, diagnosis, workers, named, advance)
 
 
 def _judged(episode: ReportedEpisode, number: int, diagnosis: Diagnosis | None) -> ReportedEpisode:
@@ -131,13 +127,17 @@ def _recordings_report(
     read = partial(_read, found.path, camera, named)
     episodes: list[ReportedEpisode] = []
     components: Components = {}
-    for number, (episode, own) in enumerate(
-        in_turn(read, list(zip(files, strips, strict=True)), workers, ahead=_AHEAD)
-    ):
+    beyond = () if run is None or run.generation is None else run.beyond
+    unrequested = {found.path / attempt.file for attempt in beyond}
+    if unrequested:
+        missing += (f"{len(unrequested)} recordings of episodes beyond the number last requested are left out.",)
+    wanted = [number for number, file in enumerate(files) if file not in unrequested]
+    results = in_turn(read, [(files[number], strips[number]) for number in wanted], workers, ahead=_AHEAD)
+    for number, (episode, own) in zip(wanted, results, strict=True):
         episodes.append(_judged(episode, number, diagnosis))
         for key, samples in own.items():
             components.setdefault(key, []).extend(samples)
-        advance(len(episodes), len(files))
+        advance(len(episodes), len(wanted))
     if run is not None:
         episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
     return Report(
@@ -146,7 +146,7 @@ def _recordings_report(
         facts=tuple(_run_facts(found, run, episodes)),
         episodes=tuple(episodes),
         distributions=components,
-        diagnosis=None,
+        diagnosis=diagnosis,
         missing=missing,
     )
 
@@ -210,7 +210,7 @@ def _run_file(found: Found) -> tuple[RunFile | None, tuple[str, ...]]:
     except DamagedRunFileError as error:
         reason = without_path(error, found.path / RUN_NAME)
         return None, (f"{reason}, so the requested number of episodes is not known.",)
-    return (None if run.generation is None else run), ((f"{run.unfinished}.",) if run.unfinished else ())
+    return run, ((f"{run.unfinished}.",) if run.unfinished else ())
 
 
 def _without_recording(attempt: Attempt) -> ReportedEpisode:
@@ -223,7 +223,7 @@ def _without_recording(attempt: Attempt) -> ReportedEpisode:
 
 
 def _run_facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
-    if run is not None:
+    if run is not None and run.generation is not None:
         yield "episodes", f"{len(run.successes)} of {run.num_episodes} asked"
     yield "attempts" if found.failed else "recordings", str(len(episodes))
     yield from _common_facts(episodes, (*found.recordings, *found.failed))
@@ -231,10 +231,7 @@ def _run_facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpi
     for name in dict.fromkeys(name for name, _ in facts):
         yield name, _few(value for of, value in facts if of == name)
     if run is not None:
-        yield "variation", run.config.variation
         yield "run digest", run.digest
-    elif found.kind == "run" and is_external_run(found.path):
-        yield "run digest", load_any_run_file(found.path).digest
 
 
 def _dataset_report(
@@ -248,7 +245,7 @@ def _dataset_report(
     if _SUCCESS in features and features[_SUCCESS].column.elements:
         wanted[_SUCCESS] = None
     reader = folder.rows(list(wanted)) if wanted else None
-    stride = max(1, -(-len(folder.places) // MAX_SHOWN))
+    stride, budget = max(1, -(-len(folder.places) // MAX_SHOWN)), strip_budget(len(folder.places))
     flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
     components: Components = {}
     episodes: list[ReportedEpisode] = []
@@ -260,7 +257,9 @@ def _dataset_report(
             columns = {} if reader is None else reader.numbers(place)
             add_motion(components, roles, columns)
             if key is not None and (place.episode_index in flagged or number % stride == 0):
-                strip = _strip(folder, key, place)
+                stored = folder.stored_images.get(key)
+                images_at = partial(stored.read, place) if stored else folder.video(key, place).images_at
+                strip = filmstrip(key.removeprefix(IMAGE_PREFIX), place.length, images_at, max_bytes=budget)
         episode = _dataset_episode(place, int(folder.info.fps), columns, rows.get(place.episode_index))
         episode = replace(episode, filmstrip=strip, problem="; ".join(problems))
         episodes.append(_judged(episode, place.episode_index, diagnosis))
@@ -272,7 +271,7 @@ def _dataset_report(
         facts=tuple(_dataset_facts(folder, episodes)),
         episodes=tuple(episodes),
         distributions=components,
-        diagnosis=None,
+        diagnosis=diagnosis,
         missing=(*folder.notes, *_missing(folder, has_sidecar=bool(rows))),
     )
 
@@ -291,13 +290,6 @@ def _camera_key(folder: LeRobotFolder, camera: str) -> str | None:
             return key
     there = ", ".join(key.removeprefix(IMAGE_PREFIX) for key in keys) or "none"
     raise ConfigError(f"No camera {camera!r} with color images, available are {there}: {folder.root}")
-
-
-def _strip(folder: LeRobotFolder, key: str, place: EpisodePlace) -> Filmstrip | None:
-    is_video = folder.info.features[key].is_video
-    images_at = folder.video(key, place).images_at if is_video else partial(folder.stored_images[key].read, place)
-    max_bytes = strip_budget(len(folder.places))
-    return filmstrip(key.removeprefix(IMAGE_PREFIX), place.length, images_at, max_bytes=max_bytes)
 
 
 def _dataset_episode(

@@ -1,30 +1,41 @@
-"""Shared parts of the editing commands: the new dataset, its printed summary, and episode lists."""
+"""`demorec dataset`: the parts that its commands share, which are the new dataset and its printed summary."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.cli.shared.paths import refuse_inside
+from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ConfigError
-from demorec.core.replacing import OptionalTarget
+from demorec.core.extension import targets_of
+from demorec.core.plain import listed
+from demorec.core.registry import Registry
+from demorec.core.replacing import OptionalTarget, check_replaceable
+from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.datasets.lerobot.paths import is_dataset
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
+_RESULT = replace(DATASET_KIND, advice="choose --overwrite or another --out")
 MAX_SHOWN = 20
-"""Maximum ranges of episodes, or differences of one level, that are printed."""
+"""Maximum ranges of episodes, parts of an episode, or differences that are printed."""
 DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
-CONDITION_HELP = (
-    "Condition on columns of the table of episodes or of demorec's sidecar, and on episode_index, num_frames, "
-    'duration_s, task, and verdict, score of demorec check: success and num_frames < 300; "cube" in task.'
-)
+
+
+class DatasetCommand:
+    """Edit LeRobot datasets without re-encoding images or changing the sources.
+
+    Reads any LeRobot dataset (v3.0, v2.1); a run means its own dataset. The result appears complete or not at all.
+    """
+
+    commands: Registry[Any] = Registry(kind="command of demorec dataset", rows=targets_of("operations"))
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -46,10 +57,6 @@ class Edit:
         """The datasets to read."""
         raise NotImplementedError
 
-    def plan(self, sources: Sequence[LeRobotFolder]) -> Plan:
-        """Plan of the new dataset."""
-        raise NotImplementedError
-
     def has_work(self, sources: Sequence[LeRobotFolder]) -> bool:
         """Whether there is anything to write; prints a line if not."""
         return True
@@ -60,12 +67,11 @@ class Edit:
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """Name in --out -> plan of the new dataset."""
-        return {"": self.plan(sources)}
+        raise NotImplementedError
 
     def run(self) -> int:
         """Plan, write, and print a summary."""
         from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.extensions.editing.write import check_target
 
         leave_pandas_out()
         if self.out is None and not self.dry_run:
@@ -79,8 +85,9 @@ class Edit:
         if outs and not self.dry_run:
             self._write(sources, outs)
             return 0
+        roots = [source.root for source in sources]
         for out in outs:
-            check_target(out, sources, overwrite=self.overwrite)
+            check_replaceable(Path.cwd() / out, _RESULT, overwrite=self.overwrite, sources=roots)
         for name, plan in self.plans(sources).items():
             say(*_changes(plan))
             self._print_result("Would be ", name, plan, "Would be left out")
@@ -88,10 +95,11 @@ class Edit:
 
     def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
         """Write the new datasets, which appear together, and print a summary."""
-        from demorec.extensions.editing.write import new_datasets, write_plan
+        from demorec.extensions.editing.write import write_plan
 
         results: list[tuple[int, int]] = []
-        with new_datasets(outs, sources, overwrite=self.overwrite) as folders:
+        roots = [source.root for source in sources]
+        with atomic_write_all(outs, _RESULT, overwrite=self.overwrite, sources=roots) as folders:
             plans = self.plans(sources)
             for plan, folder in zip(plans.values(), folders, strict=True):
                 with ProgressBar("writing") as bar:
@@ -111,19 +119,16 @@ class Edit:
         frames = sum(cut.last - cut.first for cut in plan.cuts)
         numbers = [cut.episode for cut in plan.cuts]
         is_in_parts = len(plan.sources) == 1 and len(set(numbers)) < len(numbers)
-        count = f"{len(plan.cuts)} of {counted(len(lengths), 'episode')}"
-        if is_in_parts:
-            count = f"{len(plan.cuts)} parts of {counted(len(lengths), 'episode')}"
-        text = f"{begin}{count}, {frames} of {sum(lengths)} frames"
+        noun = " parts" if is_in_parts else ""
+        text = f"{begin}{len(plan.cuts)}{noun} of {counted(len(lengths), 'episode')}, {frames} of {sum(lengths)} frames"
         place = str(self.out / name) if self.out is not None else name
         if self.dry_run and len(plan.sources) == 1 and not is_in_parts and numbers != list(range(len(lengths))):
-            say(f"episodes {_listed(numbers)}")
+            say(f"episodes {_ranges(numbers)}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
         if copies_stale_modality(plan):
             say("Copied, but written for the features of the source: meta/modality.json. Correct it.")
         if unknown := copied_unknown_files(plan):
-            more = f" and {len(unknown) - MAX_NAMES} more" if len(unknown) > MAX_NAMES else ""
-            say(f"Copied, but unknown: {', '.join(unknown[:MAX_NAMES])}{more}. Check that they still apply.")
+            say(f"Copied, but unknown: {listed(unknown, MAX_NAMES, ', ')}. Check that they still apply.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -137,6 +142,16 @@ class EditOne(Edit):
         from demorec.datasets.lerobot.folder import LeRobotFolder
 
         return [LeRobotFolder(dataset_at(self.dataset))]
+
+    def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
+        """The edited plan of the whole dataset."""
+        from demorec.extensions.editing.plan import Plan
+
+        return {"": self.edited(Plan.whole(sources[0]))}
+
+    def edited(self, plan: Plan) -> Plan:
+        """Edit the plan of a whole dataset."""
+        raise NotImplementedError
 
 
 def _changes(plan: Plan) -> list[str]:
@@ -178,7 +193,7 @@ def dataset_at(path: Path) -> Path:
     return path / DATASET
 
 
-def _listed(numbers: Sequence[int]) -> str:
+def _ranges(numbers: Sequence[int]) -> str:
     """Format some episode numbers in the form of --episodes."""
     parts: list[tuple[int, int]] = []
     for number in numbers:
