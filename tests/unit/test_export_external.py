@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -143,6 +144,35 @@ def test_episodes_of_other_kinds_do_not_mix(tmp_path: Path) -> None:
     write_episode(tmp_path / "run" / "episodes" / "episode_000001.mcap", num_frames=5)
     with pytest.raises(ConfigError, match="kind of episode is simulated instead of external"):
         export(run, tmp_path / "d")
+
+
+def test_kept_h265_becomes_hevc(tmp_path: Path) -> None:
+    from typing import cast
+
+    from demorec.mcap import SampledWriter
+
+    context = cast(av.VideoCodecContext, av.CodecContext.create("libx265", "w"))
+    context.width, context.height, context.pix_fmt, context.time_base = 64, 48, "yuv420p", Fraction(1, 30)
+    context.options = {"tune": "zerolatency", "x265-params": "log-level=none:bframes=0:keyint=5"}
+    episode = make_external(num_frames=12, cameras=(replace(TOP, kept="h265"),))
+    packets = []
+    for index in range(12):
+        frame = av.VideoFrame.from_ndarray(np.full((48, 64, 3), 9 * index, dtype=np.uint8), format="rgb24")
+        frame.pts = index
+        packets += [bytes(packet) for packet in context.encode(frame)]
+    packets += [bytes(packet) for packet in context.encode(None)]
+    (tmp_path / "run" / "episodes").mkdir(parents=True)
+    with SampledWriter(tmp_path / "run" / "episodes" / "episode_000000.mcap", episode.info) as writer:
+        for frame_, packet in zip(episode.frames, packets, strict=True):
+            writer.image("top", frame_.time_ns, packet)
+            writer.write(frame_)
+        writer.finish(episode.outcome)
+    report = export(tmp_path / "run", tmp_path / "d")
+    assert report.transcoded == ()
+    with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
+        assert file.streams.video[0].codec_context.name == "hevc"
+        shown = [int(image.to_ndarray(format="rgb24").mean()) for image in file.decode(video=0)]
+    assert np.abs(np.array(shown) - 9 * np.arange(12)).max() < 6
 
 
 def test_an_hdf5_file_has_no_invented_data(tmp_path: Path) -> None:
