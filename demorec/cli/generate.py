@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import re
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -100,8 +99,6 @@ class Generate:
     """
     dry_run: bool = False
     """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
-    view: bool = False
-    """Show the episodes in Rerun as they are made."""
     episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)
     """Options that determine the data."""
 
@@ -144,9 +141,8 @@ class Generate:
         from demorec.core.processes import terminate_as_interrupt
         from demorec.generate.run import generate
 
-        with ExitStack() as stack:
-            watch = stack.enter_context(_viewer(options.out)) if self.view else None
-            result = generate(episodes, options, progress=stack.enter_context(RunProgress(watch=watch)))
+        with RunProgress() as progress:
+            result = generate(episodes, options, progress=progress)
         if result.interrupted:
             done = f"{len(result.run.successes)} of {result.run.num_episodes}"
             tell(f"Interrupted: {done} episodes are complete; run the same command again to continue: {result.folder}")
@@ -222,13 +218,9 @@ def _prepare_comparison(original: Original, out: Path) -> None:
 
 
 class RunProgress(RunObserver, Closing):
-    """Progress of a run, one bar after another; a context manager.
+    """Progress of a run, one bar after another; a context manager."""
 
-    `watch` is called with every finished attempt.
-    """
-
-    def __init__(self, *, watch: Callable[[Attempt], None] | None = None) -> None:
-        self._watch = watch
+    def __init__(self) -> None:
         self._bar: ProgressBar | None = None
         self._title = ""
         self._failed = 0
@@ -256,8 +248,6 @@ class RunProgress(RunObserver, Closing):
 
     def ended(self, attempt: Attempt) -> None:
         """Show that an attempt has ended."""
-        if self._watch is not None:
-            self._watch(attempt)
         assert self._bar is not None  # `started` is called first
         if attempt.success:
             self._bar.advance()
@@ -268,15 +258,6 @@ class RunProgress(RunObserver, Closing):
     def says(self, message: str) -> None:
         """Print a message for the user."""
         tell(message)
-
-
-@contextmanager
-def _viewer(folder: Path) -> Iterator[Callable[[Attempt], None]]:
-    """Open a viewer window; yields the function that sends finished attempts to it."""
-    from demorec.view.live import LiveViewer
-
-    with LiveViewer() as viewer:
-        yield lambda attempt: viewer.add(folder / attempt.file) if attempt.file else None
 
 
 def config_path(args: Sequence[str]) -> Path | None:

@@ -55,13 +55,10 @@ class View:
       demorec view datasets/cubes --rank score
       demorec view recordings/cubes --save cubes.rrd
       demorec view cubes-0000.rrd
-      demorec view original.mcap replayed.mcap --compare
     """
 
     paths: Annotated[Positional[tuple[Path, ...]], arg(help=f"Any of: {WHAT_IS_READ}, .rrd files.")]
     mapping: MappingFile = None
-    compare: bool = False
-    """Overlay two episodes: the same streams in the same views, and the distance between them."""
     episodes: str = ""
     """Episodes to show, counted from 0: 7, or 0:20, or 3,5,8:10; default: the first 50."""
     rank: Annotated[str | None, arg(help=_RANK_HELP)] = None
@@ -96,7 +93,7 @@ class View:
 
     def _view(self) -> int:
         from demorec.datasets.options import select_episodes
-        from demorec.view.save import numbered, save_comparison, save_each
+        from demorec.view.scene import save_each
         from demorec.view.sources import find_episodes
         from demorec.view.viewer import need_screen
 
@@ -109,38 +106,27 @@ class View:
             sources = self._ranked(sources)
         if self.save is None and self.screenshot is None and not self.web:
             need_screen()  # fail before minutes of conversion
-        if self.compare:
-            if len(sources) != 2:
-                raise ConfigError(f"--compare takes two episodes, found {len(sources)}: name two recordings.")
-        elif len(sources) > _MOST and not self.episodes:
+        if len(sources) > _MOST and not self.episodes:
             tell(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.")
             sources = sources[:_MOST]
-        targets = [] if self.save is None else numbered(self.save, 1 if self.compare else len(sources))
+        targets = [] if self.save is None else _numbered(self.save, len(sources))
         self._check_targets(targets)
         if targets:
             self._save(sources, targets)
             if self.screenshot is None:
                 return 0
         with self._image() as image, tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
-            if self.compare:
-                files = [Path(folder) / "comparison.rrd"]
-                save_comparison(sources[0], sources[1], files[0])
-            else:
-                files = save_each(sources, Path(folder))
-            return self._show(files, sources, image)
+            return self._show(save_each(sources, Path(folder)), sources, image)
 
     def _save(self, sources: Sequence[PlaybackSource], targets: Sequence[Path]) -> None:
         """Write all .rrd files; none appears before all are complete."""
-        from demorec.view.save import save, save_comparison
+        from demorec.view.scene import save
 
         read = places_read(self.paths)
         with atomic_write_all(targets, RERUN_FILE, overwrite=self.overwrite, sources=read) as parts:
-            if self.compare:
-                save_comparison(sources[0], sources[1], parts[0])
-            else:
-                for source, part in zip(sources, parts, strict=True):
-                    save(source, part)
-        for source, target in zip(sources, targets, strict=False):
+            for source, part in zip(sources, parts, strict=True):
+                save(source, part)
+        for source, target in zip(sources, targets, strict=True):
             of = f" ({source.name})" if len(targets) > 1 else ""
             say(f"{size_in_words(target.stat().st_size)}: {target}{of}")
 
@@ -194,8 +180,8 @@ class View:
         others = [path for path in self.paths if path.suffix != ".rrd"]
         if others:
             raise ConfigError(f".rrd files need a separate call, without other paths: {others[0]}")
-        if self.compare or self.save is not None or self.episodes or self.include_failures:
-            raise ConfigError("An .rrd file is shown unchanged: --compare, --save and --episodes are for recordings.")
+        if self.save is not None or self.episodes or self.include_failures:
+            raise ConfigError("An .rrd file is shown unchanged: --save and --episodes are for recordings.")
         for path in self.paths:
             expect(path, "rrd")
         self._check_targets(())
@@ -224,8 +210,17 @@ class View:
         """Time of the screenshot; None leaves it to the viewer, which knows the duration of an .rrd file."""
         from demorec.view.viewer import moment
 
-        ends = []
-        for source in sources[: 2 if self.compare else 1]:
-            with source.open() as episode:
-                ends.append(max(episode.num_frames - 1, 0) / episode.info.fps)
-        return moment(self.at, max(ends)) if ends else self.at
+        if not sources:
+            return self.at
+        with sources[0].open() as episode:
+            return moment(self.at, max(episode.num_frames - 1, 0) / episode.info.fps)
+
+
+def _numbered(target: Path, count: int) -> list[Path]:
+    """Name `count` files: the target itself for one, NAME-0000.rrd and so on for several.
+
+    Rerun's viewer shows only the last recording of a file, so several episodes are several files.
+    """
+    if count == 1:
+        return [target]
+    return [target.with_name(f"{target.stem}-{index:04d}{target.suffix}") for index in range(count)]

@@ -5,7 +5,9 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import rerun as rr
@@ -14,7 +16,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, as_reason
 from demorec.core.files import read_text_limited
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
 from demorec.mcap.transforms import MovingJoints
 from demorec.render.procedural import texture_pixels
@@ -22,16 +24,7 @@ from demorec.robots.assets import asset_path, surface_file
 from demorec.robots.known_models import known_model
 from demorec.robots.urdf import MAX_BYTES, Urdf
 from demorec.view.episode import Playback
-from demorec.view.meshes import (
-    SurfaceMesh,
-    found_meshes,
-    joined,
-    mesh_file,
-    of_trimesh,
-    skeleton_meshes,
-    sphere_mesh,
-    urdf_meshes,
-)
+from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, skeleton_meshes, sphere_mesh, urdf_meshes
 from demorec.view.paths import Paths, log_pose, send_poses
 from demorec.view.style import GOAL
 
@@ -42,18 +35,14 @@ _SAME_SIZE = 0.1
 """Maximum difference between a model's extents and those of the recorded scene, relative to the largest extent."""
 
 
-def log_bodies(
-    recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene, tint: Rgba | None = None
-) -> None:
+def log_bodies(recording: rr.RecordingStream, episode: Playback, scene: Scene) -> None:
     """Log every body at its pose or along its trajectory, and wire frames of goals and known final poses of objects.
 
     A body with a model that is missing here, or differs from the recorded one, is drawn as the recording describes it.
     """
     for body in scene.bodies:
-        entity = paths.body(body.name)
-        if tint is not None and body.role in ("support", "fixture"):
-            continue  # the other episode's table, in the same place
-        recording.log(entity, _visible(body, episode, tint), static=True)
+        entity = Paths.body(body.name)
+        recording.log(entity, _visible(body, episode), static=True)
         poses = episode.motion.object_poses.get(body.name)
         if poses is not None:
             send_poses(recording, entity, episode.time_ns, poses)
@@ -61,28 +50,28 @@ def log_bodies(
             log_pose(recording, entity, body.world_from_body.vector())
     for name, pose in episode.motion.end_poses.items():
         wire = rr.Boxes3D(sizes=[scene.body(name).shape.extents], colors=[(200, 200, 200)], radii=[-1.0])
-        log_pose(recording, paths.end(name), pose)
-        recording.log(paths.end(name), wire, static=True)
+        log_pose(recording, Paths.end(name), pose)
+        recording.log(Paths.end(name), wire, static=True)
     for goal in scene.goals:
         wire = rr.Boxes3D(sizes=[scene.body(goal.object).shape.extents], colors=[GOAL], radii=[-1.5])
-        log_pose(recording, paths.goal(goal.object), scene.world_from_goal(goal).vector())
-        recording.log(paths.goal(goal.object), wire, static=True)
+        log_pose(recording, Paths.goal(goal.object), scene.world_from_goal(goal).vector())
+        recording.log(Paths.goal(goal.object), wire, static=True)
 
 
-def _visible(body: Body, episode: Playback, tint: Rgba | None) -> rr.Mesh3D:
+def _visible(body: Body, episode: Playback) -> rr.Mesh3D:
     if body.shape.kind == "box" and body.texture is not None:
         return _textured_box(np.array(body.shape.size), body.texture)
     color = body.mean_color
     if body.shape.kind not in ("mesh", "urdf"):
-        return as_mesh3d(_primitive_mesh(body.shape).placed(Pose(), np.ones(3), color), tint)
+        return _as_mesh3d(_primitive_mesh(body.shape).placed(rgba=color))
     mesh = _installed_mesh(body.shape)
     if mesh is not None:
         if color != _OWN_COLOR:  # replaces the model's own colours, as in the simulator
             mesh = replace(mesh, colors=np.full_like(mesh.colors, 255))
-        return as_mesh3d(mesh.placed(Pose(), np.ones(3), color), tint)
+        return _as_mesh3d(mesh.placed(rgba=color))
     if description := episode.data.description(body.name):  # already in the body's colours
-        return as_mesh3d(joined(list(urdf_meshes(description, None).values())), tint)
-    return as_mesh3d(_unit_mesh("box").placed(Pose(), np.array(body.shape.extents), color), tint)
+        return _as_mesh3d(joined(list(urdf_meshes(description, None).values())))
+    return _as_mesh3d(_unit_mesh("box").placed(None, body.shape.extents, color))
 
 
 def _primitive_mesh(shape: Shape) -> SurfaceMesh:
@@ -90,7 +79,7 @@ def _primitive_mesh(shape: Shape) -> SurfaceMesh:
         capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
         capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
         return of_trimesh(capsule)
-    return _unit_mesh(shape.kind).placed(Pose(), np.array(shape.extents), _OWN_COLOR)
+    return _unit_mesh(shape.kind).placed(None, shape.extents)
 
 
 @functools.lru_cache(maxsize=64)
@@ -98,24 +87,22 @@ def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
     """Load the model file of a mesh or urdf in the body's frame; None, with a warning, if it is unusable."""
     try:
         mesh = _model_mesh(shape)
+        if np.abs(np.ptp(mesh.vertices, axis=0) - shape.extents).max() > _SAME_SIZE * max(shape.extents):
+            raise ValueError(f"{shape.file} has another size")
     except (DemorecError, OSError, ValueError) as error:
         log.warning("An object is drawn as the recording describes it, since %s.", as_reason(error))
-        return None
-    extents = mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
-    if np.abs(extents - shape.extents).max() > _SAME_SIZE * max(shape.extents):
-        log.warning("An object is drawn as the recording describes it, since %s has another size.", shape.file)
         return None
     return mesh
 
 
 def _model_mesh(shape: Shape) -> SurfaceMesh:
     if shape.kind == "mesh":
-        return mesh_file(surface_file(shape)).placed(shape.body_from_mesh, np.full(3, shape.scale), _OWN_COLOR)
+        return mesh_file(surface_file(shape)).placed(shape.body_from_mesh, shape.scale)
     path = asset_path(shape.file)
     text = path.read_text()
     poses = Urdf.parse(text, scale=shape.scale).link_poses({})
     links = urdf_meshes(text, path.parent, shape.scale)
-    return joined([mesh.placed(poses[link], np.ones(3), _OWN_COLOR) for link, mesh in links.items()])
+    return joined([mesh.placed(poses[link]) for link, mesh in links.items()])
 
 
 @functools.cache
@@ -152,8 +139,8 @@ _SAME_PLACE = 1e-3
 """Maximum distance between joints of the installed model and of the recorded description, metres."""
 
 
-def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Playback, tint: Rgba | None = None) -> None:
-    """Log the meshes of all links below `paths.robot`, nested as the links are, and their motion.
+def log_robot(recording: rr.RecordingStream, episode: Playback) -> None:
+    """Log the meshes of all links below `Paths.robot`, nested as the links are, and their motion.
 
     Joints with unknown positions stay at 0; a robot without a description is not shown.
 
@@ -168,7 +155,7 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Playback, ti
         urdf, meshes = _external_model(description)
     else:
         return
-    entities = {urdf.root: f"{paths.robot}/{urdf.root}"}
+    entities = {urdf.root: f"{Paths.robot}/{urdf.root}"}
     for joint in urdf.depth_first():
         entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
     log_pose(recording, entities[urdf.root], episode.world_from_base.vector())
@@ -179,46 +166,43 @@ def log_robot(recording: rr.RecordingStream, paths: Paths, episode: Playback, ti
     for number, (_, child) in enumerate(joints.moving):
         send_poses(recording, entities[child], episode.time_ns, poses[:, number])
     for link, mesh in meshes.items():
-        recording.log(entities[link], as_mesh3d(mesh, tint), static=True)
+        recording.log(entities[link], _as_mesh3d(mesh), static=True)
 
 
-def _external_model(text: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
-    """Load the joint tree of a robot that was not simulated, and the meshes found for its links.
-
-    The text's original file is used if it is known and has the same joints. Otherwise a link without a mesh is drawn as
-    rods to its child joints.
-    """
-    urdf, path = Urdf.parse(text), known_model(text)
-    if path is not None:
-        try:
-            original = read_text_limited(path, MAX_BYTES)
-            if _same_joints(Urdf.parse(original), urdf):
-                return urdf, urdf_meshes(original, path.parent)
-        except (DemorecError, OSError, ValueError):  # the recording has its own description
-            log.debug("%s has changed since the robot was recorded.", path)
-    meshes, reasons = found_meshes(text)
-    if not reasons:
-        return urdf, meshes
-    log.warning(
-        "The robot is drawn as rods between its joints where its meshes are not found, since %s.", as_reason(reasons[0])
-    )
-    return urdf, {**skeleton_meshes(urdf), **meshes}
-
-
-def as_mesh3d(mesh: SurfaceMesh, tint: Rgba | None = None) -> rr.Mesh3D:
-    """Convert to Rerun's type; `tint` multiplies the colours and is the only way to make the mesh translucent."""
+def _as_mesh3d(mesh: SurfaceMesh) -> rr.Mesh3D:
     return rr.Mesh3D(
         vertex_positions=mesh.vertices,
         vertex_normals=mesh.normals,
         triangle_indices=mesh.triangles,
         vertex_colors=mesh.colors,
-        albedo_factor=None if tint is None else list(tint),
     )
 
 
+Model = tuple[Urdf, Mapping[str, SurfaceMesh]]
+"""Joint tree and meshes of the links."""
+
+
+def _external_model(text: str) -> Model:
+    """Load a robot that was not simulated, from the text's original file if that is known and has the same joints.
+
+    A link without a mesh is drawn as rods to its child joints.
+    """
+    urdf, path = Urdf.parse(text), known_model(text)
+    if path is not None:
+        with suppress(DemorecError, OSError, ValueError):  # changed or gone: the recording has its own description
+            return urdf, _original(path, 1.0, urdf)[1]
+    failures: list[DemorecError] = []
+    meshes = urdf_meshes(text, None, failures=failures)
+    if not failures:
+        return urdf, meshes
+    why = as_reason(failures[0])
+    log.warning("The robot is drawn as rods between its joints where its meshes are not found, since %s.", why)
+    return urdf, {**skeleton_meshes(urdf), **meshes}
+
+
 @functools.lru_cache(maxsize=4)
-def robot_model(urdf: str, scale: float, description: str) -> tuple[Urdf, Mapping[str, SurfaceMesh]]:
-    """Load the joint tree and the links' meshes from the installed model, else from the recorded description.
+def robot_model(urdf: str, scale: float, description: str) -> Model:
+    """Load a simulated robot from the installed model, else from the recorded description.
 
     The installed model is used if it is complete and its joints are where the recording has them.
 
@@ -228,21 +212,21 @@ def robot_model(urdf: str, scale: float, description: str) -> tuple[Urdf, Mappin
     """
     recorded = Urdf.parse(description) if description else None
     try:
-        path = asset_path(urdf)
-        text = path.read_text()
-        installed = Urdf.parse(text, scale=scale)
-        meshes = urdf_meshes(text, path.parent, scale)
+        return _original(asset_path(urdf), scale, recorded)
     except (DemorecError, OSError, ValueError) as error:
         if recorded is None:
             raise
-        reason = as_reason(error)
-    else:
-        if recorded is None or _same_joints(installed, recorded):
-            return installed, meshes
-        reason = f"the model installed here has other joints ({urdf})"
-    assert recorded is not None
-    log.warning("The robot is drawn as the boxes of the recording, since %s.", reason)
+        log.warning("The robot is drawn as the boxes of the recording, since %s.", as_reason(error))
     return recorded, urdf_meshes(description, None)
+
+
+def _original(path: Path, scale: float, recorded: Urdf | None) -> Model:
+    """Load the model that a description was made from; ValueError if its joints differ from the recorded ones."""
+    text = read_text_limited(path, MAX_BYTES)
+    urdf = Urdf.parse(text, scale=scale)
+    if recorded is not None and not _same_joints(urdf, recorded):
+        raise ValueError(f"the model installed here has other joints ({path.name})")
+    return urdf, urdf_meshes(text, path.parent, scale)
 
 
 def _same_joints(a: Urdf, b: Urdf) -> bool:

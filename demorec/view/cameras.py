@@ -22,21 +22,22 @@ _FRUSTUM_METRES = {"world": 0.22}
 _FRUSTUM_ON_ROBOT = 0.04
 
 
-def log_cameras(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
+def log_cameras(recording: rr.RecordingStream, episode: Playback) -> None:
     """Log every camera with its images; encoded images are passed through unchanged."""
     if episode.scene is not None:
-        _log_calibrations(recording, paths, episode, episode.scene)
-        _log_segmentations(recording, paths, episode)
+        _log_calibrations(recording, episode, episode.scene)
+        _log_segmentations(recording, episode)
+    _log_boxes(recording, episode)
     for name in episode.cameras:
         if name in episode.videos:
-            _send_video(recording, paths.camera(name), episode, name)
+            _send_video(recording, Paths.camera(name), episode, name)
         if name in episode.depth:
-            _send_images(recording, paths.camera(name, "/depth"), episode.time_ns, episode.distances(name))
+            _send_images(recording, Paths.camera(name, "/depth"), episode.time_ns, episode.distances(name))
 
 
-def _log_calibrations(recording: rr.RecordingStream, paths: Paths, episode: Playback, scene: Scene) -> None:
+def _log_calibrations(recording: rr.RecordingStream, episode: Playback, scene: Scene) -> None:
     for camera in scene.cameras:
-        entity = paths.camera(camera.name)
+        entity = Paths.camera(camera.name)
         pinhole = rr.Pinhole(
             image_from_camera=camera.intrinsics,
             resolution=(camera.width, camera.height),
@@ -87,17 +88,37 @@ def _send_images(
         recording.send_columns(entity, indexes(np.array([time_ns for time_ns, _ in batch]), frame_times), columns)
 
 
-def _log_segmentations(recording: rr.RecordingStream, paths: Paths, episode: Playback) -> None:
+def _log_segmentations(recording: rr.RecordingStream, episode: Playback) -> None:
     """Log segments with small numbers, 0 for the background, and the names of these numbers."""
     segment_names = episode.data.segment_names()
     known = np.array(sorted(segment_names))
     for camera in filter(episode.data.has_segmentation, episode.data.cameras):
         images = zip(episode.time_ns.tolist(), episode.data.segmentation(camera), strict=False)
         numbers = ((time_ns, np.searchsorted(known, values).astype(np.uint16)) for time_ns, values in images)
-        entity = paths.camera(camera, "/segmentation")
+        entity = Paths.camera(camera, "/segmentation")
         _send_images(recording, entity, episode.time_ns, numbers, rr.SegmentationImage)
     if segment_names:
         names = {number: segment_names[value] for number, value in enumerate(known.tolist()) if number > 0}
         colors = segment_colors(names.values())
         labels = [rr.AnnotationInfo(number, name, colors[name]) for number, name in names.items()]
-        recording.log(paths.world, rr.AnnotationContext(labels), static=True)
+        recording.log(Paths.world, rr.AnnotationContext(labels), static=True)
+
+
+def _log_boxes(recording: rr.RecordingStream, episode: Playback) -> None:
+    """Log boxes around visible bodies, named on hovering (names hide images)."""
+    found = {camera: list(episode.data.boxes(camera)) for camera in episode.data.cameras}
+    colors = segment_colors(sorted({name for boxes in found.values() for _, name, _ in boxes}))
+    for camera, boxes in found.items():
+        if not boxes:
+            continue
+        recording.log(Paths.camera(camera, "/boxes"), rr.Boxes2D.from_fields(show_labels=False), static=True)
+        columns = rr.Boxes2D.columns(
+            half_sizes=[(width / 2, height / 2) for _, _, (_, _, width, height) in boxes],
+            centers=[(x + width / 2, y + height / 2) for _, _, (x, y, width, height) in boxes],
+            labels=[name for _, name, _ in boxes],
+            colors=[colors[name] for _, name, _ in boxes],
+        )
+        lengths = np.bincount([frame for frame, _, _ in boxes], minlength=episode.num_frames)
+        recording.send_columns(
+            Paths.camera(camera, "/boxes"), indexes(episode.time_ns, episode.time_ns), columns.partition(lengths)
+        )

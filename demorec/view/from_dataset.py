@@ -22,10 +22,8 @@ from demorec.core.errors import RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
 from demorec.datasets.lerobot.files import read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import DatasetInfo
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
-from demorec.datasets.lerobot.robots import DatasetRobot
 from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, STATE_KINDS, state_names
 from demorec.episode.info import EpisodeInfo
@@ -58,24 +56,24 @@ def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playba
 def _read_episode(dataset: LeRobotFolder, number: int) -> Playback:
     root, group = dataset.root, dataset.root.resolve().name
     index, last = dataset.places[number].episode_index, dataset.places[number].length - 1
-    episode: ShownEpisode | SimulatedEpisode = ShownEpisode(dataset, number)
-    if episode.known.get("root_seed") is not None:
-        episode = SimulatedEpisode(dataset, number)
-        motion, identity = episode.motion(), f"dataset-{group}-{index}"
-        curves = simulated_curves(episode, motion, has_targets=episode.has_targets)
+    data: DatasetRecording = _ShownEpisode(dataset, number)
+    if data.known.get("root_seed") is not None:
+        data = simulated = _SimulatedEpisode(dataset, number)
+        motion, identity = data.motion(), f"dataset-{group}-{index}"
+        curves = simulated_curves(data, motion, has_targets=simulated.has_targets)
     else:
-        motion, identity = episode.motion(), hashlib.sha256(f"{root.resolve()} {index}".encode()).hexdigest()[:16]
-        curves = feature_curves(episode, dataset.roles)
+        motion, identity = data.motion(), hashlib.sha256(f"{root.resolve()} {index}".encode()).hexdigest()[:16]
+        curves = feature_curves(data, dataset.roles)
     statements = tuple(
         (min(round(row["timestamp"] * dataset.info.fps), last), str(row["style"]), str(row["content"]))
-        for row in episode.spoken.persistent
+        for row in data.spoken.persistent
     )
     return Playback(
         name=f"episode_{index:06d}",
         group=group,
         identity=identity,
-        source=str(episode.known.get("source", group)),
-        data=episode,
+        source=str(data.known.get("source", group)),
+        data=data,
         motion=motion,
         roles=dataset.roles,
         curves=curves,
@@ -83,7 +81,7 @@ def _read_episode(dataset: LeRobotFolder, number: int) -> Playback:
     )
 
 
-class ShownEpisode(DatasetRecording):
+class _ShownEpisode(DatasetRecording):
     """An episode that, without a robot description, gets the arm identified by its joint names."""
 
     @cached_property
@@ -93,29 +91,18 @@ class ShownEpisode(DatasetRecording):
         return info if info.urdf or robot is None else with_robot(info, robot, self.dataset.roles)
 
 
-class SimulatedEpisode(DatasetRecording):
+class _SimulatedEpisode(DatasetRecording):
     """An episode simulated by demorec, with scene and outcome from the sidecar.
 
-    Attributes:
-        outcome, phases: As in the sidecar.
-        has_targets: Whether its actions are joint targets.
-
-    Raises:
-        RecordingError: State or action is missing, or belongs to another robot.
-        ValueError, TypeError, KeyError, IndexError: Unexpected values in its tables.
+    `has_targets` states whether its actions are joint targets. Raises RecordingError if state or action is missing or
+    belongs to another robot, and ValueError, TypeError, KeyError or IndexError for unexpected values in its tables.
     """
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         super().__init__(dataset, number)
         (self._row,) = dataset.sidecar_rows("episodes", self.place.episode_index)
         self.has_targets = read_json(self.path / SIDECAR_DIR / "export.json").get("action") == "joint"
-        self._check()
-        self._phases = _phases(self._row, self.num_frames)
-        if self.robot is not None:
-            check_primitives(self.robot.urdf)
-
-    def _check(self) -> None:
-        missing = {STATE, ACTION} - self.dataset.info.features.keys()
+        missing = {STATE, ACTION} - dataset.info.features.keys()
         if missing:
             raise RecordingError(
                 f"The dataset lacks {' and '.join(sorted(missing))}, so it cannot be shown: {self.path}"
@@ -125,6 +112,9 @@ class SimulatedEpisode(DatasetRecording):
             raise RecordingError(
                 f"The dataset has no rows of episode {self.place.episode_index}, or rows of another robot: {self.path}"
             )
+        self._phases = _phases(self._row, self.num_frames)
+        if self.robot is not None:
+            check_primitives(self.robot.urdf)
 
     @cached_property
     def info(self) -> EpisodeInfo:
@@ -161,46 +151,50 @@ class SimulatedEpisode(DatasetRecording):
         data = {name: values.astype(np.float64) for name, values in self.table().features.items()}
         state, count = data[STATE], len(self._spec.arm_joints)
         fingers = self._spec.gripper.joint_position(state[:, count])
-        base_from_tcp = data[EE_POSE] if EE_POSE in data else _tcp_poses(self.info, state, self.robot)
+        base_from_tcp = data[EE_POSE] if EE_POSE in data else self._tcp_poses(state)
         ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in self._row["objects"]}
+        if ENVIRONMENT_STATE in data:
+            poses = self._object_poses(data[ENVIRONMENT_STATE])
+        else:
+            opening, fps = state[:, count], int(self.dataset.info.fps)
+            scene = self.info.simulated.scene
+            poses = held_object_poses(scene, ends, base_from_tcp, opening, data[ACTION][:, -1], fps)
+        rows = self.dataset.sidecar_rows("camera_poses", self.place.episode_index)
+        moving = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
         return SceneMotion(
             joint_position=dict(zip(self._spec.joint_names, [*state[:, :count].T, *fingers.T], strict=True)),
             base_from_tcp=base_from_tcp,
-            object_poses=_object_poses(self.info, ends, data, self.dataset.info, base_from_tcp),
+            object_poses=poses,
             end_poses=ends,
-            world_from_camera=_camera_poses(self),
+            world_from_camera={name: np.array([row[name] for row in rows]) for name in moving},
         )
 
+    def _tcp_poses(self, state: Array) -> Array:
+        """Compute (T, 7) TCP poses from the joints if the dataset has no observation.ee_pose."""
+        spec = self._spec
+        if self.robot is None:
+            urdf = Urdf.load(asset_path(spec.urdf), scale=self.info.simulated.scene.robot.scale)
+        else:
+            urdf = self.robot.model
+        arm = ArmKinematics(
+            urdf,
+            arm_joints=spec.arm_joints,
+            tcp_link=spec.tcp_link,
+            lower=spec.position_lower,
+            upper=spec.position_upper,
+        )
+        return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
 
-def _tcp_poses(info: EpisodeInfo, state: Array, robot: DatasetRobot | None) -> Array:
-    """Compute (T, 7) TCP poses from the joints if the dataset has no observation.ee_pose."""
-    spec = info.simulated.robot
-    urdf = Urdf.load(asset_path(spec.urdf), scale=info.simulated.scene.robot.scale) if robot is None else robot.model
-    arm = ArmKinematics(
-        urdf,
-        arm_joints=spec.arm_joints,
-        tcp_link=spec.tcp_link,
-        lower=spec.position_lower,
-        upper=spec.position_upper,
-    )
-    return np.array([arm.forward(row).vector() for row in state[:, : arm.num_joints]])
-
-
-def _object_poses(
-    info: EpisodeInfo, ends: dict[str, Array], data: dict[str, Array], described: DatasetInfo, base_from_tcp: Array
-) -> dict[str, Array]:
-    """Return name -> (T, 7): recorded in `observation.environment_state`, else moved with the hand."""
-    if ENVIRONMENT_STATE not in data:
-        opening, target = data[STATE][:, len(info.simulated.robot.arm_joints)], data[ACTION][:, -1]
-        return held_object_poses(info.simulated.scene, ends, base_from_tcp, opening, target, int(described.fps))
-    first = {name: column for column, name in enumerate(described.features[ENVIRONMENT_STATE].names or ())}
-    base, values = info.simulated.scene.robot.world_from_base, data[ENVIRONMENT_STATE]
-    result = {}
-    for body in info.simulated.scene.movable:
-        column = first[f"{body.name}.pose.x"]
-        rows = values[:, column : column + 7]
-        result[body.name] = np.array([(base @ Pose(position=p[:3], quat_xyzw=p[3:])).vector() for p in rows])
-    return result
+    def _object_poses(self, values: Array) -> dict[str, Array]:
+        """Read name -> (T, 7) from the rows of `observation.environment_state`."""
+        names = list(self.dataset.info.features[ENVIRONMENT_STATE].names or ())
+        scene, result = self.info.simulated.scene, {}
+        for body in scene.movable:
+            column = names.index(f"{body.name}.pose.x")
+            rows = values[:, column : column + 7]
+            poses = (scene.robot.world_from_base @ Pose(position=row[:3], quat_xyzw=row[3:]) for row in rows)
+            result[body.name] = np.array([pose.vector() for pose in poses])
+        return result
 
 
 def _pose_row(values: Any) -> Array:
@@ -220,13 +214,6 @@ def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
     return tuple(names)
 
 
-def _camera_poses(recording: DatasetRecording) -> dict[str, Array]:
-    """Read camera -> (T, 7) of the moving cameras."""
-    rows = recording.dataset.sidecar_rows("camera_poses", recording.place.episode_index)
-    names = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
-    return {name: np.array([row[name] for row in rows]) for name in names}
-
-
 _STOPPED_BEFORE_TARGET = 1e-3
 """Minimum excess of the opening over its target, metres, that indicates a body between the fingers."""
 _STANDS_STILL = 0.015
@@ -238,13 +225,7 @@ _WITHIN_REACH = 0.02
 
 
 def held(opening: Array, target: Array, fps: int) -> NDArray[np.bool_]:
-    """Detect (T,) whether a body is between the fingers.
-
-    Args:
-        opening: (T,) measured, metres.
-        target: (T,) target of the opening, metres.
-        fps: Frames per second.
-    """
+    """Detect (T,) whether a body is between the fingers, from (T,) measured and target openings, metres."""
     speed = fps * np.abs(np.diff(opening, prepend=opening[:1]))
     result = np.zeros(len(opening), dtype=np.bool_)
     is_held = False
@@ -263,17 +244,15 @@ def held_object_poses(
         scene: Scene at the start.
         end_poses: Name -> (7,) world_from_object at the end.
         base_from_tcp: (T, 7).
-        opening: (T,) opening of the gripper, metres.
-        target: (T,) target of the opening, metres.
-        fps: Frames per second.
+        opening, target, fps: As in `held`.
     """
-    world_from_base = scene.robot.world_from_base
-    world_from_tcp = [world_from_base @ Pose(position=row[:3], quat_xyzw=row[3:]) for row in base_from_tcp]
+    base = scene.robot.world_from_base
     present = {name: scene.body(name).world_from_body for name in end_poses}
     poses: dict[str, Array] = {name: np.empty((len(base_from_tcp), 7)) for name in end_poses}
     let_go: dict[str, int] = {}
     name, tcp_from_object = "", Pose()
-    for frame, (is_held, tcp) in enumerate(zip(held(opening, target, fps), world_from_tcp, strict=True)):
+    for frame, is_held in enumerate(held(opening, target, fps)):
+        tcp = base @ Pose(position=base_from_tcp[frame, :3], quat_xyzw=base_from_tcp[frame, 3:])
         if is_held and not name:
             name = _within_reach(scene, present, tcp)
             if name:

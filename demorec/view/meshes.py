@@ -10,6 +10,7 @@ import functools
 import hashlib
 import xml.etree.ElementTree as ElementTree
 import zipfile
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path
 from demorec.robots.collada import read_collada
-from demorec.robots.urdf import Urdf, UrdfLink, UrdfShape, read_links
+from demorec.robots.urdf import Urdf, UrdfShape, read_links
 
 MAX_TRIANGLES = 2500
 """Maximum number of triangles of one mesh file."""
@@ -55,13 +56,15 @@ class SurfaceMesh:
     triangles: NDArray[np.uint32]
     colors: NDArray[np.uint8]
 
-    def placed(self, pose: Pose, scale: NDArray[np.float64], rgba: Rgba) -> SurfaceMesh:
+    def placed(
+        self, pose: Pose | None = None, scale: Sequence[float] | float = 1.0, rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
+    ) -> SurfaceMesh:
         """Scale, then move by `pose`, and multiply the colours by `rgba`."""
-        rotation = pose.rotation
-        normals = (self.normals / scale) @ rotation.T  # display only: rounding may differ between CPUs
+        pose, factors = pose or Pose(), np.broadcast_to(np.asarray(scale, dtype=np.float64), 3)
+        normals = (self.normals / factors) @ pose.rotation.T  # display only: rounding may differ between CPUs
         lengths = np.linalg.norm(normals, axis=1, keepdims=True)
         return SurfaceMesh(
-            vertices=pose.apply(self.vertices * scale).astype(np.float32),
+            vertices=pose.apply(self.vertices * factors).astype(np.float32),
             normals=(normals / np.maximum(lengths, 1e-12)).astype(np.float32),
             triangles=self.triangles,
             colors=np.rint(self.colors * np.array(rgba)).astype(np.uint8),
@@ -81,7 +84,9 @@ def joined(meshes: list[SurfaceMesh]) -> SurfaceMesh:
     )
 
 
-def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str, SurfaceMesh]:
+def urdf_meshes(
+    text: str, folder: Path | None, scale: float = 1.0, *, failures: list[DemorecError] | None = None
+) -> dict[str, SurfaceMesh]:
     """Load link -> mesh of all visible links.
 
     Args:
@@ -89,6 +94,7 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
         folder: Its folder, to find its mesh files; None if unknown, in which case only files in ROS packages or below
             the current folder are found.
         scale: Uniform scale.
+        failures: Receives the errors of links, which are left out; None: they are raised.
 
     Raises:
         RecordingError: A mesh file cannot be read.
@@ -96,34 +102,16 @@ def urdf_meshes(text: str, folder: Path | None, scale: float = 1.0) -> dict[str,
     """
     links = {}
     for link in read_links(text, scale=scale):
-        if (mesh := _link_mesh(link, folder)) is not None:
-            links[link.name] = mesh
-    return links
-
-
-def found_meshes(text: str) -> tuple[dict[str, SurfaceMesh], list[DemorecError]]:
-    """Load the meshes of a URDF of unknown origin as `urdf_meshes`, omitting missing ones; also returns the reasons.
-
-    Raises:
-        ValueError: The text is not a URDF.
-    """
-    links: dict[str, SurfaceMesh] = {}
-    errors: list[DemorecError] = []
-    for link in read_links(text):
         try:
-            mesh = _link_mesh(link, None)
+            shapes = [_shape_mesh(shape, folder) for shape in link.visuals if shape.kind != "plane"]
         except DemorecError as error:
-            errors.append(error)
+            if failures is None:
+                raise
+            failures.append(error)
             continue
-        if mesh is not None:
-            links[link.name] = mesh
-    return links, errors
-
-
-def _link_mesh(link: UrdfLink, folder: Path | None) -> SurfaceMesh | None:
-    shapes = [_shape_mesh(shape, folder) for shape in link.visuals]
-    meshes = [mesh for mesh in shapes if mesh is not None]
-    return joined(meshes) if meshes else None
+        if shapes:
+            links[link.name] = joined(shapes)
+    return links
 
 
 def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
@@ -137,23 +125,20 @@ def skeleton_meshes(urdf: Urdf) -> dict[str, SurfaceMesh]:
     return {link: joined(rods) for link, rods in links.items()}
 
 
-def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh | None:
-    scale: NDArray[np.float64] = np.ones(3)
-    match shape.kind:
-        case "mesh":
-            try:
-                path = mesh_path(folder, shape.file)
-            except DemorecError as error:
-                raise RecordingError(str(error)) from error
-            mesh, scale = mesh_file(path), np.array(shape.size)
-        case "box":
-            mesh = of_trimesh(trimesh.creation.box(extents=shape.size))
-        case "sphere":
-            mesh = sphere_mesh(shape.size[0])
-        case "cylinder" | "capsule":
-            mesh = of_trimesh(trimesh.creation.cylinder(radius=shape.size[0], height=shape.size[1], sections=32))
-        case "plane":
-            return None
+def _shape_mesh(shape: UrdfShape, folder: Path | None) -> SurfaceMesh:
+    scale: Sequence[float] = (1.0, 1.0, 1.0)
+    if shape.kind == "mesh":
+        try:
+            path = mesh_path(folder, shape.file)
+        except DemorecError as error:
+            raise RecordingError(str(error)) from error
+        mesh, scale = mesh_file(path), shape.size
+    elif shape.kind == "box":
+        mesh = of_trimesh(trimesh.creation.box(extents=shape.size))
+    elif shape.kind == "sphere":
+        mesh = sphere_mesh(shape.size[0])
+    else:
+        mesh = of_trimesh(trimesh.creation.cylinder(radius=shape.size[0], height=shape.size[1], sections=32))
     return mesh.placed(shape.link_from_shape, scale, shape.rgba or (1.0, 1.0, 1.0, 1.0))
 
 

@@ -16,10 +16,9 @@ from demorec.core.geometry import Array
 
 
 class Paths:
-    """Paths below a root, "" for a single episode or "/a" and "/b" for two that are compared.
+    """Entity paths of an episode.
 
     Attributes:
-        root: The root argument.
         world: The scene, z up.
         robot: The robot's base; its links are nested below.
         ee_path: One piece of the gripper's path per frame.
@@ -29,31 +28,33 @@ class Paths:
         summary: The episode in words.
     """
 
-    def __init__(self, root: str = "") -> None:
-        self.root, self.world = root, f"{root}/world"
-        self.robot, self.ee_path = f"{self.world}/robot", f"{self.world}/ee_path"
-        self.phase, self.events = f"{root}/phase", f"{root}/events"
-        self.words, self.summary = f"{root}/words", f"{root}/summary"
+    world, robot, ee_path = "/world", "/world/robot", "/world/ee_path"
+    phase, events, words, summary = "/phase", "/events", "/words", "/summary"
 
-    def body(self, name: str) -> str:
+    @staticmethod
+    def body(name: str) -> str:
         """Path of a body of the scene."""
-        return f"{self.world}/bodies/{name}"
+        return f"/world/bodies/{name}"
 
-    def goal(self, name: str) -> str:
+    @staticmethod
+    def goal(name: str) -> str:
         """Path of an object's goal."""
-        return f"{self.world}/goals/{name}"
+        return f"/world/goals/{name}"
 
-    def end(self, name: str) -> str:
+    @staticmethod
+    def end(name: str) -> str:
         """Path of an object's final pose; not below the goal, because the goal's transform would apply to it."""
-        return f"{self.world}/ends/{name}"
+        return f"/world/ends/{name}"
 
-    def camera(self, name: str, more: Literal["", "/depth", "/segmentation", "/boxes"] = "") -> str:
+    @staticmethod
+    def camera(name: str, more: Literal["", "/depth", "/segmentation", "/boxes"] = "") -> str:
         """Path of a camera's pose, pinhole and images; or of its other images, or boxes around visible bodies."""
-        return f"{self.world}/cameras/{name}{more}"
+        return f"/world/cameras/{name}{more}"
 
-    def curves(self, name: str) -> str:
+    @staticmethod
+    def curves(name: str) -> str:
         """Path of numbers over time."""
-        return f"{self.root}/plots/{_NOT_IN_PATHS.sub('_', name)}"
+        return f"/plots/{_NOT_IN_PATHS.sub('_', name)}"
 
 
 _NOT_IN_PATHS = re.compile(r"[ /()]+")

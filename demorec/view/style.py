@@ -36,8 +36,7 @@ PHASES: tuple[Color, ...] = (
 MEASURED: Color = (86, 180, 233)
 TARGET: Color = (255, 170, 60)
 ASKED: Color = (235, 235, 235)
-"""Colour of all joint targets over the measured joints, and of a second episode's joints over the first's."""
-SECOND: Color = (255, 140, 60)
+"""Colour of all joint targets over the measured joints."""
 FORCE: Color = (240, 90, 90)
 GOAL: Color = (60, 230, 120)
 FRUSTUM: Color = (255, 200, 60)

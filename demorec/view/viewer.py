@@ -1,8 +1,11 @@
-"""Rerun's viewer: in a window, without a screen (for images), or in the browser."""
+"""Rerun's viewer, with the ffmpeg that it needs for H.264: in a window, without a screen, or in the browser."""
 
 from __future__ import annotations
 
+import os
 import re
+import shutil
+import socket
 import subprocess
 import tempfile
 import time
@@ -16,10 +19,10 @@ from urllib.request import urlopen
 
 from rerun.experimental import ViewerClient
 
-from demorec.core.errors import ConfigError, DemorecError, RecordingError
+from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, RecordingError
+from demorec.core.files import cache_folder
 from demorec.core.processes import start_program
 from demorec.view.paths import SECONDS
-from demorec.view.programs import free_port, has_display, viewer_environment, viewer_program
 
 _START_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
@@ -27,18 +30,56 @@ _END_SECONDS = 5.0
 _PANIC = re.compile(r"panicked at '(?P<message>.*)'$", re.MULTILINE)
 _NO_DRIVER = ("Failed to create render state", "Failed to get render context")
 """First words of the viewer's panic if the Vulkan driver is missing, or OpenGL alone is not enough for it."""
-_NO_GLYPH = re.compile(r'No glyph for "(?P<character>.+?)" \((?P<code>U\+[0-9A-F]+)\)')
 
 
 def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
     """Start the viewer, reachable only from this machine; `options` are those of `start_program`."""
-    command = [viewer_program(), "--bind", "127.0.0.1", *arguments]
-    return start_program(command, env=viewer_environment(), **options)
+    import rerun_cli
+
+    program = Path(rerun_cli.__file__).with_name("rerun")  # its version matches the recordings
+    if not program.is_file():
+        raise MissingDependencyError("Showing recordings", "rerun-sdk", "pip install 'rerun-sdk>=0.41,<0.42'")
+    return start_program([str(program), "--bind", "127.0.0.1", *arguments], env=viewer_environment(), **options)
+
+
+def viewer_environment() -> dict[str, str]:
+    """Build the viewer's environment, with `ffmpeg` on PATH: imageio-ffmpeg's if no other is installed."""
+    environment = dict(os.environ)
+    environment.setdefault("RUST_LOG", "warn")
+    if shutil.which("ffmpeg") is None:
+        environment["PATH"] = os.pathsep.join([environment.get("PATH", ""), str(_ffmpeg_folder())])
+    return environment
+
+
+def _ffmpeg_folder() -> Path:
+    """Make a folder with a link named ffmpeg to imageio-ffmpeg's program (such as ffmpeg-linux-x86_64-v7.0.2)."""
+    import imageio_ffmpeg
+
+    try:
+        program = Path(imageio_ffmpeg.get_ffmpeg_exe())
+    except RuntimeError as error:
+        raise MissingDependencyError("Playing H.264", "ffmpeg", "pip install imageio-ffmpeg, or ffmpeg") from error
+    folder = cache_folder("bin", program.name)
+    link = folder / "ffmpeg"
+    if not link.is_file():
+        fresh = folder / f"{link.name}.{os.getpid()}"
+        try:
+            fresh.symlink_to(program)
+        except OSError:
+            shutil.copy2(program, fresh)
+        fresh.replace(link)
+    return folder
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
 
 
 def need_screen() -> None:
     """Raise ConfigError unless a window can be opened."""
-    if not has_display():
+    if not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")):
         raise ConfigError(
             "No screen is available for a window: use --screenshot x.png, --web for a browser, or, unless it is an "
             ".rrd file already, --save x.rrd."
@@ -67,12 +108,6 @@ def why_it_ended(said: str) -> DemorecError:
             f"Rerun's viewer found no Vulkan driver to draw an image with ({message.rstrip('.')}): "
             "apt-get install mesa-vulkan-drivers brings one that needs no graphics card."
         )
-    glyph = _NO_GLYPH.match(message)
-    if glyph:
-        return RecordingError(
-            f"Rerun's viewer without a screen cannot draw {glyph['character']!r} ({glyph['code']}), which the file "
-            "contains: look at it in the window, or with --web."
-        )
     return RecordingError(f"Rerun's viewer ended by itself: {message or said.strip()[-300:]}")
 
 
@@ -85,7 +120,7 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
     """
 
     def __init__(self, *recordings: Path, width: int = 1600, height: int = 950) -> None:
-        self._port = free_port()
+        self._port = _free_port()
         self._recordings = recordings
         # Not a pipe, which would fill up unread.
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
@@ -246,7 +281,7 @@ def serve_web(recordings: Sequence[Path], *, web_port: int = 0) -> Iterator[tupl
     Raises:
         RecordingError: The port is taken, or the server does not start.
     """
-    data_port, web_port = free_port(), web_port or free_port()
+    data_port, web_port = _free_port(), web_port or _free_port()
     memory = max(1024, 3 * sum(recording.stat().st_size for recording in recordings) // 2**20)
     process = _start_viewer(
         "--serve-web", "--port", str(data_port), "--web-viewer-port", str(web_port), "--server-memory-limit",

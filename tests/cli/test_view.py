@@ -16,9 +16,7 @@ from demorec.cli import run_command
 from demorec.cli.view import View
 from demorec.core.config import VideoConfig
 from demorec.mcap import EpisodeWriter
-from demorec.view import live as live_module
-from demorec.view.live import LiveViewer
-from demorec.view.save import save, save_each
+from demorec.view.scene import save_each
 from demorec.view.sources import find_episodes
 from demorec.view.viewer import HeadlessViewer, serve_web
 
@@ -63,7 +61,7 @@ def test_bad_requests_are_one_sentence(
         ("cut.mcap.part", (), "demorec recover"),
         ("folder", (), "The folder holds no recording"),
         ("runs", (), "it holds runs: name one (cubes)"),
-        ("saved.rrd", ("--compare",), "is shown unchanged"),
+        ("saved.rrd", ("--episodes", "0"), "is shown unchanged"),
         ("nothing.rrd", (), "No such file"),
         ("episode.mcap", ("--screenshot", "x.png", "--at", "-1"), "--at -1 is out of range: choose 0 to 0.133 s"),
         ("episode.mcap", ("--screenshot", "x.png", "--at", "999"), "--at 999 is out of range: choose 0 to 0.133 s"),
@@ -92,10 +90,9 @@ def test_unavailable_parts_are_reported(
 @pytest.mark.slow
 @pytest.mark.long
 @pytest.mark.viewer
-@pytest.mark.parametrize("flags", [("--episodes", "0"), ("--compare",)])
-def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path, flags: tuple[str, ...]) -> None:
+def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
-    assert view(run_folder, *flags, "--save", tmp_path / "x.rrd") == 0
+    assert view(run_folder, "--episodes", "0", "--save", tmp_path / "x.rrd") == 0
     assert view(tmp_path / "x.rrd", "--screenshot", tmp_path / "x.png") == 0
     assert num_colors(pixels((tmp_path / "x.png").read_bytes())) > 200
 
@@ -173,26 +170,6 @@ def test_a_screenshot_of_an_episode(run_folder: Path, tmp_path: Path) -> None:
     image = pixels((tmp_path / "x.png").read_bytes())
     assert image.shape == (600, 900, 3)
     assert num_colors(image) > 200
-
-
-@pytest.mark.slow
-@pytest.mark.viewer
-def test_episodes_arrive_while_the_viewer_is_open(
-    run_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    need_vulkan()
-    monkeypatch.setattr(live_module, "_END_SECONDS", 300.0)  # the sender has low priority and may be late
-    first, second = sorted((run_folder / "episodes").iterdir())
-    save(find_episodes([first])[0], tmp_path / "x.rrd")
-    with HeadlessViewer(tmp_path / "x.rrd") as viewer:
-        with LiveViewer(viewer.client.url) as live:
-            live.add(second)
-        deadline = time.monotonic() + 120
-        while len(viewer.client.get_state().recordings) < 2 and time.monotonic() < deadline:
-            time.sleep(0.2)
-        names = [recording.store_id for recording in viewer.client.get_state().recordings]
-    assert len(names) == 2
-    assert any("episode_000001" in name for name in names)
 
 
 @pytest.mark.slow

@@ -80,7 +80,7 @@ def test_playback_has_the_words_and_the_boxes(dataset: Path, tmp_path: Path) -> 
     from rerun.chunk import RrdReader
 
     from demorec.view.from_dataset import open_dataset_episode
-    from demorec.view.save import save
+    from demorec.view.scene import save
     from demorec.view.sources import find_episodes
 
     (frames,) = language_of(dataset)

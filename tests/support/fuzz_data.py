@@ -176,7 +176,6 @@ class FuzzedData:
             ["report", path, "--out", self.folder / "out.html"],
             ["check", path, "--no-images"],
             ["view", path, "--save", self.folder / "out.rrd"],
-            ["view", path, self._good, "--compare", "--save", self.folder / "out.rrd"],
             [*lerobot, "--privileged"], [*lerobot, "--action", "ee_delta"],
             ["export", "hdf5", path, "--out", self.folder / "out.hdf5"],
             ["recover", path, "--out", self.folder / "out.mcap"], ["replay", path], ["replay", path, "--states"],

@@ -25,7 +25,7 @@ from demorec.extensions.imports.dataset_import import import_lerobot
 from demorec.mcap import Recording
 from demorec.view import bodies as played_robot
 from demorec.view.from_dataset import open_dataset_episode
-from demorec.view.save import save
+from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"

@@ -9,8 +9,7 @@ import pytest
 from rerun.chunk import RrdReader
 from support.external import TOP, WRIST, make_external, write_external
 
-from demorec.core.errors import ConfigError
-from demorec.view.save import save, save_comparison
+from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 
 
@@ -54,10 +53,3 @@ def test_missing_meshes_leave_the_rest_visible(tmp_path: Path, caplog: pytest.Lo
         if "Mesh3D:vertex_positions" in chunk.to_record_batch().schema.names
     }
     assert drawn == {"base", "upper", "lower"}  # rods to the joints of two links, and the third link's own shape
-
-
-def test_two_external_episodes_are_not_overlaid(tmp_path: Path) -> None:
-    path = write_external(tmp_path / "a.mcap", make_external(num_frames=5))
-    (source,) = find_episodes([path])
-    with pytest.raises(ConfigError, match="without --compare"):
-        save_comparison(source, source, tmp_path / "a.rrd")

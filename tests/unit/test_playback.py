@@ -23,10 +23,9 @@ from demorec.robots.assets import asset_path
 from demorec.view import bodies
 from demorec.view.bodies import robot_model
 from demorec.view.meshes import mesh_file
-from demorec.view.programs import viewer_environment
-from demorec.view.save import save, save_comparison
-from demorec.view.scene import differences
+from demorec.view.scene import save
 from demorec.view.sources import find_episodes
+from demorec.view.viewer import viewer_environment
 
 
 @pytest.fixture(scope="module")
@@ -208,23 +207,6 @@ def test_a_model_of_another_size_does_not_replace_the_recorded_one(
     assert "duck.obj has another size" in caplog.text
     vertices, _ = _mesh_of(drawn["/world/bodies/duck"])
     np.testing.assert_allclose(np.ptp(vertices, axis=0), DUCK.shape.size, atol=0.01)
-
-
-def test_a_comparison_measures_the_distance(tmp_path: Path, recording: Path) -> None:
-    other = write_episode(tmp_path / "b.mcap", num_frames=12, episode_index=3)
-    first, second = find_episodes([recording, other])
-    with first.open() as a, second.open() as b:
-        result = differences(a, b)
-        expected = np.max(
-            [np.abs(joint[:12] - b.motion.joint_position[name]) for name, joint in a.motion.joint_position.items()], 0
-        )
-    assert len(result["distance"].time_ns) == 12  # for the length of the shorter one
-    assert expected.min() > 0.001
-    np.testing.assert_array_equal(result["joints"].values[:, 0], expected)
-    np.testing.assert_allclose(result["distance"].values, 0.0, atol=1e-9)  # the same gripper and cube
-    save_comparison(first, second, tmp_path / "c.rrd")
-    entities = set(_chunks(tmp_path / "c.rrd"))
-    assert {"/a/plots/position", "/b/plots/position", "/differences/distance"} <= entities
 
 
 def test_a_damaged_file_in_the_cache_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

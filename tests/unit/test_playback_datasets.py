@@ -17,7 +17,7 @@ from demorec.datasets.lerobot.dataset_features import why_not_recorded
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.mcap import Recording
 from demorec.view.from_dataset import held, open_dataset_episode
-from demorec.view.save import save
+from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "sample" / "pick_place.mcap"

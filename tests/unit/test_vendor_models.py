@@ -16,7 +16,7 @@ from demorec.mcap.description import self_contained
 from demorec.robots.assets import mesh_path
 from demorec.robots.urdf import Urdf, mesh_names, read_dynamics, read_links
 from demorec.view.meshes import urdf_meshes
-from demorec.view.save import save
+from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 
 WHITE, ORANGE = (242, 242, 242, 255), (255, 128, 0, 255)

@@ -2,30 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
-
 import pytest
-from support.external import make_external, write_external
-from support.viewer import need_vulkan
 
-from demorec.cli import run_command
-from demorec.cli.view import View
 from demorec.core.errors import DemorecError
 from demorec.view.viewer import why_it_ended
-
-
-@pytest.mark.slow
-@pytest.mark.viewer
-def test_a_character_without_a_glyph_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    need_vulkan()
-    given = make_external()
-    write_external(tmp_path / "x.mcap", replace(given, info=replace(given.info, instruction="一")))
-    arguments = [str(tmp_path / "x.mcap"), "--screenshot", str(tmp_path / "x.png")]
-    assert run_command(View, arguments, prog="demorec view") == 1
-    assert "cannot draw '一' (U+4E00), which the file contains" in capsys.readouterr().err
-    assert [path.name for path in tmp_path.iterdir()] == ["x.mcap"]
-
 
 NO_DRIVER = """libEGL warning: MESA-LOADER: failed to open swrast
 thread 'main' panicked at 'Failed to create render state: CustomNativeAdapterSelectionError("No adapter found")'

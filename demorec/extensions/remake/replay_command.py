@@ -69,7 +69,7 @@ class Replay:
     out: OptionalTarget = None
     """Folder for recordings of the replays, images included."""
     view: bool = False
-    """Show recording and replay overlaid in Rerun."""
+    """Show recording and replay in Rerun."""
     overwrite: bool = False
     """Replace recordings in the output folder."""
     allow: Allow = ()
@@ -251,4 +251,4 @@ def _show(pairs: Sequence[tuple[Path, Path]]) -> None:
     if not pairs:
         raise ConfigError("Nothing to show: --view needs recordings, because a dataset has no scene to draw.")
     recorded, replayed = pairs[0]
-    run_command(COMMANDS.load("view"), [str(recorded), str(replayed), "--compare"], prog="demorec view")
+    run_command(COMMANDS.load("view"), [str(recorded), str(replayed)], prog="demorec view")
