@@ -32,8 +32,8 @@ from demorec.episode.validity import read_episode_info
 from demorec.loop import PreparedEpisode, ScriptAgent, Session, make_world, prepare
 from demorec.mcap import EpisodeWriter
 from demorec.robots.assets import allow_models, asset_path
+from demorec.robots.model_check import spec_problems
 from demorec.robots.robot import ParallelGripper, RobotSpec
-from demorec.robots.spec_check import spec_problems
 from demorec.robots.urdf import Urdf, read_dynamics
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down, symmetric_yaws

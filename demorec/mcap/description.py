@@ -19,8 +19,7 @@ from demorec.core.errors import SceneError, describe_error
 from demorec.core.geometry import Array, Pose
 from demorec.episode.scene import Body, Rgba
 from demorec.robots.assets import asset_path, mesh_path, surface_file
-from demorec.robots.collada import read_collada
-from demorec.robots.obj import read_obj
+from demorec.robots.shape_files import read_collada, read_obj
 from demorec.robots.urdf import UrdfShape, parse_xml, read_links
 
 _MIN_SIDE_M = 1e-4

@@ -21,7 +21,7 @@ from demorec.episode.words import COLOR_WORDS
 from demorec.objects.antipodal import standing_rotation
 from demorec.objects.shelf import Kind, Shelf
 from demorec.robots.assets import data_folder
-from demorec.robots.obj import read_obj
+from demorec.robots.shape_files import read_obj
 
 SUFFIXES = (".obj", ".stl", ".glb")
 MAX_BYTES = 50_000_000

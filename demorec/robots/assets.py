@@ -210,6 +210,28 @@ def _ros_packages(name: str) -> Iterator[Path]:
         yield Path(entry) / "share" / name
 
 
+def remember_model(description: str, urdf: Path) -> None:
+    """Store the file that a recorded description comes from in the cache, to draw the robot with its meshes here.
+
+    A recording has no paths; an unwritable cache only loses the meshes.
+    """
+    text = str(urdf.resolve())
+    with contextlib.suppress(OSError, UnicodeError):
+        write_whole(_remembered(description), lambda temporary: temporary.write_text(text))
+
+
+def known_model(description: str) -> Path | None:
+    """Return the file that a recorded description comes from; None if unknown or deleted."""
+    with contextlib.suppress(OSError, ValueError):
+        path = Path(_remembered(description).read_text())
+        return path if path.is_file() else None
+    return None
+
+
+def _remembered(description: str) -> Path:
+    return cache_folder("robots") / hashlib.sha256(description.encode()).hexdigest()[:32]
+
+
 def _top_folder(module: str) -> Path:
     """Find the folder of the outermost package that contains a module, or that of its file."""
     root = import_root(module)

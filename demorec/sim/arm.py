@@ -11,8 +11,8 @@ from demorec.episode.episode import Action
 from demorec.episode.scene import POSITION_GAIN, RobotPlacement
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
+from demorec.robots.model_check import checked_urdf
 from demorec.robots.robot import RobotSpec
-from demorec.robots.spec_check import checked_urdf
 from demorec.robots.urdf import JointDynamics, read_dynamics
 from demorec.sim import lossy_motors
 from demorec.sim.bodies import load_urdf
@@ -184,7 +184,7 @@ class Arm:
 
 
 def arm_kinematics(spec: RobotSpec, *, scale: float = 1.0) -> ArmKinematics:
-    """Build a robot's kinematics from its URDF; raises as `demorec.robots.spec_check.checked_urdf`."""
+    """Build a robot's kinematics from its URDF; raises as `demorec.robots.model_check.checked_urdf`."""
     return ArmKinematics(
         checked_urdf(spec, scale=scale),
         arm_joints=spec.arm_joints,

@@ -20,7 +20,7 @@ from demorec.episode.mesh import decode_mesh
 from demorec.episode.scene import Body, Texture
 from demorec.render import Visual, VisualBody, VisualKind
 from demorec.robots.assets import asset_path, collision_file, mesh_path, surface_file
-from demorec.robots.inertials import check_masses, for_simulator
+from demorec.robots.model_check import check_masses, for_simulator
 from demorec.robots.urdf import mesh_elements, parse_xml, read_links
 from demorec.sim.client import silence
 

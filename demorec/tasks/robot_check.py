@@ -11,9 +11,8 @@ import numpy as np
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Array
 from demorec.episode.scene import Physics, RobotPlacement
-from demorec.robots.inertials import check_masses
+from demorec.robots.model_check import check_masses, checked_urdf
 from demorec.robots.robot import ParallelGripper, RobotSpec
-from demorec.robots.spec_check import checked_urdf
 from demorec.sim.arm import Arm, arm_kinematics
 from demorec.sim.client import connect
 from demorec.tasks.grasping import hand_down, symmetric_yaws

@@ -20,8 +20,7 @@ from demorec.core.geometry import Array
 from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
 from demorec.mcap.transforms import MovingJoints
 from demorec.render.procedural import texture_pixels
-from demorec.robots.assets import asset_path, surface_file
-from demorec.robots.known_models import known_model
+from demorec.robots.assets import asset_path, known_model, surface_file
 from demorec.robots.urdf import MAX_BYTES, Urdf
 from demorec.view.episode import Playback
 from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, skeleton_meshes, sphere_mesh, urdf_meshes

@@ -26,7 +26,7 @@ from demorec.core.files import cache_folder, write_whole
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Rgba
 from demorec.robots.assets import mesh_path
-from demorec.robots.collada import read_collada
+from demorec.robots.shape_files import read_collada
 from demorec.robots.urdf import Urdf, UrdfShape, read_links
 
 MAX_TRIANGLES = 2500

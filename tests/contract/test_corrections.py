@@ -24,8 +24,7 @@ from demorec.extensions.policies import TakeOver, rollouts
 from demorec.extensions.policies.evaluation import Evaluation, Settings
 from demorec.extensions.policies.gym_env import DemorecEnv, Situation
 from demorec.extensions.policies.rollouts import make_rollout
-from demorec.extensions.policies.turns import Turns, read_takeover
-from demorec.extensions.policies.watch import Watch
+from demorec.extensions.policies.turns import Turns, Watch, read_takeover
 from demorec.extensions.remake.demonstration import ReplayOptions, open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.generate.options import RunOptions
@@ -186,7 +185,6 @@ def situations(speed: float) -> list[Situation]:
         (TakeOver(stuck_seconds=1.0), 0.0, (FPS - 1, "the policy is stuck")),
         (TakeOver(stuck_seconds=1.0), 0.02, (300, "the policy has had its time")),  # m/s: 2 cm a second is not rest
         (TakeOver(stuck_seconds=0.0), 0.0, (300, "the policy has had its time")),
-        (TakeOver(stuck_seconds=0.0, after_seconds=4.0), 0.0, (120, "the policy has had its time")),
     ],
 )
 def test_the_moment_of_a_takeover(takeover: TakeOver, speed: float, expected: tuple[int, str]) -> None:
@@ -244,7 +242,7 @@ def test_a_policy_that_acts_like_the_expert_is_left_alone(expert_poses: Array) -
 @pytest.mark.parametrize("hand_back", [False, True])
 def test_a_deviating_policy_is_corrected(expert_poses: Array, hand_back: bool) -> None:
     """It leaves the expert's path at frame 20 by 1 cm a frame: beyond 5 cm from frame 26, for 6 frames at frame 31."""
-    rules = TakeOver(stray_metres=0.05, stray_seconds=0.2, hand_back=hand_back)
+    rules = TakeOver(stray_metres=0.05, hand_back=hand_back)
     turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=20, drift=0.01), rules)
     assert turns.success
     phases = [frame.phase for frame in frames]

@@ -17,7 +17,7 @@ from demorec.core.errors import SceneError
 from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action
 from demorec.robots.assets import asset_path, mesh_path
-from demorec.robots.inertials import for_simulator
+from demorec.robots.model_check import for_simulator
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import arm_kinematics
 from demorec.sim.world import World

@@ -1,14 +1,13 @@
-"""Intervals and tests against SciPy's, cells against manual counts."""
+"""Intervals and tests against SciPy's."""
 
 from __future__ import annotations
 
-import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import binomtest
 
-from demorec.extensions.policies.statistics import Rate, cells, compare, sign_test
+from demorec.extensions.policies.statistics import Rate, compare, sign_test
 
 
 @given(st.integers(1, 2000).flatmap(lambda n: st.tuples(st.integers(0, n), st.just(n))))
@@ -31,12 +30,3 @@ def test_newcombes_interval_of_a_difference() -> None:
     comparison = compare(first, second)
     assert comparison.difference == pytest.approx(0.2)
     assert comparison.interval == pytest.approx((0.0524, 0.3339), abs=5e-5)
-
-
-def test_cells_cut_each_range_in_equal_parts() -> None:
-    factors = [{"x": float(x), "same": 1.0} for x in range(10)]
-    found = cells(factors, [x >= 6 for x in range(10)], parts=3)
-    assert [c.factor for c in found] == ["x"] * 3
-    assert [(c.low, c.high) for c in found] == [(0.0, 3.0), (3.0, 6.0), (6.0, 9.0)]
-    assert [(c.rate.successes, c.rate.trials) for c in found] == [(0, 3), (0, 3), (4, 4)]
-    assert np.sum([c.rate.trials for c in found]) == 10

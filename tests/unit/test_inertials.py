@@ -8,7 +8,7 @@ import pytest
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
-from demorec.robots.inertials import check_masses, require_masses
+from demorec.robots.model_check import check_masses, require_masses
 from demorec.sim.bodies import load_urdf
 from demorec.sim.client import connect
 
@@ -97,7 +97,7 @@ def test_a_frame_weighs_nothing_and_the_engine_prints_nothing(
 ) -> None:
     """A static test: the motor holds the arm of 2 kg, half a metre out, and not the frame a metre out."""
     file = tmp_path / "arm.urdf"
-    monkeypatch.setattr("demorec.robots.inertials.asset_path", lambda name: file)
+    monkeypatch.setattr("demorec.robots.model_check.asset_path", lambda name: file)
     monkeypatch.setattr("demorec.sim.bodies.asset_path", lambda name: file)
     file.write_text(arm())
     client = connect()

@@ -11,7 +11,7 @@ import trimesh
 
 from demorec.core.errors import SceneError
 from demorec.mcap.description import self_contained
-from demorec.robots.obj import read_obj
+from demorec.robots.shape_files import read_obj
 
 SQUARE = "v 0 0 0\nv 2 0 0\nv 2 3 0\nv 0 3 0\n"
 

@@ -17,7 +17,7 @@ from demorec.episode.features import STATE
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Origin, SourceFile
 from demorec.extensions.imports.fields import FieldError
 from demorec.extensions.imports.mapping import SourceMapping
-from demorec.robots.known_models import remember_model
+from demorec.robots.assets import remember_model
 from demorec.robots.urdf import Urdf
 
 

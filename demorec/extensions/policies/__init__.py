@@ -13,18 +13,12 @@ class TakeOver:
 
     stuck_seconds: float = 2.0
     """Take over once the hand has kept still this long; 0: never."""
-    after_seconds: float = 0.0
-    """Take over once the policy has acted this long without success; 0: only at the time limit."""
-    random_share: float = 0.0
-    """Share of the episodes in which the expert takes over at a random moment, regardless of the policy."""
     stray_metres: float = 0.05
     """Take over once the TCP that the policy commands is this far from the expert's path in the same scene, or an
     object this far from its place under the expert; 0: never.
     """
     stray_radians: float = 0.5
     """Take over once the hand's direction differs this much from the expert's; 0: never."""
-    stray_seconds: float = 0.2
-    """How long the TCP must stay that far off."""
     noise: bool = True
     """Add the exploration noise of demonstrations to the expert's commands; labels stay clean."""
     hand_back: bool = False
@@ -35,8 +29,5 @@ class TakeOver:
     def validate(self) -> None:
         """Raise OptionError for impossible values."""
         check_option("stuck_seconds", self.stuck_seconds, 0.0, 600.0, "s")
-        check_option("after_seconds", self.after_seconds, 0.0, 3600.0, "s")
-        check_option("random_share", self.random_share, 0.0, 1.0)
         check_option("stray_metres", self.stray_metres, 0.0, 2.0, "m")
         check_option("stray_radians", self.stray_radians, 0.0, 3.2, "rad")
-        check_option("stray_seconds", self.stray_seconds, 0.0, 60.0, "s")

@@ -42,9 +42,6 @@ class RolloutFlags:
             "preset",
             "jpeg_quality",
             "stray_radians",
-            "stray_seconds",
-            "random_share",
-            "after_seconds",
             "objects",
         }
     )
@@ -184,8 +181,6 @@ class Evaluate(RolloutFlags):
 
 
 def _evaluation_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
-    from demorec.extensions.policies.statistics import cells
-
     settings = evaluation.settings
     yield f"policy        {settings.policy_type} {settings.policy_digest}, action {settings.action}"
     yield f"scenes        {settings.config.task}, split {settings.config.split}, seed {settings.config.seed}"
@@ -194,10 +189,7 @@ def _evaluation_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
     if lengths:
         yield f"median length {lengths[len(lengths) // 2] / settings.config.fps:.1f} s of the successes"
     yield from _counts("failures", (f"{r.phase}: {r.reason}" for r in evaluation.rollouts if not r.success))
-    yield from ("", f"{'by cell':<20} {'range':<20} success (Wilson 95 %)")
-    for cell in cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]):
-        yield f"{cell.factor:<20} {f'{cell.low:.3f} .. {cell.high:.3f}':<20} {cell.rate}"
-    yield from ("", f"recordings    {out / 'episodes'}, {out / 'failed'}")
+    yield f"recordings    {out / 'episodes'}, {out / 'failed'}"
 
 
 def _counts(title: str, reasons: Iterable[str]) -> Iterator[str]:
@@ -207,12 +199,10 @@ def _counts(title: str, reasons: Iterable[str]) -> Iterator[str]:
 
 def _plain(evaluation: Evaluation) -> dict[str, Any]:
     from demorec.core.plain import to_plain
-    from demorec.extensions.policies.statistics import cells
 
     plain: dict[str, Any] = to_plain(evaluation)
     plain["success_rate"] = evaluation.rate.value
     plain["interval"] = list(evaluation.rate.interval)
-    plain["cells"] = to_plain(cells(evaluation.factors, [bool(r.success) for r in evaluation.rollouts]))
     return plain
 
 
@@ -231,8 +221,8 @@ def _compared(comparison: RateComparison, first: Path, second: Path) -> list[str
 class Correct(RolloutFlags):
     """Let a policy act until it strays, then let the scripted expert finish: demonstrations that the policy lacks.
 
-    The expert takes over when the policy strays from the expert's trajectory, gets stuck or runs out of time, or at a
-    random moment. It stops the arm, brings a held object to its goal or releases it, and finishes the task or hands
+    The expert takes over when the policy strays from the expert's trajectory, gets stuck or runs out of time. It
+    stops the arm, brings a held object to its goal or releases it, and finishes the task or hands
     back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
     replayed like any other. Run the same command again to continue where it stopped.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, nullcontext, suppress
@@ -11,7 +10,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, describe_error, resource_error, write_error
 from demorec.core.files import LOCK_NAME, make_folder, read_json_object, replace_text, run_lock
 from demorec.core.own_versions import differences
@@ -27,9 +26,8 @@ from demorec.core.replacing import (
 )
 from demorec.episode.features import ActionKind, StateKind
 from demorec.extensions.policies import TakeOver
-from demorec.extensions.policies.statistics import Rate, factors_of
+from demorec.extensions.policies.statistics import Rate
 from demorec.generate.contents import foreign_recordings
-from demorec.loop import prepare
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 
@@ -75,14 +73,11 @@ class Evaluation:
     Attributes:
         settings: Settings that decide the result.
         rollouts: One line per rollout, in episode order.
-        factors: Randomised values of each rollout's scene.
-        versions: package -> version, of the packages that decide scenes, rollouts and the policy's actions; empty in
-        evaluations by older versions of demorec.
+        versions: package -> version, of the packages that decide scenes, rollouts and the policy's actions.
     """
 
     settings: Settings
     rollouts: tuple[Attempt, ...] = ()
-    factors: tuple[Mapping[str, float], ...] = field(default=())
     versions: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -137,9 +132,8 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
     evaluation = Evaluation(settings=settings, versions=versions)
     if (out / EVALUATION_NAME).is_file():
         evaluation = load_evaluation(out)
-        here_versions = versions if evaluation.versions else {}
         there, here = _deciding(evaluation.settings), _deciding(settings)
-        if lines := differences(there, evaluation.versions, here, here_versions):
+        if lines := differences(there, evaluation.versions, here, versions):
             advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
             raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]
@@ -177,19 +171,8 @@ def _versions(config: GenerateConfig) -> dict[str, str]:
 
 
 def with_rollouts(evaluation: Evaluation, rollouts: list[Attempt]) -> Evaluation:
-    """Return the evaluation with these rollouts, in order, and the factors of their scenes."""
-    ordered = sorted(rollouts, key=lambda r: r.episode_index)
-    return replace(
-        evaluation,
-        rollouts=tuple(ordered),
-        factors=tuple(_factors(evaluation.settings.config, r.episode_index, r.attempt) for r in ordered),
-    )
-
-
-@functools.lru_cache(maxsize=100_000)
-def _factors(config: GenerateConfig, episode_index: int, attempt: int) -> dict[str, float]:
-    plan = EpisodePlan(config=config, episode_index=episode_index, attempt=attempt)
-    return factors_of(prepare(plan).info.simulated.scene)
+    """Return the evaluation with these rollouts, in order."""
+    return replace(evaluation, rollouts=tuple(sorted(rollouts, key=lambda r: r.episode_index)))
 
 
 def save_evaluation(evaluation: Evaluation, folder: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import hashlib
+import importlib
 import io
 import logging
 import reprlib
@@ -143,9 +144,9 @@ class Policy:
         torch.set_num_threads(1)
         self._torch, self._preprocess = torch, preprocess_observation
         kind = str(policy_config(checkpoint).get("type", ""))
-        not_imported = _register_plugins()
+        _register_plugins()
         if kind not in PreTrainedConfig.get_known_choices():
-            raise _missing_plugin(kind, not_imported)
+            raise _missing_plugin(kind)
         try:
             config = PreTrainedConfig.from_pretrained(checkpoint)
             config.device = "cpu"
@@ -182,42 +183,27 @@ class Policy:
         return np.asarray(action.to("cpu").numpy()[0], dtype=np.float32)
 
 
-class _PluginErrors(logging.Filter):
-    """Logging filter that collects LeRobot's errors, with tracebacks, about plug-ins that it cannot import."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.errors: list[BaseException] = []
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Suppress a record with an error."""
-        error = record.exc_info[1] if record.exc_info else None
-        if error is not None:
-            self.errors.append(error)
-        return error is None
-
-
-def _register_plugins() -> list[BaseException]:
-    """Let LeRobot import all installed plug-ins; returns the errors of those that cannot be imported."""
+def _register_plugins() -> None:
+    """Let LeRobot import all installed plug-ins; it logs a traceback for each that cannot be imported."""
     from lerobot.utils.import_utils import register_third_party_plugins
 
-    collected = _PluginErrors()
-    root = logging.getLogger()
-    root.addFilter(collected)
+    level = logging.root.manager.disable
+    logging.disable()
     try:
         register_third_party_plugins()
     finally:
-        root.removeFilter(collected)
-    return collected.errors
+        logging.disable(level)
 
 
-def _missing_plugin(kind: str, not_imported: Iterable[BaseException]) -> MissingDependencyError:
+def _missing_plugin(kind: str) -> MissingDependencyError:
     """Error for a policy type that no imported package registers."""
-    feature = f"A policy of type {reprlib.repr(kind)}"
-    for error in not_imported:
-        if isinstance(error, ImportError) and error.name:
+    feature, name = f"A policy of type {reprlib.repr(kind)}", f"lerobot_policy_{reprlib.repr(kind)[1:-1]}"
+    try:
+        if name.isidentifier():
+            importlib.import_module(name)
+    except ImportError as error:
+        if error.name and error.name != name:  # the plug-in is there, a package that it needs is not
             return MissingDependencyError(feature, error.name, f"pip install {error.name}")
-    name = f"lerobot_policy_{reprlib.repr(kind)[1:-1]}"
     return MissingDependencyError(feature, name, "docs/install.md lists demorec's plug-ins")
 
 

@@ -49,8 +49,7 @@ from demorec.extensions.policies.policy import (
     policy_inputs,
     trained_action,
 )
-from demorec.extensions.policies.turns import Turns
-from demorec.extensions.policies.watch import correcting_behaviour
+from demorec.extensions.policies.turns import Turns, correcting_behaviour
 from demorec.generate.executor import Raised
 from demorec.generate.local import LocalExecutor
 from demorec.loop import make_world

@@ -1,12 +1,10 @@
-"""Uncertainty of a success rate: intervals, comparisons and cells of the randomised ranges."""
+"""Uncertainty of a success rate: intervals and comparisons."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
-
-from demorec.episode.scene import Scene
 
 Z95 = 1.959963984540054
 """Two-sided 95 % quantile of the normal distribution."""
@@ -93,48 +91,3 @@ def sign_test(k: int, m: int) -> float:
     n = k + m
     tail = float(sum(math.comb(n, i) for i in range(min(k, m) + 1)) / 2**n)
     return min(1.0, 2.0 * tail)
-
-
-@dataclass(frozen=True, kw_only=True)
-class Cell:
-    """Successes in one part of a randomised range, `low` included."""
-
-    factor: str
-    low: float
-    high: float
-    rate: Rate
-
-
-def cells(factors: Sequence[Mapping[str, float]], successes: Sequence[bool], *, parts: int = 3) -> tuple[Cell, ...]:
-    """Success by factor, with each range cut into `parts` equal parts; constant factors are left out."""
-    found = []
-    for name in dict.fromkeys(name for row in factors for name in row):
-        values = [(row[name], success) for row, success in zip(factors, successes, strict=True) if name in row]
-        low, high = min(v for v, _ in values), max(v for v, _ in values)
-        if high - low < 1e-9:
-            continue
-        edges = [low + (high - low) * i / parts for i in range(parts + 1)]
-        for i in range(parts):
-            last = i == parts - 1
-            inside = [s for v, s in values if edges[i] <= v and (last or v < edges[i + 1])]
-            rate = Rate(successes=sum(inside), trials=len(inside))
-            found.append(Cell(factor=name, low=edges[i], high=edges[i + 1], rate=rate))
-    return tuple(found)
-
-
-def factors_of(scene: Scene) -> dict[str, float]:
-    """Randomised values of a scene as numbers: positions, sizes, yaws and physics of the objects to be moved."""
-    values: dict[str, float] = {}
-    for number, goal in enumerate(scene.goals):
-        prefix = "" if len(scene.goals) == 1 else f"{number}."
-        body = scene.body(goal.object)
-        place = body.world_from_body
-        values[f"{prefix}object.x"], values[f"{prefix}object.y"] = (float(v) for v in place.position[:2])
-        values[f"{prefix}object.radius"] = math.hypot(*place.position[:2].tolist())
-        values[f"{prefix}object.size"] = max(body.shape.extents)
-        values[f"{prefix}object.mass"] = body.mass
-        values[f"{prefix}object.friction"] = body.lateral_friction
-        wanted = scene.world_from_goal(goal).position
-        values[f"{prefix}goal.x"], values[f"{prefix}goal.y"] = (float(v) for v in wanted[:2])
-        values[f"{prefix}distance"] = math.dist(place.position[:2], wanted[:2])
-    return values

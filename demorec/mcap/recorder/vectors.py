@@ -20,7 +20,7 @@ from demorec.core.registry import nearest_match
 from demorec.episode.features import ACTION, STATE
 from demorec.episode.info import Feature
 from demorec.mcap.description import robot_description, self_contained
-from demorec.robots.known_models import remember_model
+from demorec.robots.assets import remember_model
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import MAX_BYTES, Urdf, parse_xml
 

@@ -9,8 +9,7 @@ import numpy as np
 
 from demorec.core.errors import RenderError, describe_error
 from demorec.render.raster.mesh import Floats, RasterMesh, make_mesh
-from demorec.robots.collada import read_collada
-from demorec.robots.obj import ObjMaterial, read_obj
+from demorec.robots.shape_files import ObjMaterial, read_collada, read_obj
 
 FORMATS = (".obj", ".stl", ".dae")
 
