@@ -67,9 +67,9 @@ class View:
     save: OptionalTarget = None
     """Write an .rrd file (layout included) instead of opening a window; several episodes: NAME-0000.rrd and so on."""
     screenshot: OptionalTarget = None
-    """Write a screenshot (.png) of the viewer instead of opening a window."""
+    """Write a screenshot (.png) of the viewer with the first episode instead of opening a window."""
     at: float | None = None
-    """Time of the screenshot in the episode, in seconds (auto: the middle of the first episode)."""
+    """Time of the screenshot in the episode, in seconds (auto: its middle)."""
     size: tuple[int, int] = (1600, 950)
     """Width and height of the screenshot in pixels."""
     web: bool = False
@@ -116,7 +116,8 @@ class View:
             if self.screenshot is None:
                 return 0
         with self._image() as image, tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
-            return self._show(save_each(sources, Path(folder)), sources, image)
+            shown = sources if image is None else sources[:1]
+            return self._show(save_each(shown, Path(folder)), sources, image)
 
     def _save(self, sources: Sequence[PlaybackSource], targets: Sequence[Path]) -> None:
         """Write all .rrd files; none appears before all are complete."""
@@ -193,7 +194,7 @@ class View:
             from demorec.view.viewer import screenshot
 
             width, height = self.size
-            screenshot(files, image, seconds=self._second(sources), width=width, height=height)
+            screenshot(files[0], image, seconds=self._second(sources), width=width, height=height)
             return 0
         if self.web:
             from demorec.view.viewer import serve_web

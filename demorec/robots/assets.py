@@ -81,8 +81,7 @@ def asset_path(name: str) -> Path:
 def surface_file(shape: Shape) -> Path:
     """Return the file that a mesh is drawn from: its own, or a cached copy of the recorded mesh.
 
-    Raises:
-        SceneError: The file does not exist, or the recorded mesh is broken; others as `asset_path`.
+    Raises as `asset_path`, and SceneError for a broken recorded mesh.
     """
     return _written_mesh(shape.mesh)[0] if shape.mesh else asset_path(shape.file)
 
@@ -114,12 +113,8 @@ def modules_of_models(names: Iterable[str]) -> tuple[str, ...]:
 def model_name(file: str | Path, module: str) -> str:
     """Build the recorded name of a model given by a user's module.
 
-    Args:
-        file: Absolute, relative to the module's file, below pybullet_data, or "demorec:NAME".
-        module: The user's module.
-
-    Raises:
-        ConfigError: An absolute path that is neither next to the module (or in its package) nor in pybullet_data.
+    The file is absolute, relative to the module's file, below pybullet_data, or "demorec:NAME". Raises ConfigError for
+    an absolute path that is neither next to the module (or in its package) nor in pybullet_data.
     """
     name = str(file)
     if ":" in name:
@@ -172,7 +167,10 @@ def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...])
         yield data_folder() / relative
         folders = [folder]
     else:
-        folders = [Path.cwd(), *_allowed_folders()]
+        folders = [Path.cwd()]
+        for module in sorted(_modules_with_models):
+            with contextlib.suppress(ConfigError):  # a module that does not exist here has no meshes
+                folders.append(module_file(module).parent)
         if not Path(relative).is_absolute() and ".." not in Path(relative).parts:
             yield from (place / relative for place in (*folders, data_folder()))
     if not parts or ".." in parts:
@@ -182,13 +180,6 @@ def _mesh_candidates(folder: Path | None, relative: str, parts: tuple[str, ...])
             yield above.joinpath(*parts)
             yield above.joinpath(*parts[1:])  # a repository named differently from its package
     yield from (package.joinpath(*parts[1:]) for package in _ros_packages(parts[0]))
-
-
-def _allowed_folders() -> Iterator[Path]:
-    """Yield the folders of the allowed modules; one that does not exist here has no meshes."""
-    for module in sorted(_modules_with_models):
-        with contextlib.suppress(ConfigError):
-            yield module_file(module).parent
 
 
 def _package_path(scheme: str, path: str) -> tuple[str, ...]:

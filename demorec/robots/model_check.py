@@ -26,11 +26,7 @@ _LINKAGES = 'docs/robots.md, "Grippers with linkages", describes the remedy'
 
 
 def checked_urdf(spec: RobotSpec, *, scale: float = 1.0) -> Urdf:
-    """Read a robot's URDF, and check that the spec fits it.
-
-    Args:
-        spec: The robot, with its gripper's lengths already scaled.
-        scale: Uniform scale of the URDF.
+    """Read a robot's URDF, scaled uniformly, and check that the spec, with lengths scaled already, fits it.
 
     Raises:
         SceneError: The URDF does not exist, cannot be read, or describes a robot that cannot be simulated; the message
@@ -216,15 +212,9 @@ def for_simulator(text: str) -> str:
 
 
 def _mass(link: ET.Element, *, must_be_whole: bool, may_be_point: bool) -> float:
-    """Return the mass of one link, kg.
+    """Return the mass of one link, kg; ValueError if no body can have its mass and inertia.
 
-    Args:
-        link: Link of the URDF.
-        must_be_whole: Whether its mass and inertia matter, so that a shape needs them.
-        may_be_point: Whether it may have mass without inertia, because it is fixed to a body that has both.
-
-    Raises:
-        ValueError: No body can have this mass and inertia.
+    A shape needs both if it `must_be_whole`; a link that `may_be_point` is fixed to a body that has both.
     """
     inertial = link.find("inertial")
     if inertial is None:

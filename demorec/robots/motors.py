@@ -30,13 +30,9 @@ _MAX_BYTES = 1 << 16
 
 @dataclass(frozen=True, kw_only=True)
 class MotorCalibration:
-    """Calibration of a servo by `lerobot-calibrate`: its entry in the file that LeRobot saves.
+    """A servo's entry in the file that `lerobot-calibrate` saves.
 
-    Attributes:
-        id: ID on the bus.
-        drive_mode: 1 if ratios of the range run against the encoder, else 0.
-        homing_offset: Offset that the servo subtracts from its counts.
-        range_min, range_max: Calibrated range, counts.
+    `drive_mode` is 1 if ratios of the range run against the encoder, else 0; the range is in counts.
     """
 
     id: int

@@ -139,7 +139,7 @@ class JawGripper:
         return self.opening[-1][1]
 
     def joint_position(self, width: Array | float) -> Array:
-        """Compute positions (..., 1), rad, at openings (...), metres."""
+        """See `ParallelGripper`, in rad."""
         position, opening = np.array(self.opening).T
         return np.asarray(np.interp(width, opening, position)[..., np.newaxis])
 
@@ -148,12 +148,12 @@ class JawGripper:
         return float(abs(self.joint_position(self.open_width)[0] - self.opening[0][0])) / self.joint_speed
 
     def width(self, joint_position: Array) -> Array:
-        """Compute openings (...), metres, at positions (..., 1), rad."""
-        position, opening = self._rising()
+        """See `ParallelGripper`."""
+        position, opening = np.array(sorted(self.opening)).T
         return np.asarray(np.interp(joint_position[..., 0], position, opening))
 
     def width_velocity(self, joint_position: Array, joint_velocity: Array) -> Array:
-        """Compute speeds (...), m/s, of the opening from positions and velocities (..., 1), rad and rad/s."""
+        """See `ParallelGripper`."""
         return np.asarray(self._slope(joint_position[..., 0]) * joint_velocity[..., 0])
 
     def contact_force(self, width: Array) -> Array:
@@ -176,14 +176,9 @@ class JawGripper:
             play=self.play * scale,
         )
 
-    def _rising(self) -> tuple[Array, Array]:
-        """Positions in increasing order, and the openings there."""
-        position, opening = np.array(sorted(self.opening)).T
-        return position, opening
-
     def _slope(self, position: Array) -> Array:
         """Compute d opening / d position, m/rad; beyond the rows that of the nearest two."""
-        at, opening = self._rising()
+        at, opening = np.array(sorted(self.opening)).T
         piece = np.clip(np.searchsorted(at, position, side="right") - 1, 0, len(at) - 2)
         return np.asarray((np.diff(opening) / np.diff(at))[piece])
 

@@ -99,7 +99,7 @@ class Urdf:
 
     @classmethod
     def load(cls, path: Path, *, scale: float = 1.0) -> Urdf:
-        """Read the joints of a URDF file; ValueError if they are not a tree with one root link."""
+        """Parse a file, as `parse`."""
         return cls.parse(path.read_text(), scale=scale)
 
     @classmethod
@@ -250,12 +250,7 @@ class UrdfShape:
 
 @dataclass(frozen=True, kw_only=True)
 class UrdfLink:
-    """One link.
-
-    Attributes:
-        name: Unique in the URDF.
-        visuals, collisions: Its shapes, in the order of the file, without unknown geometries.
-    """
+    """One link, and its shapes in the order of the file, without unknown geometries."""
 
     name: str
     visuals: tuple[UrdfShape, ...]
@@ -263,11 +258,7 @@ class UrdfLink:
 
 
 def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
-    """Read the links of a URDF, in the order of the file.
-
-    Args:
-        text: The URDF.
-        scale: Uniform scale.
+    """Read the links of a URDF, in the order of the file, scaled uniformly.
 
     Raises:
         ValueError: The text is not acceptable XML (`parse_xml`), or a shape lacks a size or has one that is not finite.
@@ -276,13 +267,17 @@ def read_links(text: str, *, scale: float = 1.0) -> tuple[UrdfLink, ...]:
     colors = {
         name: rgba for element in robot.iter("material") if (name := element.get("name")) and (rgba := _rgba(element))
     }
+
+    def shapes(link: ET.Element, tag: str) -> tuple[UrdfShape, ...]:
+        return tuple(
+            _shape(element, geometry, scale, colors)
+            for element in link.findall(tag)
+            if (geometry := element.find("geometry/*")) is not None and geometry.tag in get_args(UrdfShapeKind)
+        )
+
     try:
         return tuple(
-            UrdfLink(
-                name=link.attrib["name"],
-                visuals=_shapes(link, "visual", scale, colors),
-                collisions=_shapes(link, "collision", scale, colors),
-            )
+            UrdfLink(name=link.attrib["name"], visuals=shapes(link, "visual"), collisions=shapes(link, "collision"))
             for link in robot.findall("link")
         )
     except KeyError as error:
@@ -301,14 +296,6 @@ def mesh_elements(robot: ET.Element) -> list[ET.Element]:
     """List the <mesh> elements of the shapes of all links."""
     shapes = [*robot.iterfind("link/visual"), *robot.iterfind("link/collision")]
     return [mesh for shape in shapes for mesh in shape.iterfind("geometry/mesh") if mesh.get("filename")]
-
-
-def _shapes(link: ET.Element, tag: str, scale: float, colors: dict[str, Rgba]) -> tuple[UrdfShape, ...]:
-    return tuple(
-        _shape(element, geometry, scale, colors)
-        for element in link.findall(tag)
-        if (geometry := element.find("geometry/*")) is not None and geometry.tag in get_args(UrdfShapeKind)
-    )
 
 
 def _shape(element: ET.Element, geometry: ET.Element, scale: float, colors: dict[str, Rgba]) -> UrdfShape:
@@ -333,9 +320,8 @@ def _shape(element: ET.Element, geometry: ET.Element, scale: float, colors: dict
     )
 
 
-def _origin(element: ET.Element | None, scale: float) -> Pose:
-    """Read the <origin> of an element; the identity if it is missing."""
-    origin = None if element is None else element.find("origin")
+def _origin(element: ET.Element, scale: float) -> Pose:
+    origin = element.find("origin")
     if origin is None:
         return Pose()
     return Pose(

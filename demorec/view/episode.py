@@ -28,13 +28,7 @@ Statements = tuple[tuple[int, str, str], ...]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Curves:
-    """Several numbers over time: one row per timestamp, one column per name.
-
-    Attributes:
-        time_ns: (T,) since the episode's start.
-        values: (T, n) values.
-        names: n names.
-    """
+    """Several numbers over time: (T,) ns since the episode's start, (T, n) values, n names."""
 
     time_ns: NDArray[np.int64]
     values: Array
@@ -171,15 +165,10 @@ def feature_curves(episode: Episode, roles: Roles) -> dict[str, Curves]:
 
 
 def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool = True) -> dict[str, Curves]:
-    """Compute the curves of a simulated episode.
+    """Compute the curves of a simulated episode; a missing observation has none.
 
     They are "position" and "velocity" of the arm's joints, "gripper" (m), "ee" (m) and those of its sensors, split by
-    unit ("wrench (N)"); "target" and "gripper target" are the commands.
-
-    Args:
-        episode: The episode; a missing observation has no curves.
-        motion: Its motion.
-        has_targets: Whether its actions are joint targets.
+    unit ("wrench (N)"); "gripper target" and, if its actions are joint targets, "target" are the commands.
     """
     info, time_ns = episode.info, times_from_start(episode)
     features = {name: values.astype(np.float64) for name, values in episode.table().features.items()}

@@ -112,25 +112,23 @@ def why_it_ended(said: str) -> DemorecError:
 
 
 class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
-    """Context manager over a viewer without a screen that shows .rrd or .mcap files in order, the first one in front.
+    """Context manager over a viewer without a screen that shows an .rrd file.
 
     Raises:
         RecordingError: The graphics driver is missing, the viewer does not start or ends unexpectedly, or it cannot
             load the file.
     """
 
-    def __init__(self, *recordings: Path, width: int = 1600, height: int = 950) -> None:
+    def __init__(self, recording: Path, *, width: int = 1600, height: int = 950) -> None:
         self._port = _free_port()
-        self._recordings = recordings
         # Not a pipe, which would fill up unread.
         self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
         self._process = _start_viewer(
             "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
-            str(recordings[0]), stdout=subprocess.DEVNULL, stderr=self._said,
+            str(recording), stdout=subprocess.DEVNULL, stderr=self._said,
         )  # fmt: skip
         try:
-            self.client = self._connect()
-            self._add(recordings[1:])
+            self.client = self._connect(recording)
         except BaseException as error:
             self.__exit__(type(error), error, error.__traceback__)
             raise
@@ -153,35 +151,23 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         self._said.close()
 
     def _reason(self) -> DemorecError:
-        """Determine why the viewer has ended, from its output."""
         self._said.seek(0)
         return why_it_ended(self._said.read())
 
-    def _connect(self) -> ViewerClient:
+    def _connect(self, recording: Path) -> ViewerClient:
         for _ in _tries(0.2):
             if self._process.poll() is not None:
                 raise self._reason()
             with suppress(OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
                 client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
-                if _loaded(client, 1):
+                state = client.get_state()
+                if not state.loading and any(loaded.timelines for loaded in state.recordings):
                     return client
-        raise _not_loaded(self._recordings[0])
-
-    def _add(self, recordings: Sequence[Path]) -> None:
-        """Load more files; the viewer lists them as they arrive, but names and reads only those it has shown."""
-        for count, recording in enumerate(recordings, start=2):
-            self.client.open(str(recording), navigate=False)
-            if not any(_loaded(self.client, count) for _ in _tries(0.1)):
-                raise _not_loaded(recording)
-        listed = self.client.get_state().recordings
-        if len(listed) > 1:
-            for shown in (*listed[1:], listed[0]):
-                self.client.set_location(shown.location)
-                self._image()
+        raise RecordingError(f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {recording}")
 
     @property
     def end(self) -> float:
-        """Return seconds of the last row of the recording in front; 0 if it lacks that timeline."""
+        """Return seconds of the last row of the recording; 0 if it lacks that timeline."""
         first = self.client.get_state().recordings[0]
         return max((line.end / 1e9 for line in first.timelines if line.name == SECONDS), default=0.0)
 
@@ -233,15 +219,6 @@ def _tries(pause: float) -> Iterator[None]:
         time.sleep(pause)
 
 
-def _loaded(client: ViewerClient, count: int) -> bool:
-    state = client.get_state()
-    return not state.loading and sum(bool(recording.timelines) for recording in state.recordings) >= count
-
-
-def _not_loaded(recording: Path) -> RecordingError:
-    return RecordingError(f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {recording}")
-
-
 def moment(seconds: float | None, end: float) -> float:
     """Choose a time of an episode that lasts until `end`, seconds; by default its middle.
 
@@ -255,15 +232,15 @@ def moment(seconds: float | None, end: float) -> float:
     return seconds
 
 
-def screenshot(recordings: Sequence[Path], target: Path, *, seconds: float | None, width: int, height: int) -> None:
-    """Save an image of the viewer with .rrd files at a time of the first of them, by default its middle.
+def screenshot(recording: Path, target: Path, *, seconds: float | None, width: int, height: int) -> None:
+    """Save an image of the viewer with an .rrd file at a time of it, by default its middle.
 
     Raises:
         ConfigError: The time is outside it.
         DemorecError: The viewer cannot work on this machine, or a view reports an error.
         OSError: The image cannot be written.
     """
-    with HeadlessViewer(*recordings, width=width, height=height) as viewer:
+    with HeadlessViewer(recording, width=width, height=height) as viewer:
         viewer.seek(moment(seconds, viewer.end))
         for view, report in viewer.reports():
             if report.severity == "error":

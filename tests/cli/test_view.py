@@ -97,17 +97,6 @@ def test_a_saved_file_is_shown(run_folder: Path, tmp_path: Path) -> None:
     assert num_colors(pixels((tmp_path / "x.png").read_bytes())) > 200
 
 
-@pytest.mark.slow
-@pytest.mark.viewer
-def test_episodes_are_listed_in_the_order_given(run_folder: Path, tmp_path: Path) -> None:
-    need_vulkan()
-    first, second = save_each(find_episodes([run_folder]), tmp_path)
-    with HeadlessViewer(second, first) as viewer:
-        state = viewer.client.get_state()
-    assert ["episode_000001" in recording.store_id for recording in state.recordings] == [True, False]
-    assert state.active_recording == state.recordings[0].store_id
-
-
 def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "wrist")) -> None:
     """Check that no view reports an error, that the 3D view shows robot, table and frusta, and that each camera shows
     its moving red square.
@@ -128,11 +117,10 @@ def _check_views(viewer: HeadlessViewer, cameras: tuple[str, ...] = ("front", "w
 def test_the_viewer_shows_a_run(run_folder: Path, tmp_path: Path) -> None:
     need_vulkan()
     files = save_each(find_episodes([run_folder]), tmp_path)
-    with HeadlessViewer(*files) as viewer:
+    with HeadlessViewer(files[0]) as viewer:
         viewer.seek(1.0)
         _check_views(viewer)
         state = viewer.client.get_state()
-        assert len(state.recordings) == 2
         assert {recording.current_time for recording in state.recordings} == {1_000_000_000}
         before = pixels(viewer.view_image("front camera"))
         viewer.seek(0.2)
@@ -154,7 +142,7 @@ def test_the_viewer_shows_the_colours_that_were_recorded(codec: Literal["av1", "
         for frame in frames:
             writer.write(replace(frame, images={"front": replace(frame.images["front"], color=image)}))
         writer.finish(outcome)
-    with HeadlessViewer(*save_each(find_episodes([tmp_path]), tmp_path)) as viewer:
+    with HeadlessViewer(save_each(find_episodes([tmp_path]), tmp_path)[0]) as viewer:
         viewer.seek(0.5)
         shown = pixels(viewer.view_image("front camera"))
     height, width = shown.shape[:2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -88,8 +88,8 @@ def with_stand_in_viewer(words: list[str]) -> None:
 
     from demorec.view import viewer
 
-    def screenshot(recordings: Sequence[Path], target: Path, *, width: int, height: int, **_: object) -> None:
-        assert all(path.is_file() for path in recordings)
+    def screenshot(recording: Path, target: Path, *, seconds: float | None, width: int, height: int) -> None:
+        assert recording.is_file()
         noise = np.random.default_rng(width).integers(0, 256, (height, width), np.uint8)
         Image.fromarray(noise).save(target, format="PNG")
 

@@ -185,7 +185,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     @property
     def world(self) -> World:
         """The simulated world, after a reset."""
-        return _after_reset(self._session, "world").world
+        return _after_reset(self._session).world
 
     @property
     def situation(self) -> Situation:
@@ -366,9 +366,9 @@ def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> 
     return spaces.Dict(found)
 
 
-def _after_reset[T](value: T | None, what: str = "episode") -> T:
+def _after_reset[T](value: T | None) -> T:
     if value is None:
-        raise RuntimeError(f"the environment has no {what} yet: call reset first")
+        raise RuntimeError("the environment has no episode yet: call reset first")
     return value
 
 

@@ -76,11 +76,8 @@ def settings_for(
 ) -> Settings:
     """Read the policy's type, actions, inputs and camera sizes from its folder.
 
-    Args:
-        policy: Folder of the policy.
-        config: The caller's choice of scenes; its cameras are the user's own that the policy may see.
-        action, action_steps, episode_length: As in `Settings`; None: as trained, or the environment's.
-        allowed: The user's own modules that may be imported if the policy names them.
+    The cameras of `config` are the user's own that the policy may see; `allowed` modules may be imported if the policy
+    names them.
 
     Raises:
         ConfigError: No policy, missing cameras, or actions of an unknown meaning.
@@ -213,7 +210,7 @@ def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:
 
 @functools.lru_cache(maxsize=1)  # a worker serves one evaluation
 def _stage(folder: Path) -> tuple[Settings, DemorecEnv, Policy, World | None]:
-    """Settings, environment, policy and the world for simulating the expert, kept between rollouts."""
+    """Load what is kept between rollouts; the world is for simulating the expert."""
     settings = load_evaluation(folder).settings
     env = DemorecEnv(
         config=settings.config,
