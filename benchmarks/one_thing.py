@@ -18,7 +18,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from demorec.tasks.anything import PickAnything
-from demorec.tasks.placing import Layout
+from demorec.tasks.base import Layout
 from demorec.tasks.sampling import Sampler
 
 

@@ -70,7 +70,10 @@ if TYPE_CHECKING:
     from demorec.robots.so101 import SO101 as SO101
     from demorec.robots.so101 import SO101_FOLLOWER as SO101_FOLLOWER
     from demorec.sim.world import World as World
+    from demorec.tasks.base import PlacingTask as PlacingTask
     from demorec.tasks.base import Task as Task
+    from demorec.tasks.base import on_table as on_table
+    from demorec.tasks.base import random_cube as random_cube
     from demorec.tasks.furniture import mark as mark
     from demorec.tasks.furniture import robot_at_origin as robot_at_origin
     from demorec.tasks.furniture import table_and_floor as table_and_floor
@@ -79,9 +82,6 @@ if TYPE_CHECKING:
     from demorec.tasks.grasping import raised as raised
     from demorec.tasks.grasping import symmetric_yaws as symmetric_yaws
     from demorec.tasks.pick import PickPlace as PickPlace
-    from demorec.tasks.placing import PlacingTask as PlacingTask
-    from demorec.tasks.placing import on_table as on_table
-    from demorec.tasks.placing import random_cube as random_cube
     from demorec.tasks.sampling import Region as Region
     from demorec.tasks.sampling import Sampler as Sampler
     from demorec.tasks.sampling import wording as wording
@@ -116,8 +116,7 @@ GROUPS: Mapping[str, Mapping[str, tuple[str, ...]]] = {
         "demorec.view.paths": ("Paths",),
     },
     "Write a task": {
-        "demorec.tasks.base": ("Task",),
-        "demorec.tasks.placing": ("PlacingTask", "random_cube", "on_table"),
+        "demorec.tasks.base": ("Task", "PlacingTask", "random_cube", "on_table"),
         "demorec.tasks.pick": ("PickPlace",),
         "demorec.episode.scene": ("Scene", "Body", "Shape", "Goal"),
         "demorec.tasks.sampling": ("Sampler", "Region", "wording"),

@@ -22,11 +22,11 @@ EXTENSION = Extension(
     },
     tasks={
         "pick_place": "demorec.tasks.pick:PickPlace",
-        "place_in_tray": "demorec.tasks.trays:PlaceInTray",
+        "place_in_tray": "demorec.tasks.pick:PlaceInTray",
         "stack": "demorec.tasks.cubes:Stack",
         "stack_three": "demorec.tasks.cubes:StackThree",
         "unstack": "demorec.tasks.cubes:Unstack",
-        "sort_by_color": "demorec.tasks.trays:SortByColor",
+        "sort_by_color": "demorec.tasks.pick:SortByColor",
         "line_up": "demorec.tasks.cubes:LineUp",
         "pick_from_clutter": "demorec.tasks.pick:PickFromClutter",
         "pick_shapes": "demorec.tasks.pick:PickShapes",
@@ -45,9 +45,9 @@ EXTENSION = Extension(
         "workspace": "demorec.render.cameras:WORKSPACE",
     },
     objects={
-        "household": "demorec.objects.household:HOUSEHOLD",
-        "blocks": "demorec.objects.blocks:BLOCKS",
-        "cubes": "demorec.objects.blocks:CUBES",
+        "household": "demorec.objects.catalog:HOUSEHOLD",
+        "blocks": "demorec.objects.catalog:BLOCKS",
+        "cubes": "demorec.objects.catalog:CUBES",
         "random": "demorec.objects.folder:RANDOM",
     },
     renderers={

@@ -37,29 +37,21 @@ from demorec.robots.robot import ParallelGripper, RobotSpec
 from demorec.robots.urdf import Urdf, read_dynamics
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down, symmetric_yaws
+from demorec.tasks.reach import Reach
 from demorec.tasks.robot_check import finger_boxes, unreachable_poses
 
 __all__ = ["RobotContract", "TaskContract"]
 
 
 class TaskContract:
-    """Layouts, instructions, success and recordings of one task with one robot, without images.
+    """Layouts, instructions, success and recordings of one task with one robot, without images."""
 
-    Attributes:
-        task: Name of a row of `demorec list tasks`, or "package.module:Name".
-        robot: Name of a row of `demorec list robots`, or "package.module:NAME".
-        seed: Root seed of all episodes.
-        num_layouts: Number of layouts to draw and examine.
-        num_episodes: Number of episodes that the expert attempts.
-        min_success: Minimum ratio of episodes that succeed at the first attempt.
-    """
-
-    task: ClassVar[str]
-    robot: ClassVar[str] = "panda"
-    seed: ClassVar[int] = 0
-    num_layouts: ClassVar[int] = 30
-    num_episodes: ClassVar[int] = 10
-    min_success: ClassVar[float] = 0.9
+    task: ClassVar[str]  # name of a row of `demorec list tasks`, or "package.module:Name"
+    robot: ClassVar[str] = "panda"  # name of a row of `demorec list robots`, or "package.module:NAME"
+    seed: ClassVar[int] = 0  # root seed of all episodes
+    num_layouts: ClassVar[int] = 30  # number of layouts to draw and examine
+    num_episodes: ClassVar[int] = 10  # number of episodes that the expert attempts
+    min_success: ClassVar[float] = 0.9  # minimum ratio of episodes that succeed at the first attempt
 
     def test_scenes_and_words_follow_from_the_plan_alone(self) -> None:
         """Check that equal plans give equal descriptions, and another episode or attempt another scene."""
@@ -94,11 +86,14 @@ class TaskContract:
     def test_objects_and_goals_are_within_reach(self) -> None:
         """Check that the hand, pointing down, reaches each object and its target at one yaw at least."""
         for index, info in enumerate(self._layouts()):
-            for goal in info.simulated.scene.goals:
-                start = info.simulated.scene.body(goal.object).world_from_body
-                for what, pose in (("start", start), ("goal", info.simulated.scene.world_from_goal(goal))):
+            scene = info.simulated.scene
+            reach = Reach(scene, info.simulated.robot)
+            for goal in scene.goals:
+                ends = {"start": scene.body(goal.object).world_from_body, "goal": scene.world_from_goal(goal)}
+                for what, pose in ends.items():
                     at = pose.position.round(3).tolist()
-                    assert _is_within_reach(info, at), f"the {what} of {goal.object} of episode {index}, {at}"
+                    is_reached = any(reach.at_all(hand_down(at, yaw)) for yaw in symmetric_yaws(0.0, 8))
+                    assert is_reached, f"the {what} of {goal.object} of episode {index}, {at}"
 
     def test_doing_nothing_is_a_failure(self) -> None:
         """Check that the success conditions do not hold at the start, so that they cannot hold by chance."""
@@ -174,15 +169,10 @@ class TaskContract:
 
 
 class RobotContract:
-    """Agreement of a robot's description with its URDF, and the arm's ability to do the tasks.
+    """Agreement of a robot's description with its URDF, and the arm's ability to do the tasks."""
 
-    Attributes:
-        robot: Name of a row of `demorec list robots`, or "package.module:NAME".
-        seed: Root seed of the test's pick_place episode.
-    """
-
-    robot: ClassVar[str]
-    seed: ClassVar[int] = 0
+    robot: ClassVar[str]  # name of a row of `demorec list robots`, or "package.module:NAME"
+    seed: ClassVar[int] = 0  # root seed of the test's pick_place episode
 
     def test_the_spec_names_what_the_urdf_has(self) -> None:
         """Check that links and joints exist, are of the right kinds, and have limits within the URDF's."""
@@ -258,16 +248,3 @@ def run_expert(task: str, robot: str, seed: int, index: int) -> tuple[tuple[Fram
         session = Session.of_episode(world, episode)
         frames = tuple(session.run(ScriptAgent(episode)))
     return frames, session.outcome
-
-
-def _is_within_reach(info: EpisodeInfo, point: list[float]) -> bool:
-    """Check whether the TCP reaches a point in the world (3,), metres, with the hand pointing down."""
-    base_from_world = info.simulated.scene.robot.world_from_base.inverse()
-    arm = arm_kinematics(info.simulated.robot, scale=info.simulated.scene.robot.scale)
-    start = np.array(info.simulated.robot.home_q)
-    ahead = base_from_world.apply(np.array(point)) - arm.origins[0]
-    start[0] = math.atan2(ahead[1], ahead[0])
-    return any(
-        arm.inverse(base_from_world @ hand_down(point, yaw), start=start, rest=start) is not None
-        for yaw in symmetric_yaws(0.0, 8)
-    )

@@ -15,7 +15,7 @@ from typing import Any
 from demorec.api import GROUPS
 from demorec.cli.list_rows import rows_of
 from demorec.core.tables import TASKS
-from demorec.episode.info import sensor_feature
+from demorec.episode.info import OBSERVATION
 from demorec.sim.sensors import SENSORS
 
 COMMANDS = """# Every name: for commands, and for Python
@@ -45,7 +45,7 @@ FOREIGN = {"Positional": "Marks a field of a command as a positional argument (t
 def page() -> str:
     """Return the page."""
     tasks = [(name, TASKS.load(name).summary, success(TASKS.load(name))) for name in TASKS.names()]
-    sensors = [(sensor_feature(sensor.quantity), sensor.meaning) for sensor in SENSORS]
+    sensors = [(OBSERVATION + sensor.quantity, sensor.meaning) for sensor in SENSORS]
     parts = [COMMANDS, table("Tasks (`--task`)", ("name", "motion", "success"), tasks)]
     parts += [table(title, ("name", "meaning"), rows_of(what)) for what, title in TITLES.items()]
     parts += [table("Sensors of simulated arms", ("feature", "meaning"), sensors), PYTHON]

@@ -6,23 +6,15 @@ Everything is derived from the recording (phases, events, poses, the scene as da
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 LanguageKind = Literal["subtask", "plan", "memory", "motion", "task_aug"]
 """`task_aug` is another wording of the task."""
 KINDS: tuple[LanguageKind, ...] = get_args(LanguageKind)
 
 
-@dataclass(frozen=True, kw_only=True)
-class Statement:
-    """One sentence, valid from a dataset row until the next one of its kind.
-
-    Attributes:
-        row: Row of the episode, from 0.
-        kind: Kind of the sentence.
-        text: The sentence.
-    """
+class Statement(NamedTuple):
+    """One sentence, valid from a row of the episode, counted from 0, until the next one of its kind."""
 
     row: int
     kind: LanguageKind
@@ -32,7 +24,5 @@ class Statement:
 BoxEntry = tuple[int, str, Mapping[str, Any]]
 """Row of a box in its episode, the kind of its object, and its other values by COCO's names.
 
-`bbox` is (x, y, width, height) of the pixels that show the object, `area` their number. `visible_fraction` is that
-number divided by the area, px, of the whole outline, including hidden parts and those beyond the image's edge; None for
-a shape with unknown outline (meshes, URDFs) or behind the camera. `color` is a word, or "".
+`bbox` is (x, y, width, height) of the pixels that show the object, `area` their number, `color` a word or "".
 """

@@ -10,14 +10,14 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property, lru_cache
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose
-from demorec.episode.scene import Goal, Scene
-from demorec.episode.words import COLOR_WORDS, nouns_of
+from demorec.core.geometry import Array
+from demorec.episode.scene import Body, Goal, Scene
+from demorec.episode.words import COLOR_WORDS, VESSELS, nouns_of
 
 MIN_GAP = 0.04
 """Minimum distance, metres, by which an object must be farther to a side, or nearer, than the next one."""
@@ -30,91 +30,55 @@ _IN_FRONT = ("left", "right", "leftmost", "rightmost", "middle", "smaller", "lar
 _BEHIND = ("nearest to the robot", "farthest from the robot")
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class NamedThing:
-    """One body of the scene.
+class NamedThing(NamedTuple):
+    """One body of the scene at one moment."""
 
-    Attributes:
-        name: Name of the body.
-        nouns: Possible nouns, the usual one first.
-        color: Word for its colour, or "".
-        size: Largest extent, metres.
-        position: (3,) centre in the robot's base frame (x forward, y left, z up), metres.
-        height: Height of its bounding box, metres.
-        can_be_held: Whether it is movable.
-    """
-
-    name: str
-    nouns: tuple[str, ...]
-    color: str
-    size: float
-    position: Array
-    height: float
-    can_be_held: bool
+    body: Body
+    nouns: tuple[str, ...]  # possible nouns, the usual one first
+    position: Array  # (3,) centre in the robot's base frame (x forward, y left, z up), metres
 
     @property
-    def noun(self) -> str:
-        """The usual noun."""
-        return self.nouns[0]
+    def words(self) -> str:
+        """Its colour and usual noun."""
+        return f"{self.body.color_name} {self.nouns[0]}".strip()
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Surroundings:
-    """All objects at one moment, except the floor and other supports."""
-
-    things: tuple[NamedThing, ...]
-
-    @cached_property
-    def nouns(self) -> frozenset[str]:
-        """All possible nouns of these objects."""
-        return frozenset(noun for thing in self.things for noun in thing.nouns)
-
-    def thing(self, name: str) -> NamedThing:
-        """The object with that name; KeyError if missing."""
-        for thing in self.things:
-            if thing.name == name:
-                return thing
-        raise KeyError(name)
+Surroundings = Mapping[str, NamedThing]
+"""All bodies at one moment, by name, except the floor and other fixtures."""
 
 
 def situation(scene: Scene, world_from_object: Mapping[str, Array] | None = None) -> Surroundings:
     """Return the objects of a scene at one moment.
 
-    Args:
-        scene: Scene at the episode's start.
-        world_from_object: Body -> (7,) pose (xyz, quaternion xyzw); bodies left out keep the scene's pose.
+    `world_from_object` has body -> (7,) pose (xyz, quaternion xyzw); bodies left out keep the scene's pose.
     """
-    moved = world_from_object or {}
+    places = {body.name: body.world_from_body.position for body in scene.bodies}
+    places |= {name: pose[:3] for name, pose in (world_from_object or {}).items()}
     base_from_world = scene.robot.world_from_base.inverse()
-    things = []
-    for body in scene.bodies:
-        if body.role == "fixture":
-            continue
-        place = moved[body.name][:3] if body.name in moved else body.world_from_body.position
-        things.append(
-            NamedThing(
-                name=body.name,
-                nouns=nouns_of(body),
-                color=body.color_name,
-                size=max(body.shape.extents),
-                position=base_from_world.apply(place),
-                height=body.shape.extents[2],
-                can_be_held=body.movable,
-            )
-        )
-    return Surroundings(things=tuple(things))
+    return {
+        body.name: NamedThing(body, nouns_of(body), base_from_world.apply(places[body.name]))
+        for body in scene.bodies
+        if body.role != "fixture"
+    }
 
 
 def place_of(scene: Scene, goal: Goal) -> str:
     """Name of the body on or in which a goal puts its object, such as a mark, or ""."""
     if goal.onto:
         return goal.onto
-    wanted: Pose = scene.world_from_goal(goal)
+    wanted = scene.world_from_goal(goal).position
     for body in scene.bodies:
-        offset = np.abs(body.world_from_body.position[:2] - wanted.position[:2])
+        offset = np.abs(body.world_from_body.position[:2] - wanted[:2])
         if body.role == "target" and bool((offset < _AT_THE_PLACE).all()):
             return body.name
     return ""
+
+
+def prepositions(scene: Scene, place: str) -> tuple[str, str]:
+    """("into", "in") for a container, ("to", "at") for a place without an object, ("onto", "on") otherwise."""
+    if not place:
+        return "to", "at"
+    return ("into", "in") if nouns_of(scene.body(place))[0] in VESSELS else ("onto", "on")
 
 
 def resolve(phrase: str, situation: Surroundings) -> frozenset[str]:
@@ -123,43 +87,48 @@ def resolve(phrase: str, situation: Surroundings) -> frozenset[str]:
     Empty if the phrase does not fit the grammar, or is ambiguous. Grammar: ARTICLE [ORDER] [COLOUR] NOUN [nearest to
     the robot | farthest from the robot], where ARTICLE is "the" or "every".
     """
-    match = _grammar(situation.nouns).fullmatch(phrase.strip().lower())
+    match = _grammar(situation).fullmatch(phrase.strip().lower())
     return frozenset() if match is None else _resolved(match, situation)
 
 
-def references(text: str, situation: Surroundings) -> Iterator[tuple[str, frozenset[str]]]:
-    """Yield each phrase of a text and the objects that it refers to; an ambiguous phrase has none."""
-    for match in _grammar(situation.nouns).finditer(text.lower()):
-        yield match[0], _resolved(match, situation)
+def references(text: str, situation: Surroundings) -> Iterator[frozenset[str]]:
+    """Yield the objects that each phrase of a text refers to; an ambiguous phrase has none."""
+    for match in _grammar(situation).finditer(text.lower()):
+        yield _resolved(match, situation)
 
 
 def phrases_for(name: str, situation: Surroundings) -> Iterator[str]:
     """Yield every phrase of the grammar that refers to this object alone, the simplest with a colour first."""
-    thing = situation.thing(name)
+    thing = situation[name]
+    color = thing.body.color_name
     for noun in thing.nouns:
-        for colored in ([f"{thing.color} {noun}"] if thing.color else []) + [noun]:
+        for colored in ([f"{color} {noun}"] if color else []) + [noun]:
             plain = f"the {colored}"
             if resolve(plain, situation) == {name}:  # if the plain noun is unambiguous, longer phrases are unnatural
                 yield plain
                 continue
             candidates = [f"the {order} {colored}" for order in _IN_FRONT]
             candidates += [f"the {colored} {order}" for order in _BEHIND]
-            for candidate in candidates:
-                if resolve(candidate, situation) == {name}:
-                    yield candidate
+            yield from (candidate for candidate in candidates if resolve(candidate, situation) == {name})
 
 
 def phrase_for(name: str, situation: Surroundings) -> str:
     """The simplest phrase for an object; "a red cube" if none is unambiguous."""
-    for found in phrases_for(name, situation):
-        return found
-    thing = situation.thing(name)
-    words = f"{thing.color} {thing.noun}".strip()
-    return f"{'an' if words[0] in 'aeiou' else 'a'} {words}"
+    words = situation[name].words
+    return next(phrases_for(name, situation), f"{'an' if words[0] in 'aeiou' else 'a'} {words}")
+
+
+def joined(parts: Sequence[str]) -> str:
+    """Join words as "a", "a and b", "a, b and c"."""
+    return parts[0] if len(parts) == 1 else f"{', '.join(parts[:-1])} and {parts[-1]}"
+
+
+def _grammar(situation: Surroundings) -> re.Pattern[str]:
+    return _grammar_of(frozenset(noun for thing in situation.values() for noun in thing.nouns))
 
 
 @lru_cache(maxsize=64)
-def _grammar(known: frozenset[str]) -> re.Pattern[str]:
+def _grammar_of(known: frozenset[str]) -> re.Pattern[str]:
     nouns = "|".join(sorted((re.escape(noun) for noun in known), key=len)[::-1])
     return re.compile(
         rf"\b(?P<article>the|every) (?:(?P<order>{'|'.join(_IN_FRONT)}) )?(?:(?P<color>{'|'.join(COLOR_WORDS)}) )?"
@@ -170,15 +139,15 @@ def _grammar(known: frozenset[str]) -> re.Pattern[str]:
 def _resolved(match: re.Match[str], situation: Surroundings) -> frozenset[str]:
     fitting = [
         thing
-        for thing in situation.things
-        if match["noun"] in thing.nouns and (match["color"] is None or thing.color == match["color"])
+        for thing in situation.values()
+        if match["noun"] in thing.nouns and match["color"] in (None, thing.body.color_name)
     ]
     if match["article"] == "every":
-        return frozenset(thing.name for thing in fitting)
+        return frozenset(thing.body.name for thing in fitting)
     for order in (match["order"], match["behind"]):
         if order is not None:
             fitting = _ordered(order, fitting)
-    return frozenset({fitting[0].name} if len(fitting) == 1 else ())
+    return frozenset({fitting[0].body.name} if len(fitting) == 1 else ())
 
 
 def _ordered(order: str, things: Sequence[NamedThing]) -> list[NamedThing]:
@@ -217,11 +186,11 @@ def _leftward(thing: NamedThing) -> float:
 
 
 def _size(thing: NamedThing) -> float:
-    return math.log(thing.size)
+    return math.log(max(thing.body.shape.extents))
 
 
 def _distance(thing: NamedThing) -> float:
-    return math.hypot(float(thing.position[0]), float(thing.position[1]))
+    return math.hypot(*thing.position[:2].tolist())
 
 
 _RATIO = math.log(MIN_SIZE_RATIO)

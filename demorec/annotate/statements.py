@@ -1,20 +1,54 @@
-"""All statements about one recording, row by row, as in a language column."""
+"""All statements about one recording, row by row, as in a language column: subtask, plan, memory, motion, wordings."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.annotate import KINDS, LanguageKind, Statement
-from demorec.annotate.attempts import PhaseSegment, episode_timeline
-from demorec.annotate.referring import Surroundings, situation
-from demorec.annotate.subtasks import goal_words, memories, motion, plan, subtask
+from demorec.annotate.referring import joined, phrase_for, place_of, prepositions, situation
+from demorec.annotate.timeline import PhaseSegment, episode_timeline
 from demorec.annotate.wordings import task_wordings
 from demorec.core.geometry import Array
 from demorec.core.seeding import generator
 from demorec.mcap import Recording
+
+_SENTENCES = {
+    "open": "open the gripper",
+    "approach": "move above {object}",
+    "above_cube": "move above {object}",
+    "descend": "lower the open gripper around {object}",
+    "close": "grasp {object}",
+    "lift": "lift {object}",
+    "hold": "lift {object}",
+    "transport": "carry {object} to {place}",
+    "carry": "carry {object} over {place}",
+    "lower": "lower {object} {into} {place}",
+    "release": "let go of {object}",
+    "retreat": "move away from {object}",
+}
+_MISSING = {
+    "approach": "move beside {object}, to miss it on purpose",
+    "descend": "lower the open gripper beside {object}, to miss it on purpose",
+    "close": "close the gripper beside {object}, missing it on purpose",
+    "lift": "lift the empty gripper, having missed {object} on purpose",
+}
+_AGAIN = ("approach", "descend", "close")
+"""Phases of a later attempt in which the subtask begins with "try again"."""
+_RECOVERY = {
+    "missed": "open the gripper and rise after missing {object}",
+    "dropped": "open the gripper and rise after dropping {object}",
+}
+# Half of the last printed digit.
+_MIN_MOVE_M = 0.005
+_MIN_OPENING_CHANGE_M = 0.0025
+
+_GoalWords = dict[str, str]
+"""Words of a goal at one moment: "object" ("the red cube"), "place" ("the blue tray", or "its place" without an object
+there), and the prepositions of the place: "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at")."""
 
 
 def episode_statements(
@@ -22,41 +56,42 @@ def episode_statements(
 ) -> list[Statement]:
     """Return the statements of the requested kinds in row order; within a row, in the order of `KINDS`.
 
-    Args:
-        recording: Recording with its events.
-        rows: (T,) recorded frame of each dataset row.
-        kinds: Requested kinds; those that the recording does not support are left out.
-
-    Raises:
-        RecordingError: The recording is damaged.
+    `rows` is the (T,) recorded frame of each dataset row. Raises RecordingError if the recording is damaged.
     """
-    annotator = _Annotator(recording, rows)
-    found: dict[LanguageKind, Callable[[], Iterator[Statement]]] = {
-        "subtask": annotator.subtasks,
-        "plan": annotator.plans,
-        "memory": annotator.memories,
-        "motion": annotator.motions,
-        "task_aug": annotator.wordings,
+    narrator = _Narrator(recording, rows)
+    sentences = {
+        "subtask": narrator.subtasks,
+        "plan": narrator.plans,
+        "memory": narrator.memories,
+        "motion": narrator.motions,
+        "task_aug": narrator.wordings,
     }
-    statements = [statement for kind in KINDS if kind in kinds for statement in found[kind]()]
-    return sorted(statements, key=lambda statement: statement.row)
+    found = [Statement(row, kind, text) for kind in KINDS if kind in kinds for row, text in sentences[kind]()]
+    return sorted(found, key=lambda statement: statement.row)
 
 
-class _Annotator:
-    """The sentences of one episode, kind by kind."""
+class _Narrator:
+    """The sentences of one episode, kind by kind, each with its row."""
 
     def __init__(self, recording: Recording, rows: NDArray[np.intp]) -> None:
         self._info, self._trajectory, self._rows = recording.info, recording.trajectory(), rows
-        self._timeline = episode_timeline(recording)
         self._scene = recording.info.simulated.scene
+        self._timeline = episode_timeline(recording)
+        self._is_dropped = self._timeline.is_dropped
         self._words = {
-            attempt.first: goal_words(self._scene, attempt.goal, self._situation(attempt.first))
-            for attempt in self._timeline.attempts
+            attempt.first: self._goal_words(attempt.goal, attempt.first) for attempt in self._timeline.attempts
         }
 
-    def _situation(self, frame: int) -> Surroundings:
+    def _goal_words(self, goal_index: int | None, frame: int) -> _GoalWords:
+        """Phrases that distinguish a goal's object and place from all other objects at a frame."""
+        if goal_index is None:
+            return {"object": "the object", "place": "its place", "into": "to", "inside": "at"}
+        goal = self._scene.goals[goal_index]
         poses: dict[str, Array] = {name: values[frame] for name, values in self._trajectory.object_poses.items()}
-        return situation(self._scene, poses)
+        now, name = situation(self._scene, poses), place_of(self._scene, goal)
+        into, inside = prepositions(self._scene, name)
+        place = phrase_for(name, now) if name else "its place"
+        return {"object": phrase_for(goal.object, now), "place": place, "into": into, "inside": inside}
 
     def _row_of(self, frame: int) -> int:
         """Return the first row at or after a frame; T if all are earlier."""
@@ -65,51 +100,109 @@ class _Annotator:
     def _segment_rows(self) -> Iterator[tuple[PhaseSegment, int, int]]:
         """Yield (segment, first row, row after the last) of each segment that contains a row."""
         for segment in self._timeline.segments:
-            first = self._row_of(segment.first)
-            end = self._row_of(segment.end)
+            first, end = self._row_of(segment.first), self._row_of(segment.end)
             if first < end:
                 yield segment, first, end
 
-    def subtasks(self) -> Iterator[Statement]:
-        is_dropped = self._timeline.is_dropped
+    def subtasks(self) -> Iterator[tuple[int, str]]:
         for segment, first, _ in self._segment_rows():
-            words = self._words[segment.attempt.first]
-            text = subtask(segment, words, self._info.instruction, is_dropped=is_dropped)
-            yield Statement(row=first, kind="subtask", text=text)
+            yield first, self._subtask(segment)
 
-    def plans(self) -> Iterator[Statement]:
+    def _subtask(self, segment: PhaseSegment) -> str:
+        """Return the imperative for a segment; the instruction if the recording has no phases."""
+        phase, attempt = segment.phase, segment.attempt
+        if phase == "recover":
+            text = _RECOVERY.get(attempt.end, "open the gripper and rise")
+            text += " on purpose" if attempt.is_deliberate_miss else ""
+        elif segment.is_deliberate_miss and phase in _MISSING:
+            text = _MISSING[phase]
+        elif phase == "release" and self._is_dropped:
+            text = "drop {object} {into} {place}"
+        elif phase in _SENTENCES:
+            is_again = attempt.number > 0 and phase in _AGAIN
+            text = f"try again: {_SENTENCES[phase]}" if is_again else _SENTENCES[phase]
+        else:
+            return phase.replace("_", " ") or self._info.instruction
+        return text.format(**self._words[attempt.first])
+
+    def plans(self) -> Iterator[tuple[int, str]]:
+        """Yield numbered lists of the remaining actions, at the start and at each repeated attempt."""
         for index, attempt in enumerate(self._timeline.attempts):
-            if attempt.goal is None or (index > 0 and attempt.number == 0):
-                continue
             row = 0 if index == 0 else self._row_of(attempt.first)
-            if row < len(self._rows):
-                now = self._situation(attempt.first)
-                remaining = [goal_words(self._scene, goal, now) for goal in range(attempt.goal, len(self._scene.goals))]
-                text = plan(remaining, is_dropped=self._timeline.is_dropped, is_retry=attempt.number > 0)
-                yield Statement(row=row, kind="plan", text=text)
+            is_new_goal = index > 0 and attempt.number == 0
+            if attempt.goal is None or is_new_goal or row >= len(self._rows):
+                continue
+            actions: list[str] = []
+            for goal in range(attempt.goal, len(self._scene.goals)):
+                words = self._goal_words(goal, attempt.first)
+                again = " again" if attempt.number > 0 and not actions else ""
+                put = f"{'drop' if self._is_dropped else 'put'} it {words['into']} {words['place']}"
+                actions += [
+                    f"pick up {words['object']}{again}",
+                    "put it in its place" if words["into"] == "to" else put,
+                ]
+            yield row, "\n".join(f"{number}. {action}" for number, action in enumerate(actions, start=1))
 
-    def memories(self) -> Iterator[Statement]:
-        latest: dict[int, Statement] = {}
-        for frame, text in memories(self._timeline, self._words, is_dropped=self._timeline.is_dropped):
-            row = self._row_of(frame)
-            if row < len(self._rows):  # if two segments begin in one row, the later one applies
-                latest[row] = Statement(row=row, kind="memory", text=text)
-        yield from latest.values()
+    def memories(self) -> Iterator[tuple[int, str]]:
+        """Yield the actions done so far, in the first person; if two segments begin in one row, the later applies."""
+        done: list[str] = []
+        latest: dict[int, str] = {}
+        for before, segment in pairwise(self._timeline.segments):
+            if before.attempt is not segment.attempt:
+                continue
+            deed = self._deed(before, segment)
+            if deed and (row := self._row_of(segment.first)) < len(self._rows):
+                latest[row] = " ".join([*done, deed])
+            if before.phase == "release" and segment.attempt.end == "placed":
+                done.append(deed)
+        yield from latest.items()
 
-    def motions(self) -> Iterator[Statement]:
+    def _deed(self, before: PhaseSegment, segment: PhaseSegment) -> str:
+        """Return what was done when one segment of an attempt follows another; "" if nothing to remember."""
+        attempt, words = segment.attempt, self._words[segment.attempt.first]
+        object_ = words["object"]
+        if before.phase in ("lift", "hold") and segment.phase != "recover":
+            return f"I picked up {object_}."
+        if before.phase == "release" and attempt.end == "placed":
+            verb, where = ("dropped", words["into"]) if self._is_dropped else ("put", words["inside"])
+            has_place = words["into"] != "to"
+            return f"I {verb} {object_} {where} {words['place']}." if has_place else f"I put {object_} in its place."
+        if before.phase == "release" and attempt.end == "misplaced":
+            return f"I put {object_} down in the wrong place."
+        if segment.phase == "recover":
+            verb = "dropped" if attempt.end == "dropped" else "missed"
+            return f"I {verb} {object_}{' on purpose' if attempt.is_deliberate_miss else ''}."
+        return ""
+
+    def motions(self) -> Iterator[tuple[int, str]]:
         trajectory, last = self._trajectory, self._rows[-1]
         for _, first, end in self._segment_rows():
             frames = [self._rows[first], self._rows[end] if end < len(self._rows) else last]
-            text = motion(trajectory.base_from_tcp[frames, :3], trajectory.gripper_width[frames])
-            yield Statement(row=first, kind="motion", text=text)
+            yield first, _motion(trajectory.base_from_tcp[frames, :3], trajectory.gripper_width[frames])
 
-    def wordings(self) -> Iterator[Statement]:
+    def wordings(self) -> Iterator[tuple[int, str]]:
         info = self._info
-        rng = generator(
-            root_seed=info.simulated.root_seed,
-            episode_index=info.episode_index,
-            attempt=info.attempt,
-            purpose="language",
-        )
-        for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._timeline.is_dropped):
-            yield Statement(row=0, kind="task_aug", text=text)
+        seed = info.simulated.root_seed
+        rng = generator(root_seed=seed, episode_index=info.episode_index, attempt=info.attempt, purpose="language")
+        for text in task_wordings(self._scene, info.instruction, rng, is_dropped=self._is_dropped):
+            yield 0, text
+
+
+def _motion(position: Array, opening: Array) -> str:
+    """Describe, to whole centimetres, the displacement of the TCP (2, 3) in the base frame, metres, and of the gripper
+    opening (2,), metres, between two moments.
+    """
+    parts = []
+    directions = ("forward", "backward"), ("left", "right"), ("up", "down")
+    for change, (positive, negative) in zip((position[1] - position[0]).tolist(), directions, strict=True):
+        centimetres = round(abs(change) * 100)
+        if abs(change) >= _MIN_MOVE_M and centimetres:
+            parts.append((centimetres, positive if change > 0 else negative))
+    parts.sort(key=lambda part: -part[0])
+    said = [f"{centimetres} cm {direction}" for centimetres, direction in parts]
+    sentences = [f"move {joined(said)}"] if said else []
+    change = float(opening[1]) - float(opening[0])
+    if abs(change) >= _MIN_OPENING_CHANGE_M:
+        verb = "open" if change > 0 else "close"
+        sentences.append(f"{verb} the gripper by {max(0.5, round(abs(change) * 200) / 2):g} cm")
+    return ", ".join(sentences) or "hold still"

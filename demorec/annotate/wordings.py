@@ -7,13 +7,21 @@ finished text and does not know the template.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from demorec.annotate.referring import Surroundings, phrases_for, place_of, references, resolve, situation
-from demorec.annotate.subtasks import joined, prepositions
+from demorec.annotate.referring import (
+    Surroundings,
+    joined,
+    phrases_for,
+    place_of,
+    prepositions,
+    references,
+    resolve,
+    situation,
+)
 from demorec.episode.scene import Goal, Scene
 
 WORDINGS = 24
@@ -53,9 +61,8 @@ _POLITE = ("{s}", "please {s}", "could you {s}?", "can you {s}?", "would you {s}
 _THEN = ("{a}, then {b}", "first {a}, then {b}", "{a}, and then {b}", "{a}; after that, {b}")
 
 
-@dataclass(frozen=True, kw_only=True)
-class _Clause:
-    """Words of one goal: names of its object, its place and the object below, "" for none."""
+class _Clause(NamedTuple):
+    """Names of a goal's object, of its place and of the object below it, "" for none."""
 
     object: str
     place: str
@@ -65,30 +72,20 @@ class _Clause:
 def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, is_dropped: bool) -> list[str]:
     """Return up to `WORDINGS` different wordings, the recorded instruction first; each is proved unambiguous.
 
-    Args:
-        scene: Scene at the episode's start.
-        instruction: Recorded instruction.
-        rng: Chooses among all possible wordings.
-        is_dropped: Whether objects are dropped rather than set down.
+    `rng` chooses among all possible wordings; with `is_dropped`, objects are dropped rather than set down.
     """
     start = situation(scene)
-    clauses = [
-        _Clause(object=goal.object, place=place_of(scene, goal), base=_base_of(goal, start)) for goal in scene.goals
-    ]
-    sentences = list(
-        dict.fromkeys([*_by_class(scene, clauses, start), *_one_by_one(scene, clauses, start, is_dropped, rng)])
-    )
-    order = rng.permutation(len(sentences))
-    wanted = WORDINGS - 1
-    chosen = [sentences[index] for index in order[:wanted]]
+    clauses = [_Clause(goal.object, place_of(scene, goal), _base_of(goal, start)) for goal in scene.goals]
+    options = [list(_sentences(scene, clause, start, is_dropped)) for clause in clauses]
+    sentences = list(dict.fromkeys([*_by_class(scene, clauses, start), *_one_by_one(options, rng)]))
+    chosen = [sentences[index] for index in rng.permutation(len(sentences))[: WORDINGS - 1]]
     # The first round gives each sentence another polite form; further rounds are used if there are too few sentences.
     forms = rng.permutation(len(_POLITE))
     found = [instruction]
-    for turn, (round_, index) in enumerate(product(range(len(_POLITE)), range(len(chosen)))):
+    for turn, (round_, sentence) in enumerate(product(range(len(_POLITE)), chosen)):
         if len(found) >= WORDINGS:
             break
-        form = _POLITE[forms[(turn + round_) % len(_POLITE)]]
-        text = form.replace("{s}", chosen[index])
+        text = _POLITE[forms[(turn + round_) % len(_POLITE)]].format(s=sentence)
         if text not in found and _is_proved(text, clauses, start):
             found.append(text)
     return found
@@ -96,7 +93,7 @@ def task_wordings(scene: Scene, instruction: str, rng: np.random.Generator, *, i
 
 def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bool:
     """Whether each phrase of a wording is unambiguous and all together refer to the goals' objects."""
-    found = [names for _, names in references(text, start)]
+    found = list(references(text, start))
     wanted = {name for clause in clauses for name in (clause.object, clause.place) if name}
     allowed = wanted | {clause.base for clause in clauses}
     return all(found) and wanted <= set().union(*found) <= allowed
@@ -104,37 +101,26 @@ def _is_proved(text: str, clauses: Sequence[_Clause], start: Surroundings) -> bo
 
 def _base_of(goal: Goal, start: Surroundings) -> str:
     """Name of the movable object below a goal's object, or ""."""
-    upper = start.thing(goal.object)
-    for thing in start.things:
-        offset = upper.position - thing.position
-        air = float(offset[2]) - (upper.height + thing.height) / 2
-        if (
-            thing is not upper
-            and thing.can_be_held
-            and abs(air) < _ON
-            and bool((abs(offset[:2]) < thing.size / 2).all())
-        ):
-            return thing.name
+    upper = start[goal.object]
+    for name, thing in start.items():
+        extents = thing.body.shape.extents
+        x, y, z = np.abs(upper.position - thing.position).tolist()
+        gap = abs(z - (upper.body.shape.extents[2] + extents[2]) / 2)
+        if thing is not upper and thing.body.movable and gap < _ON and max(x, y) < max(extents) / 2:
+            return name
     return ""
 
 
-def _one_by_one(
-    scene: Scene, clauses: Sequence[_Clause], start: Surroundings, is_dropped: bool, rng: np.random.Generator
-) -> Iterator[str]:
-    """Sentences that name each goal."""
-    per_goal = [list(_sentences(scene, clause, start, is_dropped)) for clause in clauses]
-    if not all(per_goal):
+def _one_by_one(options: Sequence[Sequence[str]], rng: np.random.Generator) -> Iterator[str]:
+    """Sentences that name each goal, from the possible ones for each."""
+    if not all(options):
         return
-    if len(per_goal) == 1:
-        yield from per_goal[0]
+    if len(options) == 1:
+        yield from options[0]
         return
     for number in range(4 * WORDINGS):
-        parts = [options[int(rng.integers(len(options)))] for options in per_goal]
-        form = _THEN[number % len(_THEN)]
-        text = parts[0]
-        for part in parts[1:-1]:
-            text += f", then {part}"
-        yield form.replace("{a}", text).replace("{b}", parts[-1])
+        *first, last = [sentences[int(rng.integers(len(sentences)))] for sentences in options]
+        yield _THEN[number % len(_THEN)].format(a=", then ".join(first), b=last)
 
 
 def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: bool) -> Iterator[str]:
@@ -142,18 +128,14 @@ def _sentences(scene: Scene, clause: _Clause, start: Surroundings, is_dropped: b
     places = list(phrases_for(clause.place, start)) if clause.place else []
     base = next(phrases_for(clause.base, start), "") if clause.base else ""
     into, inside = prepositions(scene, clause.place)
-    is_on_cube = bool(clause.place) and start.thing(clause.place).can_be_held
-    templates = _DROP if is_dropped else (*_PUT, *_INTO)
-    if base and not is_dropped:
-        templates = (*templates, *_OFF)
+    is_on_cube = bool(clause.place) and start[clause.place].body.movable
+    templates = _DROP if is_dropped else (*_PUT, *_INTO, *(_OFF if base else ()))
     for template, object_, place in product(templates, objects, places):
-        text = template.replace("{o}", object_).replace("{i}", f"{into} {place}").replace("{p}", f"{inside} {place}")
-        yield text.replace("{b}", base) if base else text
+        yield template.format(o=object_, i=f"{into} {place}", p=f"{inside} {place}", b=base)
         if is_on_cube and "{p}" in template:
-            yield template.replace("{o}", object_).replace("{p}", f"on top of {place}")
+            yield template.format(o=object_, p=f"on top of {place}", b=base)
     if is_on_cube:
-        for object_, place in product(objects, places):
-            yield f"stack {object_} on {place}"
+        yield from (f"stack {object_} on {place}" for object_, place in product(objects, places))
 
 
 def _by_class(scene: Scene, clauses: Sequence[_Clause], start: Surroundings) -> Iterator[str]:
@@ -164,10 +146,10 @@ def _by_class(scene: Scene, clauses: Sequence[_Clause], start: Surroundings) -> 
     parts: list[list[str]] = []
     for place in places:
         members = frozenset(clause.object for clause in clauses if clause.place == place)
-        thing = start.thing(next(iter(members)))
         into, inside = prepositions(scene, place)
-        words = f"every {thing.color} {thing.noun}"
-        if resolve(words, start) != members or not (names := list(phrases_for(place, start))):
+        words = f"every {start[next(iter(members))].words}"
+        names = list(phrases_for(place, start))
+        if resolve(words, start) != members or not names:
             return
         options = [*((verb, inside) for verb in ("put", "place", "set")), *((verb, into) for verb in _CLASS_VERBS)]
         parts.append([f"{verb} {words} {where} {name}" for name in names for verb, where in options])

@@ -29,7 +29,6 @@ from demorec.episode.features import (
     observation_vectors,
 )
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.simulated import on_request, scene_of
 from demorec.mcap import Recording
 
@@ -204,14 +203,15 @@ class ExportEpisode[O: CommonOptions]:
 
     def _scene_observations(self) -> dict[str, NDArray[np.floating[Any]]]:
         vectors = observation_vectors(
-            ObservationRows.of_trajectory(self.recording.trajectory(), self.rows),
+            self.recording.trajectory(),
             self.info.simulated.robot,
             self.info.simulated.scene,
             privileged=self.options.privileged,
             state=self.state,
             dtype=np.float64,
         )
-        return {name: vectors[name] for name in (STATE, ENVIRONMENT_STATE) if name in vectors and name in self.names}
+        taken = [name for name in (STATE, ENVIRONMENT_STATE) if name in vectors and name in self.names]
+        return {name: vectors[name][self.rows] for name in taken}
 
     @cached_property
     def columns(self) -> Mapping[str, NDArray[np.generic]]:

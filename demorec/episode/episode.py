@@ -35,42 +35,26 @@ Vector = NDArray[np.float32] | NDArray[np.float64]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Observation:
-    """All measurements at one instant.
+    """All measurements at one instant."""
 
-    Attributes:
-        joint_position: (n_joints,) in the order of `RobotSpec.joint_names`; rad, fingers m.
-        joint_velocity: (n_joints,) rad/s, fingers m/s.
-        joint_effort: (n_joints,) motor torque N m, fingers N.
-        gripper_width: Opening between the fingers, metres.
-        base_from_tcp: TCP pose in the base frame.
-        object_poses: name -> world_from_object, of every movable body of the scene.
-        contact_force: Sum of the normal forces on the fingers, N.
-        sensed: Other sensors: quantity -> (D,), by the rows of `demorec.sim.sensors`.
-    """
-
-    joint_position: Array
-    joint_velocity: Array
-    joint_effort: Array
-    gripper_width: float
-    base_from_tcp: Pose
-    object_poses: Mapping[str, Pose]
-    contact_force: float
+    joint_position: Array  # (n_joints,) in the order of `RobotSpec.joint_names`; rad, fingers m
+    joint_velocity: Array  # (n_joints,) rad/s, fingers m/s
+    joint_effort: Array  # (n_joints,) motor torque N m, fingers N
+    gripper_width: float  # opening between the fingers, metres
+    base_from_tcp: Pose  # TCP pose in the base frame
+    object_poses: Mapping[str, Pose]  # name -> world_from_object, of every movable body of the scene
+    contact_force: float  # sum of the normal forces on the fingers, N
+    # Other sensors: quantity -> (D,), by the rows of `demorec.sim.sensors`.
     sensed: Mapping[str, Array] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Action:
-    """One command: absolute joint targets and gripper opening, reached by linear interpolation over the step.
+    """One command: absolute joint targets and gripper opening, reached by linear interpolation over the step."""
 
-    Attributes:
-        joint_target: (n_arm,) rad.
-        gripper_target: Opening, metres.
-        base_from_tcp_target: Forward kinematics of `joint_target`, in the base frame.
-    """
-
-    joint_target: Array
-    gripper_target: float
-    base_from_tcp_target: Pose
+    joint_target: Array  # (n_arm,) rad
+    gripper_target: float  # opening, metres
+    base_from_tcp_target: Pose  # forward kinematics of `joint_target`, in the base frame
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -85,20 +69,15 @@ class JointSample:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class CameraImages:
-    """Images of one camera at one instant.
+    """Images of one camera at one instant."""
 
-    Attributes:
-        color: (H, W, 3) uint8 RGB, row 0 on top.
-        depth: (H, W) float32 metres along the optical axis, 0 for the background; None unless requested.
-        segmentation: (H, W) int32, body index + ((link index + 1) << 24) as PyBullet numbers them, -1 for the
-            background; None unless requested.
-        world_from_camera: Pose, OpenCV axes.
-    """
-
-    color: NDArray[np.uint8]
+    color: NDArray[np.uint8]  # (H, W, 3) uint8 RGB, row 0 on top
+    # (H, W) float32 metres along the optical axis, 0 for the background; None unless requested.
     depth: NDArray[np.float32] | None = None
+    # (H, W) int32, body index + ((link index + 1) << 24) as PyBullet numbers them, -1 for the background; None unless
+    # requested.
     segmentation: NDArray[np.int32] | None = None
-    world_from_camera: Pose
+    world_from_camera: Pose  # OpenCV axes
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -112,76 +91,47 @@ class Event:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Frame:
-    """One control step.
+    """One control step."""
 
-    Attributes:
-        frame_index: t, from 0.
-        time_ns: Simulated time since the episode's start, computed from frame_index.
-        observation: Observation at t.
-        action: The expert's intended action at t.
-        command: Command sent to the motors at t.
-        phase: Phase of the scripted motion ("approach", "lift", ...).
-        events: Events at t.
-        images: Camera name -> images at t.
-        joint_samples: Joint states since the previous frame, both ends excluded; empty unless requested.
-        is_deliberate_miss: Whether this frame belongs to a deliberate miss, which no policy can predict.
-    """
-
-    frame_index: int
-    time_ns: int
+    frame_index: int  # t, from 0
+    time_ns: int  # simulated time since the episode's start, computed from frame_index
     observation: Observation
-    action: Action
-    command: Action
-    phase: str
+    action: Action  # the expert's intended action at t
+    command: Action  # command sent to the motors at t
+    phase: str  # phase of the scripted motion ("approach", "lift", ...)
     events: tuple[Event, ...] = ()
-    images: Mapping[str, CameraImages] = field(default_factory=dict)
+    images: Mapping[str, CameraImages] = field(default_factory=dict)  # camera name -> images at t
+    # Joint states since the previous frame, both ends excluded; empty unless requested.
     joint_samples: tuple[JointSample, ...] = ()
-    is_deliberate_miss: bool = False
+    is_deliberate_miss: bool = False  # whether this frame belongs to a deliberate miss, which no policy can predict
 
 
 @dataclass(frozen=True, kw_only=True)
 class SuccessCheck:
-    """One success condition.
+    """One success condition."""
 
-    Attributes:
-        name: Measured quantity ("distance_to_goal").
-        value: Measured value, in `unit`.
-        limit: Allowed value; `passed` implies on which side.
-        unit: "m", "rad", "m/s", "N" or "".
-        passed: Whether the condition holds.
-    """
-
-    name: str
-    value: float
-    limit: float
-    unit: str
+    name: str  # measured quantity ("distance_to_goal")
+    value: float  # measured value, in `unit`
+    limit: float  # allowed value; `passed` implies on which side
+    unit: str  # "m", "rad", "m/s", "N" or ""
     passed: bool
 
 
 @dataclass(frozen=True, kw_only=True)
 class Outcome:
-    """Result of an episode.
+    """Result of an episode."""
 
-    Attributes:
-        success: Whether it succeeded; for a simulated one whether every check passed; None if unknown.
-        checks: The task's conditions, with the measured values.
-        failure_phase: Phase of the failure, "" on success and if unknown.
-        failure_reason: Name of the first failed check, reason of the expert's failure, or a reason in words; "" on
-            success and if unknown.
-        num_frames: Number of frames.
-        num_retries: Number of repeated attempts of the expert within the episode.
-        final_state_digest: SHA-256 (hex) over positions and velocities of all joints and movable bodies at the end, ""
-            if unknown.
-        drops: "frames", or a camera's name -> number of dropped ones; missing names lost none.
-    """
-
-    success: bool | None = None
-    checks: tuple[SuccessCheck, ...] = ()
-    failure_phase: str = ""
+    success: bool | None = None  # whether it succeeded; for a simulated one whether every check passed; None if unknown
+    checks: tuple[SuccessCheck, ...] = ()  # the task's conditions, with the measured values
+    failure_phase: str = ""  # phase of the failure, "" on success and if unknown
+    # Name of the first failed check, reason of the expert's failure, or a reason in words; "" on success and if
+    # unknown.
     failure_reason: str = ""
     num_frames: int
-    num_retries: int = 0
+    num_retries: int = 0  # number of repeated attempts of the expert within the episode
+    # SHA-256 (hex) over positions and velocities of all joints and movable bodies at the end, "" if unknown.
     final_state_digest: str = ""
+    # "frames", or a camera's name -> number of dropped ones; missing names lost none.
     drops: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -196,57 +146,45 @@ def gave_up(outcome: Outcome, events: Sequence[Event], info: EpisodeInfo) -> boo
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sample:
-    """A received vector.
+    """A received vector."""
 
-    Attributes:
-        stamp_ns: Timestamp by the clock of its stream.
-        vector: (D,) of the feature's dtype.
-    """
-
-    stamp_ns: int
-    vector: Vector
+    stamp_ns: int  # timestamp by the clock of its stream
+    vector: Vector  # (D,) of the feature's dtype
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SampledFrame:
-    """One control step.
+    """One control step."""
 
-    Attributes:
-        time_ns: Its timestamp; frames are in order, at any intervals. Its data is `time_ns - stamp_ns` old.
-        samples: Feature -> its sample; contains every feature.
-        images: Camera -> number of its image, counted from 0 in each camera. Several frames, or none, may refer to an
-            image; a missing camera has no image at this frame.
-        subtask: Subtask that begins at this frame, in the source's words; "" if it does not change.
-    """
-
+    # Its timestamp; frames are in order, at any intervals. Its data is `time_ns - stamp_ns` old.
     time_ns: int
-    samples: Mapping[str, Sample]
+    samples: Mapping[str, Sample]  # feature -> its sample; contains every feature
+    # Camera -> number of its image, counted from 0 in each camera. Several frames, or none, may refer to an image; a
+    # missing camera has no image at this frame.
     images: Mapping[str, int] = field(default_factory=dict)
-    subtask: str = ""
+    subtask: str = ""  # subtask that begins at this frame, in the source's words; "" if it does not change
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Table:
-    """Numbers of an episode of T frames, and the images that the frames show.
+class TimedRows:
+    """Rows of T frames."""
 
-    Attributes:
-        time_ns: (T,) timestamps of the frames.
-        features: Feature -> (T, D) in its own dtype.
-        stamps: Feature -> (T,) timestamps of the samples.
-        images: Camera -> (T,) image number of each frame, `NO_IMAGE` if none.
-        image_stamps: Camera -> (P,) timestamps of its images.
-    """
-
-    time_ns: NDArray[np.int64]
-    features: Mapping[str, NDArray[Any]]
-    stamps: Mapping[str, NDArray[np.int64]]
-    images: Mapping[str, NDArray[np.int64]]
-    image_stamps: Mapping[str, NDArray[np.int64]]
+    time_ns: NDArray[np.int64]  # (T,) timestamps of the frames
 
     @property
     def num_frames(self) -> int:
         """Number of frames, T."""
         return len(self.time_ns)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Table(TimedRows):
+    """Numbers of an episode of T frames, and the images that the frames show."""
+
+    features: Mapping[str, NDArray[Any]]  # feature -> (T, D) in its own dtype
+    stamps: Mapping[str, NDArray[np.int64]]  # feature -> (T,) timestamps of the samples
+    images: Mapping[str, NDArray[np.int64]]  # camera -> (T,) image number of each frame, `NO_IMAGE` if none
+    image_stamps: Mapping[str, NDArray[np.int64]]  # camera -> (P,) timestamps of its images
 
     def age_ns(self, feature: str) -> NDArray[np.int64]:
         """Compute (T,) age of each frame's sample of a feature."""
@@ -261,13 +199,12 @@ class Table:
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Trajectory:
-    """All simulated data of an episode of T frames, exactly as computed.
+class Observations:
+    """Numbers of T observations, measured now or recorded; shapes and units of a row as in `Observation`.
 
-    Shapes and units of a row are as in `Observation` and `Action`. A pose is (7,): position, then quaternion xyzw.
+    A pose is (7,): position, then quaternion xyzw.
     """
 
-    time_ns: NDArray[np.int64]  # (T,)
     joint_position: Array  # (T, n_joints)
     joint_velocity: Array  # (T, n_joints)
     joint_effort: Array  # (T, n_joints)
@@ -276,6 +213,29 @@ class Trajectory:
     object_poses: Mapping[str, Array]  # name -> (T, 7), world_from_object
     contact_force: Array  # (T,)
     sensed: Mapping[str, Array]  # quantity -> (T, D)
+
+    @classmethod
+    def of(cls, observation: Observation) -> Observations:
+        """Take one observation, as T = 1."""
+        return cls(
+            joint_position=observation.joint_position[np.newaxis],
+            joint_velocity=observation.joint_velocity[np.newaxis],
+            joint_effort=observation.joint_effort[np.newaxis],
+            gripper_width=np.array([observation.gripper_width]),
+            base_from_tcp=observation.base_from_tcp.vector()[np.newaxis],
+            object_poses={name: pose.vector()[np.newaxis] for name, pose in observation.object_poses.items()},
+            contact_force=np.array([observation.contact_force]),
+            sensed={name: values[np.newaxis] for name, values in observation.sensed.items()},
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Trajectory(Observations, TimedRows):
+    """All simulated data of an episode of T frames, exactly as computed; rows of actions as in `Action`.
+
+    Digests follow the order of the fields: times, observations, actions.
+    """
+
     action_joint_target: Array  # (T, n_arm)
     action_gripper: Array  # (T,)
     action_base_from_tcp: Array  # (T, 7)
@@ -285,11 +245,6 @@ class Trajectory:
     phase: tuple[str, ...]  # T
     is_deliberate_miss: NDArray[np.bool_]  # (T,)
     world_from_camera: Mapping[str, Array]  # name -> (T, 7)
-
-    @property
-    def num_frames(self) -> int:
-        """Number of frames, T."""
-        return len(self.time_ns)
 
 
 def frame_time_ns(frame_index: int, fps: int) -> int:

@@ -11,16 +11,16 @@ Frames: all vectors are in the robot's base frame (equal to the world's if the r
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Sequence
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.core.geometry import Array, Pose, quat_multiply, quat_product, rotation_rows
-from demorec.episode.episode import Trajectory
-from demorec.episode.info import Feature
-from demorec.episode.observation_rows import ObservationRows
+from demorec.episode.episode import Observations, Trajectory
+from demorec.episode.info import OBSERVATION, Feature
 from demorec.episode.scene import Goal, Scene
 from demorec.robots.robot import RobotSpec
 
@@ -63,14 +63,14 @@ _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
 _TCP_NAMES = tuple(f"tcp.{axis}" for axis in _POSE)
 
 
+_Columns = Iterator[tuple[tuple[str, ...], Array]]
+"""Names of components, and their numbers: (T,) or (T, number of names)."""
+
+
 def state_names(robot: RobotSpec, kind: StateKind) -> tuple[str, ...]:
     """List the name of every component of `observation.state`."""
     joints = (*(f"{joint}.pos" for joint in robot.arm_joints), "gripper.width")
     return (*joints, *_TCP_NAMES) if kind == "joint_ee" else joints
-
-
-def _velocity_names(robot: RobotSpec) -> tuple[str, ...]:
-    return (*(f"{joint}.vel" for joint in robot.arm_joints), "gripper.vel")
 
 
 def observation_names(
@@ -82,18 +82,23 @@ def observation_names(
     sensed: Sequence[Feature] = (),
 ) -> dict[str, tuple[str, ...]]:
     """List feature name -> name of every component, in the order of `observation_vectors`."""
-    names = {
-        STATE: state_names(robot, state),
-        VELOCITY: _velocity_names(robot),
-        EE_POSE: _TCP_NAMES,
-    }
-    if privileged:
-        names[ENVIRONMENT_STATE] = tuple(_environment_names(robot, scene))
-    return names | {feature.name: feature.names for feature in sensed}
+    joints, pose = np.empty((0, len(robot.joint_names))), np.empty((0, 7))
+    rows = Observations(
+        joint_position=joints,
+        joint_velocity=joints,
+        joint_effort=joints,
+        gripper_width=np.empty(0),
+        base_from_tcp=pose,
+        object_poses={body.name: pose for body in scene.movable},
+        contact_force=np.empty(0),
+        sensed={feature.name.removeprefix(OBSERVATION): joints for feature in sensed},
+    )
+    columns = _observations(rows, robot, scene, privileged, state, sensed)
+    return {feature: tuple(name for names, _ in parts for name in names) for feature, parts in columns.items()}
 
 
 def observation_vectors(
-    rows: ObservationRows,
+    rows: Observations,
     robot: RobotSpec,
     scene: Scene,
     *,
@@ -109,47 +114,102 @@ def observation_vectors(
     - `observation.velocity`: arm joint velocities (rad/s), speed of the gripper's opening (m/s).
     - `observation.ee_pose`: base_from_tcp, xyz (m) and quaternion xyzw, with the sign that makes x >= 0: it does not
     jump for a hand that points down within 180 degrees of yaw.
-    - `observation.environment_state` (only if `privileged`): see `_environment_columns`.
+    - `observation.environment_state` (only if `privileged`): see `_environment`.
     - `sensed`: the optional observations, in their units.
     """
-    arm, count = len(robot.arm_joints), len(rows.gripper_width)
-    tcp = _continuous(rows.base_from_tcp)
+    columns = _observations(rows, robot, scene, privileged, state, sensed)
+    return {feature: _joined([numbers for _, numbers in parts], dtype) for feature, parts in columns.items()}
+
+
+def _observations(
+    rows: Observations,
+    robot: RobotSpec,
+    scene: Scene,
+    privileged: bool,
+    state: StateKind,
+    sensed: Sequence[Feature],
+) -> dict[str, _Columns]:
+    arm = len(robot.arm_joints)
+    pose = _TCP_NAMES, _continuous(rows.base_from_tcp)
+    joints = state_names(robot, "joint")
+    positions = [(joints[:-1], rows.joint_position[:, :arm]), (joints[-1:], rows.gripper_width)]
     features = {
-        STATE: [rows.joint_position[:, :arm], rows.gripper_width, *([tcp] if state == "joint_ee" else [])],
+        STATE: iter([*positions, pose] if state == "joint_ee" else positions),
         VELOCITY: _velocities(rows, robot),
-        EE_POSE: [tcp],
+        EE_POSE: iter([pose]),
     }
     if privileged:
-        features[ENVIRONMENT_STATE] = _environment_columns(rows, robot, scene)
+        features[ENVIRONMENT_STATE] = _environment(rows, robot, scene)
+    values = {OBSERVATION + quantity: numbers for quantity, numbers in rows.sensed.items()}
+    values |= {EFFORT: rows.joint_effort[:, :arm], CONTACT_FORCE: rows.contact_force}
     for feature in sensed:
-        values = rows.sensed[feature.name].reshape(count, -1)
-        features[feature.name] = [values[:, : len(feature.names)]]  # a gripper's joints follow those of the arm
-    return {name: _joined(columns, dtype) for name, columns in features.items()}
+        features[feature.name] = iter([(feature.names, values[feature.name])])
+    return features
 
 
-# ---------------------------------------------------------------------------------------------- environment state
+def _velocities(rows: Observations, robot: RobotSpec) -> _Columns:
+    arm = len(robot.arm_joints)
+    yield tuple(f"{joint}.vel" for joint in robot.arm_joints), rows.joint_velocity[:, :arm]
+    yield ("gripper.vel",), robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
 
 
-def _environment_names(robot: RobotSpec, scene: Scene) -> Iterable[str]:
-    yield from (*_axes("tcp."), "tcp.yaw.sin", "tcp.yaw.cos")
+def _environment(rows: Observations, robot: RobotSpec, scene: Scene) -> _Columns:
+    """Compute first the inputs a policy learns best from, then raw poses (metres, rad; base frame).
+
+    First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents, position
+    relative to the TCP in base axes and in hand axes, and, for a body with a yaw symmetry of 2 pi / n, its yaw as sine
+    and cosine of n times the angle, absolute and relative to the hand. The same for the target pose (with the extents
+    of the body that supports it, 0 for a goal in the world; the yaw is relative to the object). The offsets object -
+    TCP, goal - TCP and goal - object follow again as near-field components d / (|d| + NEAR), in -1..1 and steep around
+    0. Then the velocities of `observation.velocity`, because LeRobot's ACT takes no second state vector, and last the
+    raw poses of all movable bodies.
+    """
+    base_from_world = scene.robot.world_from_base.inverse().vector()[np.newaxis]
+    tcp = rows.base_from_tcp
+    poses = {name: _compose(base_from_world, pose) for name, pose in rows.object_poses.items()}
+    for body in scene.fixed:
+        poses[body.name] = _compose(base_from_world, body.world_from_body.vector()[np.newaxis])
+    yield _axes("tcp."), tcp[:, :3]
+    yield _yaw_names("tcp.yaw", 1), _yaw(tcp, 1)
     for label, goal in _labelled_goals(scene):
-        n, wanted = scene.body(goal.object).yaw_symmetry, f"{label}.goal"
-        yield from _axes(f"{label}.", f"{label}.size.", f"{label}.from_tcp.", f"{label}.from_tcp.hand_")
-        if n:
-            yield from _yaw_names(f"{label}.yaw", n)
-            yield from _yaw_names(f"{label}.from_tcp.yaw", n)
-        yield from _axes(f"{wanted}.", f"{wanted}.size.", f"{wanted}.from_tcp.", f"{wanted}.from_tcp.hand_")
-        yield from _axes(f"{label}.from_tcp.near_", f"{wanted}.from_tcp.near_", f"{wanted}.from_{goal.object}.near_")
-        if goal.yaw_symmetry:
-            yield from _yaw_names(f"{wanted}.yaw", goal.yaw_symmetry)
-            yield from _yaw_names(f"{wanted}.from_{goal.object}.yaw", goal.yaw_symmetry)
-    yield from _velocity_names(robot)
+        body, object_ = scene.body(goal.object), poses[goal.object]
+        onto_pose = poses[goal.onto] if goal.onto else base_from_world
+        onto_size = scene.body(goal.onto).shape.extents if goal.onto else (0.0, 0.0, 0.0)
+        wanted = np.broadcast_to(_compose(onto_pose, goal.onto_from_goal.vector()[np.newaxis]), (len(tcp), 7))
+        goal_label, from_object = f"{label}.goal", f"{label}.goal.from_{goal.object}"
+        yield from _placed(label, object_, body.shape.extents, tcp)
+        if n := body.yaw_symmetry:
+            yield _yaw_names(f"{label}.yaw", n), _yaw(object_, n)
+            yield _yaw_names(f"{label}.from_tcp.yaw", n), _difference(_yaw(object_, n), _yaw(tcp, n))
+        yield from _placed(goal_label, wanted, onto_size, tcp)
+        yield _near(f"{label}.from_tcp", tcp, object_)
+        yield _near(f"{goal_label}.from_tcp", tcp, wanted)
+        yield _near(from_object, object_, wanted)
+        if n := goal.yaw_symmetry:
+            yield _yaw_names(f"{goal_label}.yaw", n), _yaw(wanted, n)
+            yield _yaw_names(f"{from_object}.yaw", n), _difference(_yaw(wanted, n), _yaw(object_, n))
+    yield from _velocities(rows, robot)
     for body in scene.movable:
-        yield from (f"{body.name}.pose.{axis}" for axis in _POSE)
+        yield tuple(f"{body.name}.pose.{axis}" for axis in _POSE), poses[body.name]
 
 
-def _axes(*prefixes: str) -> Iterable[str]:
-    return (f"{prefix}{axis}" for prefix in prefixes for axis in _POSITION)
+def _placed(label: str, pose: Array, extents: tuple[float, float, float], tcp: Array) -> _Columns:
+    """Yield position, extents and offset from the TCP in base axes and in hand axes, metres."""
+    offset = pose[:, :3] - tcp[:, :3]
+    conjugate = tcp[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
+    yield _axes(f"{label}."), pose[:, :3]
+    yield _axes(f"{label}.size."), np.broadcast_to(np.array(extents), (len(tcp), 3))
+    yield _axes(f"{label}.from_tcp."), offset
+    yield _axes(f"{label}.from_tcp.hand_"), _rotate(conjugate, offset)
+
+
+def _near(label: str, start: Array, end: Array) -> tuple[tuple[str, ...], Array]:
+    offset = end[:, :3] - start[:, :3]
+    return _axes(f"{label}.near_"), offset / (np.abs(offset) + NEAR)
+
+
+def _axes(prefix: str) -> tuple[str, ...]:
+    return tuple(prefix + axis for axis in _POSITION)
 
 
 def _yaw_names(prefix: str, n: int) -> tuple[str, str]:
@@ -157,74 +217,16 @@ def _yaw_names(prefix: str, n: int) -> tuple[str, str]:
     return f"{prefix}.sin{times}", f"{prefix}.cos{times}"
 
 
-def _environment_columns(rows: ObservationRows, robot: RobotSpec, scene: Scene) -> list[Array]:
-    """Compute first the inputs a policy learns best from, then raw poses (metres, rad; base frame).
-
-    First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents, position
-    relative to the TCP in base axes and in hand axes, and, for a body with a yaw symmetry of 2 pi / n, its yaw as sine
-    and cosine of n times the angle, absolute and relative to the hand. The same for the target pose (with the extents
-    of the body that supports it, 0 for a goal in the world; the yaw is relative to the object). The offsets object -
-    TCP, goal - TCP and goal - object follow again as near-field components (`near_field`). Then the velocities of
-    `observation.velocity`, because LeRobot's ACT takes no second state vector, and last the raw poses of all movable
-    bodies.
-    """
-    count = len(rows.gripper_width)
-    base_from_world = scene.robot.world_from_base.inverse().vector()[np.newaxis]
-    tcp = rows.base_from_tcp
-    poses = {name: _compose(base_from_world, pose) for name, pose in rows.object_poses.items()}
-    hand_yaw = _yaw(tcp, 1)
-    columns = [tcp[:, :3], *hand_yaw]
-    for _, goal in _labelled_goals(scene):
-        body = scene.body(goal.object)
-        onto_pose, onto_size = _onto(scene, goal, poses, base_from_world)
-        wanted = np.broadcast_to(_compose(onto_pose, goal.onto_from_goal.vector()[np.newaxis]), (count, 7))
-        object_ = poses[goal.object]
-        columns += [object_[:, :3], _repeat(body.shape.extents, count), *_seen_from(tcp, object_)]
-        if body.yaw_symmetry:
-            object_yaw = _yaw(object_, body.yaw_symmetry)
-            columns += [*object_yaw, *_difference(object_yaw, _yaw(tcp, body.yaw_symmetry))]
-        columns += [wanted[:, :3], _repeat(onto_size, count), *_seen_from(tcp, wanted)]
-        columns += [near_field(a[:, :3] - b[:, :3]) for a, b in ((object_, tcp), (wanted, tcp), (wanted, object_))]
-        if goal.yaw_symmetry:
-            wanted_yaw = _yaw(wanted, goal.yaw_symmetry)
-            columns += [*wanted_yaw, *_difference(wanted_yaw, _yaw(object_, goal.yaw_symmetry))]
-    return [*columns, *_velocities(rows, robot), *(poses[body.name] for body in scene.movable)]
-
-
-def _labelled_goals(scene: Scene) -> list[tuple[str, Goal]]:
+def _labelled_goals(scene: Scene) -> Iterator[tuple[str, Goal]]:
     """Give each goal a unique label: its object's name, numbered from the second goal of the same object on."""
-    seen: dict[str, int] = {}
-    labelled = []
+    seen: Counter[str] = Counter()
     for goal in scene.goals:
-        seen[goal.object] = seen.get(goal.object, 0) + 1
-        labelled.append((goal.object if seen[goal.object] == 1 else f"{goal.object}#{seen[goal.object]}", goal))
-    return labelled
+        seen[goal.object] += 1
+        yield goal.object if seen[goal.object] == 1 else f"{goal.object}#{seen[goal.object]}", goal
 
 
-def _onto(
-    scene: Scene, goal: Goal, poses: Mapping[str, Array], base_from_world: Array
-) -> tuple[Array, tuple[float, float, float]]:
-    if not goal.onto:
-        return base_from_world, (0.0, 0.0, 0.0)
-    body = scene.body(goal.onto)
-    if goal.onto in poses:
-        return poses[goal.onto], body.shape.extents
-    return _compose(base_from_world, body.world_from_body.vector()[np.newaxis]), body.shape.extents
-
-
-def _seen_from(tcp: Array, pose: Array) -> tuple[Array, Array]:
-    offset = pose[:, :3] - tcp[:, :3]
-    conjugate = tcp[:, 3:] * np.array([-1.0, -1.0, -1.0, 1.0])
-    return offset, _rotate(conjugate, offset)
-
-
-def near_field(offset: Array) -> Array:
-    """Convert offsets (metres, any shape) to near-field components d / (|d| + NEAR), in -1..1 and steep around 0."""
-    return np.asarray(offset / (np.abs(offset) + NEAR), dtype=np.float64)
-
-
-def _yaw(pose: Array, n: int) -> tuple[Array, Array]:
-    """Compute sine and cosine (T,) of n times the yaw of the body axis used by `demorec.episode.scene.yaw_of`."""
+def _yaw(pose: Array, n: int) -> Array:
+    """Compute sine and cosine (T, 2) of n times the yaw of the body axis used by `demorec.episode.scene.yaw_of`."""
     rotation = _rotation(pose[:, 3:])
     vertical = np.argmax(np.abs(rotation[:, 2]), axis=1)
     horizontal = (vertical + 1) % 3
@@ -235,12 +237,12 @@ def _yaw(pose: Array, n: int) -> tuple[Array, Array]:
     sin, cos = sin1, cos1
     for _ in range(n - 1):
         sin, cos = sin * cos1 + cos * sin1, cos * cos1 - sin * sin1
-    return sin, cos
+    return np.stack([sin, cos], axis=1)
 
 
-def _difference(a: tuple[Array, Array], b: tuple[Array, Array]) -> tuple[Array, Array]:
-    (sin_a, cos_a), (sin_b, cos_b) = a, b
-    return sin_a * cos_b - cos_a * sin_b, cos_a * cos_b + sin_a * sin_b
+def _difference(a: Array, b: Array) -> Array:
+    (sin_a, cos_a), (sin_b, cos_b) = a.T, b.T
+    return np.stack([sin_a * cos_b - cos_a * sin_b, cos_a * cos_b + sin_a * sin_b], axis=1)
 
 
 # --------------------------------------------------------------------------------------------------------- actions
@@ -278,12 +280,7 @@ def action_vectors(
     translation in base axes (m), then rotation vector in base axes (rad, |r| <= pi), applied from the left
     (`pose_from_delta`); noise is removed as in `joint_increment`, with rotation vectors added.
 
-    Args:
-        trajectory: Numbers of the whole episode.
-        scene: Scene of the episode.
-        kind: Kind of action.
-        rows: Frames to return; increments are taken between these.
-        dtype: Type of the numbers.
+    `rows` are the frames of the whole episode to return; increments are taken between these.
     """
     gripper = trajectory.action_gripper[rows]
     if kind == "joint":
@@ -302,11 +299,6 @@ def action_vectors(
     shifts[1:] += share * (poses[:-1, :3] - executed[:-1, :3])
     turns[1:] += share * _rotation_vectors(executed[:-1, 3:], poses[:-1, 3:])
     return _joined([shifts, turns, gripper], dtype)
-
-
-def command_vectors(trajectory: Trajectory) -> Vectors:
-    """Compute (T, D) float64 motor commands: joint targets (rad), gripper opening (m)."""
-    return _joined([trajectory.command_joint_target, trajectory.command_gripper], np.float64)
 
 
 def _noise_share(time_ns: NDArray[np.int64]) -> float:
@@ -349,21 +341,9 @@ def _rotation_vectors(before: Array, after: Array) -> Array:
 # ---------------------------------------------------------------------------------------------- arithmetic on rows
 
 
-def _joined(columns: Iterable[Array], dtype: VectorType) -> Vectors:
-    parts = [part[:, np.newaxis] if part.ndim == 1 else part for part in columns]
-    joined: Array = np.concatenate(parts, axis=1)
+def _joined(columns: Sequence[Array], dtype: VectorType) -> Vectors:
+    joined: Array = np.column_stack(columns)
     return joined if dtype is np.float64 else joined.astype(np.float32)
-
-
-def _repeat(values: tuple[float, ...], count: int) -> Array:
-    return np.broadcast_to(np.array(values, dtype=np.float64), (count, len(values)))
-
-
-def _velocities(rows: ObservationRows, robot: RobotSpec) -> list[Array]:
-    """Return the velocities of the arm's joints and of the gripper's opening."""
-    arm = len(robot.arm_joints)
-    opening = robot.gripper.width_velocity(rows.joint_position[:, arm:], rows.joint_velocity[:, arm:])
-    return [rows.joint_velocity[:, :arm], opening]
 
 
 def _continuous(pose: Array) -> Array:

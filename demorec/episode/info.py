@@ -34,47 +34,33 @@ DEPTH_UNITS: Mapping[str, float] = {"16UC1": 1000.0, "32FC1": 1.0}
 
 @dataclass(frozen=True, kw_only=True)
 class SensorStream:
-    """Messages of a simulated sensor, one per frame.
-
-    Attributes:
-        topic: Topic of the messages.
-        layout: "wrench" for three forces and three torques (geometry_msgs/WrenchStamped), "array" for any vector
-            (std_msgs/Float64MultiArray).
-        frame: Link in whose axes the vectors of a wrench are given.
-    """
+    """Messages of a simulated sensor, one per frame."""
 
     topic: str
+    # "wrench" for three forces and three torques (geometry_msgs/WrenchStamped), "array" for any vector
+    # (std_msgs/Float64MultiArray).
     layout: Literal["wrench", "array"] = "array"
-    frame: str = ""
+    frame: str = ""  # link in whose axes the vectors of a wrench are given
 
 
 @dataclass(frozen=True, kw_only=True)
 class Feature:
-    """A vector present in every frame.
+    """A vector present in every frame."""
 
-    Attributes:
-        name: Name in datasets: "observation.state", "action", "observation.force".
-        dtype: Type of its numbers, as recorded.
-        names: Names of its D elements.
-        units: Units of its elements ("rad", "deg", "m"), or empty if unknown.
-        joints: For each element the URDF joint that it measures ("" for none); empty without joints. Positions are
-            in rad and m, or in degrees if the unit is "deg", unless there is a calibration.
-        source: Its origin, in words: "/joint_states position, latest before, header stamps".
-        calibration: For each element a factor and an offset, for servos with other units: factor times the value plus
-            offset is rad or m; empty if the unit suffices.
-        role: Role that its name does not imply; "" if its common name does (`demorec.episode.roles`).
-        stream: Messages of a simulated sensor; None for any other feature.
-    """
-
-    name: str
-    dtype: Literal["float32", "float64"] = "float64"
-    names: tuple[str, ...]
-    units: tuple[str, ...] = ()
+    name: str  # name in datasets: "observation.state", "action", "observation.force"
+    dtype: Literal["float32", "float64"] = "float64"  # type of its numbers, as recorded
+    names: tuple[str, ...]  # names of its D elements
+    units: tuple[str, ...] = ()  # units of its elements ("rad", "deg", "m"), or empty if unknown
+    # For each element the URDF joint that it measures ("" for none); empty without joints. Positions are in rad and m,
+    # or in degrees if the unit is "deg", unless there is a calibration.
     joints: tuple[str, ...] = ()
-    source: str = ""
+    source: str = ""  # its origin, in words: "/joint_states position, latest before, header stamps"
+    # For each element a factor and an offset, for servos with other units: factor times the value plus offset is rad or
+    # m; empty if the unit suffices.
     calibration: tuple[tuple[float, float], ...] = ()
+    # Role that its name does not imply; "" if its common name does (`demorec.episode.roles`).
     role: Literal["", "state", "action", "gripper"] = ""
-    stream: SensorStream | None = None
+    stream: SensorStream | None = None  # messages of a simulated sensor; None for any other feature
 
     def in_si(self, values: NDArray[Any]) -> Array:
         """Convert values (..., D) to float64 (..., D): positions to rad and m, other values unchanged."""
@@ -87,40 +73,27 @@ class Feature:
 
 leave_out_default(Feature, "role", "stream")
 
-_OBSERVATION = "observation."
-
-
-def sensor_feature(quantity: str) -> str:
-    """Return the feature of a sensed quantity: "observation.wrench" for "wrench"."""
-    return _OBSERVATION + quantity
+OBSERVATION = "observation."
+"""Prefix of a sensed quantity's feature: "observation.wrench" for "wrench"."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Camera:
-    """A camera; unknown parts are absent.
+    """A camera; unknown parts are absent."""
 
-    Attributes:
-        name: Unique; also its topic.
-        width, height: Pixels.
-        kept: Codec of passthrough images; "" for pixels, which the recorder encodes. For a depth camera ROS's name of
-            its bit-exact distances: "16UC1" (whole millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or
-            not finite where nothing was measured).
-        intrinsics: K row by row, 9 numbers in pixels; None if unknown.
-        distortion: Plumb bob coefficients (k1, k2, p1, p2, k3); empty for none.
-        mount: The URDF link that carries it, "world" for a fixed camera of a scene; "" if unknown.
-        mount_from_camera: Pose in the frame of that link, OpenCV axes; None if unknown.
-        source: Origin of its images, in words.
-    """
-
-    name: str
+    name: str  # unique; also its topic
+    # width, height: pixels.
     width: int
     height: int
+    # Codec of passthrough images; "" for pixels, which the recorder encodes. For a depth camera ROS's name of its bit-
+    # exact distances: "16UC1" (whole millimetres, 0 where nothing was measured) or "32FC1" (metres, 0 or not finite
+    # where nothing was measured).
     kept: Kept = ""
-    intrinsics: tuple[float, ...] | None = None
-    distortion: tuple[float, ...] = ()
-    mount: str = ""
-    mount_from_camera: Pose | None = None
-    source: str = ""
+    intrinsics: tuple[float, ...] | None = None  # K row by row, 9 numbers in pixels; None if unknown
+    distortion: tuple[float, ...] = ()  # plumb bob coefficients (k1, k2, p1, p2, k3); empty for none
+    mount: str = ""  # the URDF link that carries it, "world" for a fixed camera of a scene; "" if unknown
+    mount_from_camera: Pose | None = None  # pose in the frame of that link, OpenCV axes; None if unknown
+    source: str = ""  # origin of its images, in words
 
     @property
     def is_depth(self) -> bool:
@@ -141,83 +114,54 @@ class SourceFile:
 
 @dataclass(frozen=True, kw_only=True)
 class Origin:
-    """The origin of an external episode.
+    """The origin of an external episode."""
 
-    Attributes:
-        kind: The `Recorder` in a user's program, `demorec import`, or a dataset that is read directly.
-        files: Imported files.
-        mapping_digest: Digest of the mapping used by the import.
-    """
-
+    # The `Recorder` in a user's program, `demorec import`, or a dataset that is read directly.
     kind: Literal["recorder", "import", "dataset"] = "recorder"
     files: tuple[SourceFile, ...] = ()
-    mapping_digest: str = ""
+    mapping_digest: str = ""  # digest of the mapping used by the import
 
 
 @dataclass(frozen=True, kw_only=True)
 class Simulation:
-    """The part of a description that only simulated episodes have.
-
-    Attributes:
-        root_seed: Root seed of the run.
-        task: Name of the task (or "package.module:Name").
-        robot: The arm.
-        scene: Scene at the start, including cameras with intrinsics and mounts.
-        physics_hz: Steps per second.
-        cpu: Type of the CPU that simulated it (`demorec.core.config.cpu_type`).
-        behaviour: Name -> value of all other random draws of this episode (speed, approach height,
-            noise level), for the card and for analysis.
-        config: The resolved GenerateConfig as plain JSON data.
-        config_digest: SHA-256 of it, 16 hex digits.
-    """
+    """The part of a description that only simulated episodes have."""
 
     root_seed: int
-    task: str
+    task: str  # name of the task (or "package.module:Name")
     robot: RobotSpec
-    scene: Scene
-    physics_hz: int
-    cpu: str = ""
+    scene: Scene  # scene at the start, including cameras with intrinsics and mounts
+    physics_hz: int  # steps per second
+    cpu: str = ""  # type of the CPU that simulated it (`demorec.core.config.cpu_type`)
+    # Name -> value of all other random draws of this episode (speed, approach height, noise level), for the card and
+    # for analysis.
     behaviour: Mapping[str, float] = field(default_factory=dict)
-    config: Mapping[str, Any] = field(default_factory=dict)
-    config_digest: str = ""
+    config: Mapping[str, Any] = field(default_factory=dict)  # the resolved GenerateConfig as plain JSON data
+    config_digest: str = ""  # SHA-256 of it, 16 hex digits
 
 
 @dataclass(frozen=True, kw_only=True)
 class EpisodeInfo:
-    """The description of an episode, recorded as metadata. Holds no clock, host name or path.
-
-    Attributes:
-        episode_index: Index of the episode in the run.
-        attempt: Number of the attempt.
-        instruction: The task in words; LeRobot's task text.
-        robot_name: Name of the robot.
-        urdf: Its description as text, "" if unknown; that of a simulated robot is in the scene's models.
-        fps: Nominal frames per second; the timestamps of the frames are exact.
-        features: Vectors that every frame has.
-        cameras: None to many.
-        origin: Origin of the episode; for a simulated one "" if generated, "replay of DIGEST" or "render of DIGEST" if
-            derived.
-        versions: package -> version of the packages that wrote it; for a simulated one those that determine the bits
-            (demorec, pybullet, numpy, numba, av), and digests of the user's modules.
-        simulation: Scene, seed, task; None for an episode that demorec did not simulate.
-    """
+    """The description of an episode, recorded as metadata. Holds no clock, host name or path."""
 
     episode_index: int
     attempt: int = 0
-    instruction: str
+    instruction: str  # the task in words; LeRobot's task text
     robot_name: str = ""
-    urdf: str = ""
-    fps: int
+    urdf: str = ""  # its description as text, "" if unknown; that of a simulated robot is in the scene's models
+    fps: int  # nominal frames per second; the timestamps of the frames are exact
     features: tuple[Feature, ...] = ()
     cameras: tuple[Camera, ...] = ()
+    # Origin of the episode; for a simulated one "" if generated, "replay of DIGEST" or "render of DIGEST" if derived.
     origin: str | Origin = ""
+    # package -> version of the packages that wrote it; for a simulated one those that determine the bits (demorec,
+    # pybullet, numpy, numba, av), and digests of the user's modules.
     versions: Mapping[str, str] = field(default_factory=dict)
-    simulation: Simulation | None = None
+    simulation: Simulation | None = None  # scene, seed, task; None for an episode that demorec did not simulate
 
     @property
     def sensors(self) -> Mapping[str, Feature]:
         """Sensed quantity, as in `Observation.sensed` -> its feature."""
-        return {f.name.removeprefix(_OBSERVATION): f for f in self.features if f.stream is not None}
+        return {f.name.removeprefix(OBSERVATION): f for f in self.features if f.stream is not None}
 
     @property
     def simulated(self) -> Simulation:

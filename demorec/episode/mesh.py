@@ -27,17 +27,12 @@ _END_OF_PART = 0xFFFF
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SolidMesh:
-    """A closed surface in the body's frame.
+    """A closed surface in the body's frame."""
 
-    Attributes:
-        points: (V, 3) metres.
-        faces: (F, 3) rows of `points`, counter-clockwise from outside.
-        parts: Rows of `points`; the hull of each is one convex part of the solid in physics. Empty for a mesh just read
-            from a file: `demorec.sim.solids` finds them.
-    """
-
-    points: Array
-    faces: NDArray[np.int64]
+    points: Array  # (V, 3) metres
+    faces: NDArray[np.int64]  # (F, 3) rows of `points`, counter-clockwise from outside
+    # Rows of `points`; the hull of each is one convex part of the solid in physics. Empty for a mesh just read from a
+    # file: `demorec.sim.solids` finds them.
     parts: tuple[NDArray[np.int64], ...]
 
     @property
@@ -58,7 +53,8 @@ class SolidMesh:
 
     def mass_properties(self) -> tuple[float, Array, Array]:
         """Compute volume, m^3, centre (3,), m, and (3,) m^2: the moments of inertia about the centre's axes over the
-        mass."""
+        mass.
+        """
         corners = self.points[self.faces]  # (F, 3, 3)
         six = (corners[:, 0] * np.cross(corners[:, 1], corners[:, 2])).sum(axis=1)
         volume = float(six.sum()) / 6

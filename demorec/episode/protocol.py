@@ -23,34 +23,23 @@ Box = tuple[int, str, tuple[float, float, float, float]]
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SceneMotion:
-    """The motion of a robot, its scene and its cameras over T frames; unknown parts are empty.
+    """The motion of a robot, its scene and its cameras over T frames; unknown parts are empty."""
 
-    Attributes:
-        joint_position: Joint of the URDF -> (T,) rad or m.
-        base_from_tcp: (T, 7), None if unknown.
-        object_poses: Name -> (T, 7), world_from_object.
-        end_poses: Name -> (7,) pose of an object at the end, for sources that may not know its trajectory.
-        world_from_camera: Name -> (T, 7).
-    """
-
-    joint_position: Mapping[str, Array] = field(default_factory=dict)
-    base_from_tcp: Array | None = None
-    object_poses: Mapping[str, Array] = field(default_factory=dict)
+    joint_position: Mapping[str, Array] = field(default_factory=dict)  # joint of the URDF -> (T,) rad or m
+    base_from_tcp: Array | None = None  # (T, 7), None if unknown
+    object_poses: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7), world_from_object
+    # Name -> (7,) pose of an object at the end, for sources that may not know its trajectory.
     end_poses: Mapping[str, Array] = field(default_factory=dict)
-    world_from_camera: Mapping[str, Array] = field(default_factory=dict)
+    world_from_camera: Mapping[str, Array] = field(default_factory=dict)  # name -> (T, 7)
 
 
 class Episode(Protocol):
     """An open episode of any source; unknown parts are absent.
 
-    Attributes:
-        path: File, or folder of the dataset.
-        num_frames: T.
-
     Methods and properties raise DemorecError if the files cannot be read. Those with a body return what is unknown.
     """
 
-    path: Path
+    path: Path  # file, or folder of the dataset
     num_frames: int
 
     @property

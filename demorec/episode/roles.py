@@ -78,14 +78,10 @@ _JOINTS = re.compile(r"(^|_)(joints?(_(pos|positions?|angles?))?|qpos|proprio)$"
 
 
 class Column(NamedTuple):
-    """A feature, as input to the search for roles.
+    """A feature, as input to the search for roles."""
 
-    Attributes:
-        dtype: Its type: "float32", "int64", "string", "video", ...
-        elements: Names of the elements of a vector of numbers, "0", "1", ... where unknown; empty for anything else.
-    """
-
-    dtype: str
+    dtype: str  # "float32", "int64", "string", "video", ...
+    # Names of the elements of a vector of numbers, "0", "1", ... where unknown; empty for anything else.
     elements: tuple[str, ...] = ()
 
     @property
@@ -120,33 +116,23 @@ NO_NAMES = NamedRoles()
 
 @dataclass(frozen=True, kw_only=True)
 class Modality:
-    """Content of GR00T's `modality.json`.
+    """Content of GR00T's `modality.json`."""
 
-    Attributes:
-        state, action: Features that they consist of, in order.
-        labels: Features that are annotations.
-        elements: Feature -> names of its elements after their groups: "left_arm.0", "gripper".
-    """
-
+    # state, action: features that they consist of, in order.
     state: tuple[str, ...] = ()
     action: tuple[str, ...] = ()
     labels: tuple[str, ...] = ()
+    # Feature -> names of its elements after their groups: "left_arm.0", "gripper".
     elements: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, kw_only=True)
 class Roles:
-    """The role of each feature of an episode or a dataset.
+    """The role of each feature of an episode or a dataset."""
 
-    Attributes:
-        of: Feature -> its role, None if it has none; without `COUNTERS`.
-        columns: Feature -> its type and elements.
-        state, action: Features that they consist of, concatenated.
-        named: Roles named by the user.
-    """
-
-    of: Mapping[str, Role | None]
-    columns: Mapping[str, Column]
+    of: Mapping[str, Role | None]  # feature -> its role, None if it has none; without `COUNTERS`
+    columns: Mapping[str, Column]  # feature -> its type and elements
+    # state, action: features that they consist of, concatenated.
     state: tuple[str, ...]
     action: tuple[str, ...]
     named: NamedRoles
@@ -163,9 +149,7 @@ class Roles:
     def elements(self, parts: Sequence[str], *, qualified: bool = False) -> tuple[str, ...]:
         """List the names of the elements of concatenated features.
 
-        Args:
-            parts: The features.
-            qualified: Whether an element is named "joint.0" after its feature even if there is only one feature.
+        With `qualified`, an element is named "joint.0" after its feature even if there is only one feature.
         """
         if len(parts) == 1 and not (qualified and _head(parts[0])[1]):
             return self.columns[parts[0]].elements
@@ -233,16 +217,10 @@ def roles_of_features(features: Iterable[Feature], named: NamedRoles) -> Roles:
 
 
 def find_roles(columns: Mapping[str, Column], named: NamedRoles, modality: Modality | None = None) -> Roles:
-    """Find the role of each feature.
-
-    Args:
-        columns: Feature -> its type and elements, in their order.
-        named: The user's roles; they take precedence.
-        modality: Roles of `modality.json`; they precede names.
+    """Find the role of each feature: named by the user, else in `modality.json`, else implied by its name.
 
     Raises:
-        ConfigError: The user named a missing feature, one that is not a vector of numbers, or one feature for two
-            roles.
+        ConfigError: The user named a missing feature, one that is not a vector, or one feature for two roles.
     """
     modality = modality or Modality()
     columns = {
@@ -340,7 +318,8 @@ def _role_by_name(name: str, column: Column) -> Role | None:
 
 def _state_parts(free: Sequence[str]) -> tuple[str, ...]:
     """Find the state: a feature of this name, else all parts of one that are joints or grippers, else joints, else
-    poses."""
+    poses.
+    """
     heads = {name: _head(name) for name in free}
     whole = [name for name, (head, words) in heads.items() if head == "state" and words in ([], ["robot"])]
     if whole:

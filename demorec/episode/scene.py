@@ -24,26 +24,20 @@ Role = Literal["object", "target", "support", "distractor", "fixture"]
 
 @dataclass(frozen=True, kw_only=True)
 class Shape:
-    """The geometry of a body, in its own frame (origin at the centre of mass, unless the URDF says otherwise).
+    """The geometry of a body, in its own frame (origin at the centre of mass, unless the URDF says otherwise)."""
 
-    Attributes:
-        kind: Geometry; decides the meaning of `size`.
-        size: box: (x, y, z) full extents; sphere: (radius,); cylinder and capsule: (radius, length) along z;
-            mesh and urdf: (x, y, z) extents of the bounding box after scaling, for features and grasping.
-        file: mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`, or
-            "module:PATH" for one next to a user's module (a task may give it relative to its module).
-        scale: mesh and urdf: uniform scale of the file.
-        origin: mesh: the point of the file, in its own axes before scaling, that becomes the body's origin.
-        y_up: mesh: whether the file's y axis points up (its x axis stays x).
-        mesh: mesh: the solid itself instead of a file, as encoded by `demorec.episode.mesh`, with origin and scale.
-    """
-
-    kind: ShapeKind
+    kind: ShapeKind  # geometry; decides the meaning of `size`
+    # box: (x, y, z) full extents; sphere: (radius,); cylinder and capsule: (radius, length) along z; mesh and urdf: (x,
+    # y, z) extents of the bounding box after scaling, for features and grasping.
     size: tuple[float, ...]
+    # mesh and urdf: path below pybullet_data, or "demorec:NAME" for a file of `demorec/sim/assets`, or "module:PATH"
+    # for one next to a user's module (a task may give it relative to its module).
     file: str = ""
-    scale: float = 1.0
+    scale: float = 1.0  # mesh and urdf: uniform scale of the file
+    # mesh: the point of the file, in its own axes before scaling, that becomes the body's origin.
     origin: Vector3 = (0.0, 0.0, 0.0)
-    y_up: bool = False
+    y_up: bool = False  # mesh: whether the file's y axis points up (its x axis stays x)
+    # mesh: the solid itself instead of a file, as encoded by `demorec.episode.mesh`, with origin and scale.
     mesh: str = ""
 
     @property
@@ -70,58 +64,37 @@ Pattern = Literal["plain", "checker", "stripes", "noise", "wood"]
 
 @dataclass(frozen=True, kw_only=True)
 class Texture:
-    """A procedural texture, a pure function of its fields, without external files.
-
-    Attributes:
-        pattern: Kind of pattern.
-        colors: The two colours (r, g, b in 0..1) that it blends.
-        scale: Repetitions over the texture's side.
-        seed: Seed of the pattern's noise.
-    """
+    """A procedural texture, a pure function of its fields, without external files."""
 
     pattern: Pattern
-    colors: tuple[Vector3, Vector3]
-    scale: float = 4.0
+    colors: tuple[Vector3, Vector3]  # the two colours (r, g, b in 0..1) that it blends
+    scale: float = 4.0  # repetitions over the texture's side
     seed: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
 class Body:
-    """One body other than the robot.
+    """One body other than the robot."""
 
-    Attributes:
-        name: Unique in the scene; also its topic and coordinate frame.
-        role: object: to be manipulated; target: its destination; support, fixture: fixed; distractor: irrelevant to the
-            task.
-        shape: Geometry.
-        world_from_body: Pose at the start.
-        mass: kg; 0 for a fixed body.
-        lateral_friction, spinning_friction, rolling_friction: Coulomb coefficients, as PyBullet's changeDynamics.
-        restitution: 0 (no bounce) .. 1.
-        linear_damping, angular_damping: 1/s.
-        rgba: Colour; (1, 1, 1, 1) keeps the colours of a URDF or mesh file.
-        color_name: Its word in instructions, or "".
-        texture: Procedural texture, multiplied by the colour, or None.
-        collides: False for a visual-only mark.
-        yaw_symmetry: n if its appearance repeats every 2 pi / n about its vertical axis; 0 if it is the same at every
-            angle.
-    """
-
-    name: str
+    name: str  # unique in the scene; also its topic and coordinate frame
+    # object: to be manipulated; target: its destination; support, fixture: fixed; distractor: irrelevant to the task.
     role: Role
     shape: Shape
     world_from_body: Pose
-    mass: float = 0.0
+    mass: float = 0.0  # kg; 0 for a fixed body
+    # lateral_friction, spinning_friction, rolling_friction: Coulomb coefficients, as PyBullet's changeDynamics.
     lateral_friction: float = 0.6
     spinning_friction: float = 0.0
     rolling_friction: float = 0.0
-    restitution: float = 0.0
+    restitution: float = 0.0  # 0 (no bounce) .. 1
+    # linear_damping, angular_damping: 1/s.
     linear_damping: float = 0.04
     angular_damping: float = 0.04
-    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)
-    color_name: str = ""
-    texture: Texture | None = None
-    collides: bool = True
+    rgba: Rgba = (1.0, 1.0, 1.0, 1.0)  # colour; (1, 1, 1, 1) keeps the colours of a URDF or mesh file
+    color_name: str = ""  # its word in instructions, or ""
+    texture: Texture | None = None  # procedural texture, multiplied by the colour, or None
+    collides: bool = True  # False for a visual-only mark
+    # n if its appearance repeats every 2 pi / n about its vertical axis; 0 if it is the same at every angle.
     yaw_symmetry: int = 1
 
     @property
@@ -141,21 +114,14 @@ class Body:
 
 @dataclass(frozen=True, kw_only=True)
 class Goal:
-    """Target of one object: the plain-data part of a task's aim, for features, cards and checks.
-
-    Attributes:
-        object: Name of the object.
-        onto: Name of the body that it is placed on or in, or "" for a goal in the world.
-        onto_from_goal: Target pose of the object in that body's frame (in the world for "").
-        yaw_symmetry: As `Body.yaw_symmetry`, for the target yaw; 0 if any yaw is acceptable.
-        area: Minimum x and y, maximum x and y in that body's frame, metres: the object's origin may be anywhere in it,
-            as in a tray; None if it must be at the target pose.
-    """
+    """Target of one object: the plain-data part of a task's aim, for features, cards and checks."""
 
     object: str
-    onto: str
-    onto_from_goal: Pose
-    yaw_symmetry: int = 4
+    onto: str  # name of the body that it is placed on or in, or "" for a goal in the world
+    onto_from_goal: Pose  # target pose of the object in that body's frame (in the world for "")
+    yaw_symmetry: int = 4  # as `Body.yaw_symmetry`, for the target yaw; 0 if any yaw is acceptable
+    # Minimum x and y, maximum x and y in that body's frame, metres: the object's origin may be anywhere in it, as in a
+    # tray; None if it must be at the target pose.
     area: tuple[float, float, float, float] | None = None
 
     def distance(self, world_from_onto: Pose, world_from_object: Pose) -> float:
@@ -170,21 +136,13 @@ class Goal:
 
 @dataclass(frozen=True, kw_only=True)
 class RobotPlacement:
-    """Robot, its placement and its initial state.
+    """Robot, its placement and its initial state."""
 
-    Attributes:
-        name: Row of the robots' table.
-        world_from_base: Pose of the base.
-        scale: Uniform scale of the URDF.
-        joint_position: (n_arm,) initial arm joint positions, rad.
-        gripper_width: Initial opening, metres.
-    """
-
-    name: str
+    name: str  # row of the robots' table
     world_from_base: Pose
-    scale: float = 1.0
-    joint_position: tuple[float, ...]
-    gripper_width: float
+    scale: float = 1.0  # uniform scale of the URDF
+    joint_position: tuple[float, ...]  # (n_arm,) initial arm joint positions, rad
+    gripper_width: float  # initial opening, metres
 
 
 POSITION_GAIN = 0.2
@@ -193,69 +151,48 @@ POSITION_GAIN = 0.2
 
 @dataclass(frozen=True, kw_only=True)
 class Physics:
-    """Engine parameters, all set at every reset (PyBullet leaks some into later clients).
+    """Engine parameters, all set at every reset (PyBullet leaks some into later clients)."""
 
-    Attributes:
-        hz: Steps per second.
-        solver_iterations: Maximum iterations of each step.
-        grip_iterations: The same while a finger touches an object; 0 for the same number.
-        gravity: m/s^2.
-        contact_breaking_threshold: Relative motion of two bodies after which Bullet drops a contact point, as a ratio
-            of the smaller one's radius. With Bullet's 0.02 a small, light, slippery cube can rock between fingers that
-            touch it in one point each, and they penetrate it (docs/simulation.md).
-        finger_stiffness: Contact stiffness of a finger, N/m: a finger that pushes at one point penetrates the object by
-            the force divided by it. With PyBullet's 30,000 and 20 N that is 0.7 mm, and over a millimetre when the
-            object meets the table (docs/simulation.md).
-    """
-
-    hz: int = 240
-    solver_iterations: int = 50
-    gravity: Vector3 = (0.0, 0.0, -9.81)
+    hz: int = 240  # steps per second
+    solver_iterations: int = 50  # maximum iterations of each step
+    gravity: Vector3 = (0.0, 0.0, -9.81)  # m/s^2
+    # Relative motion of two bodies after which Bullet drops a contact point, as a ratio of the smaller one's radius.
+    # With Bullet's 0.02 a small, light, slippery cube can rock between fingers that touch it in one point each, and
+    # they penetrate it (docs/simulation.md).
     contact_breaking_threshold: float = 0.05
+    # Contact stiffness of a finger, N/m: a finger that pushes at one point penetrates the object by the force divided
+    # by it. With PyBullet's 30,000 and 20 N that is 0.7 mm, and over a millimetre when the object meets the table
+    # (docs/simulation.md).
     finger_stiffness: float = 120_000.0
-    grip_iterations: int = 0
+    grip_iterations: int = 0  # the same while a finger touches an object; 0 for the same number
 
 
 @dataclass(frozen=True, kw_only=True)
 class Light:
-    """One directional light and the sky, for every renderer.
+    """One directional light and the sky, for every renderer."""
 
-    Attributes:
-        direction: From the scene towards the light, world frame; need not be of unit length.
-        color: Colour of the light, r, g, b in 0..1.
-        ambient, diffuse, specular: Coefficients of the Phong terms.
-        shadow: Ratio of the direct light removed in a shadow, 0 (no shadows) .. 1.
-        sky_color: Colour of the background, r, g, b in 0..1.
-    """
-
-    direction: Vector3 = (0.5, -0.4, 1.0)
-    color: Vector3 = (1.0, 1.0, 1.0)
+    direction: Vector3 = (0.5, -0.4, 1.0)  # from the scene towards the light, world frame; need not be of unit length
+    color: Vector3 = (1.0, 1.0, 1.0)  # colour of the light, r, g, b in 0..1
+    # ambient, diffuse, specular: coefficients of the Phong terms.
     ambient: float = 0.5
     diffuse: float = 0.55
     specular: float = 0.1
-    shadow: float = 0.6
-    sky_color: Vector3 = (0.72, 0.80, 0.88)
+    shadow: float = 0.6  # ratio of the direct light removed in a shadow, 0 (no shadows) .. 1
+    sky_color: Vector3 = (0.72, 0.80, 0.88)  # colour of the background, r, g, b in 0..1
 
 
 @dataclass(frozen=True, kw_only=True)
 class SceneCamera:
-    """A pinhole camera, fixed in the world or carried by a robot link.
+    """A pinhole camera, fixed in the world or carried by a robot link."""
 
-    Attributes:
-        name: Unique; also its topic.
-        width, height: Pixels.
-        fov_y: Vertical field of view, rad.
-        mount: "world", or the name of a robot link.
-        mount_from_camera: Pose in the mount's frame, OpenCV axes (x right, y down, z forward).
-        near, far: Clipping distances along the optical axis, metres.
-    """
-
-    name: str
+    name: str  # unique; also its topic
+    # width, height: pixels.
     width: int
     height: int
-    fov_y: float
-    mount: str
-    mount_from_camera: Pose
+    fov_y: float  # vertical field of view, rad
+    mount: str  # "world", or the name of a robot link
+    mount_from_camera: Pose  # pose in the mount's frame, OpenCV axes (x right, y down, z forward)
+    # near, far: clipping distances along the optical axis, metres.
     near: float = 0.02
     far: float = 6.0
 
@@ -267,24 +204,16 @@ class SceneCamera:
 
 @dataclass(frozen=True, kw_only=True)
 class Scene:
-    """Everything that the simulator and the renderers need to rebuild an episode's start.
-
-    Attributes:
-        robot: The robot.
-        bodies: Bodies in loading order, which is part of the physics' determinism.
-        goals: Final placements, in the order of execution.
-        physics, light: Parameters.
-        cameras: All cameras, in order; empty without images.
-        hold: How the hand holds objects: by friction alone, or by a rigid constraint from the moment both fingers press
-            on one until the gripper opens (a shortcut of many tutorials).
-    """
+    """Everything that the simulator and the renderers need to rebuild an episode's start."""
 
     robot: RobotPlacement
-    bodies: tuple[Body, ...]
-    goals: tuple[Goal, ...] = ()
+    bodies: tuple[Body, ...]  # bodies in loading order, which is part of the physics' determinism
+    goals: tuple[Goal, ...] = ()  # final placements, in the order of execution
     physics: Physics = field(default_factory=Physics)
     light: Light = field(default_factory=Light)
-    cameras: tuple[SceneCamera, ...] = ()
+    cameras: tuple[SceneCamera, ...] = ()  # all cameras, in order; empty without images
+    # How the hand holds objects: by friction alone, or by a rigid constraint from the moment both fingers press on one
+    # until the gripper opens (a shortcut of many tutorials).
     hold: Literal["friction", "constraint"] = "friction"
 
     def body(self, name: str) -> Body:

@@ -18,14 +18,11 @@ from demorec.episode.features import (
     EFFORT,
     STATE,
     VELOCITY,
-    action_names,
     action_vectors,
-    command_vectors,
     observation_names,
     observation_vectors,
 )
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
-from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Scene
 
 
@@ -39,13 +36,7 @@ def simulated_info(
     attempt: int = 0,
     versions: Mapping[str, str] | None = None,
 ) -> EpisodeInfo:
-    """Describe an episode that demorec simulates.
-
-    Args:
-        simulation: Scene, seed and robot.
-        sensors: Features that have a stream.
-        episode_index, instruction, fps, attempt, origin, versions: As in `EpisodeInfo`.
-    """
+    """Describe an episode that demorec simulates, with the features of some sensors."""
     return EpisodeInfo(
         episode_index=episode_index,
         attempt=attempt,
@@ -60,11 +51,7 @@ def simulated_info(
 
 
 def with_simulation(info: EpisodeInfo, **changes: Any) -> EpisodeInfo:
-    """Change fields of an episode's `Simulation`, and with it the cameras and the names of elements.
-
-    Raises:
-        RecordingError: demorec did not simulate this episode.
-    """
+    """Change fields of an episode's `Simulation`, and with it cameras and names of elements; raises as `simulated`."""
     simulation = replace(info.simulated, **changes)
     features = simulated_features(simulation, list(info.sensors.values()))
     return replace(info, simulation=simulation, features=features, cameras=simulated_cameras(simulation.scene))
@@ -87,41 +74,28 @@ def simulated_cameras(scene: Scene) -> tuple[Camera, ...]:
 
 def simulated_features(simulation: Simulation, sensors: Sequence[Feature]) -> tuple[Feature, ...]:
     """Describe the vectors of a simulated episode; `simulated_table` returns their values."""
-    robot, arm = simulation.robot, simulation.robot.arm_joints
-    names = observation_names(robot, simulation.scene)
-    target_names = action_names(robot, "joint")
-    joints, units = (*arm, ""), (*("rad" for _ in arm), "m")
+    arm, names = simulation.robot.arm_joints, observation_names(simulation.robot, simulation.scene)
+    state = Feature(name=STATE, names=names[STATE], units=("rad",) * len(arm) + ("m",), joints=(*arm, ""))
+    efforts, force = "motor torques of the arm's joints (N m)", "sum of the normal forces on the fingers (N)"
+    effort_names = tuple(f"{joint}.effort" for joint in arm)
     return (
-        Feature(name=STATE, names=names[STATE], units=units, joints=joints),
-        Feature(name=VELOCITY, names=names[VELOCITY], units=(*("rad/s" for _ in arm), "m/s")),
+        state,
+        Feature(name=VELOCITY, names=names[VELOCITY], units=("rad/s",) * len(arm) + ("m/s",)),
         Feature(name=EE_POSE, names=names[EE_POSE], units=("m", "m", "m", "", "", "", "")),
-        Feature(
-            name=EFFORT,
-            names=tuple(f"{joint}.effort" for joint in arm),
-            units=("N m",) * len(arm),
-            source="motor torques of the arm's joints (N m)",
-        ),
-        Feature(
-            name=CONTACT_FORCE,
-            names=("gripper.force",),
-            units=("N",),
-            source="sum of the normal forces on the fingers (N)",
-        ),
+        Feature(name=EFFORT, names=effort_names, units=("N m",) * len(arm), source=efforts),
+        Feature(name=CONTACT_FORCE, names=("gripper.force",), units=("N",), source=force),
         *sensors,
-        Feature(name=ACTION, names=target_names, units=units, joints=joints),
-        Feature(name=COMMAND, names=target_names, units=units, joints=joints),
+        replace(state, name=ACTION),
+        replace(state, name=COMMAND),
     )
 
 
 def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
     """Convert a trajectory to its described features, in float64; each frame has the image of its number."""
     robot, scene = info.simulated.robot, info.simulated.scene
-    rows = ObservationRows.of_trajectory(trajectory)
-    vectors = {
-        **observation_vectors(rows, robot, scene, sensed=on_request(info), dtype=np.float64),
-        ACTION: action_vectors(trajectory, scene, "joint", dtype=np.float64),
-        COMMAND: command_vectors(trajectory),
-    }
+    vectors = observation_vectors(trajectory, robot, scene, sensed=on_request(info), dtype=np.float64)
+    vectors[ACTION] = action_vectors(trajectory, scene, "joint", dtype=np.float64)
+    vectors[COMMAND] = np.column_stack([trajectory.command_joint_target, trajectory.command_gripper])
     features = {feature.name: vectors[feature.name] for feature in info.features}
     cameras = list(trajectory.world_from_camera)
     return Table(
@@ -154,14 +128,8 @@ def simulation_facts(info: EpisodeInfo) -> Mapping[str, Any]:
     """
     if info.simulation is None:
         return {}
-    simulation = info.simulation
-    return {
-        "task": simulation.task,
-        "root_seed": simulation.root_seed,
-        "physics_hz": simulation.physics_hz,
-        "objects": [body.name for body in simulation.scene.movable],
-        "config_digest": simulation.config_digest,
-    }
+    facts = {key: getattr(info.simulation, key) for key in ("task", "root_seed", "physics_hz", "config_digest")}
+    return facts | {"objects": [body.name for body in info.simulation.scene.movable]}
 
 
 def scene_of(info: EpisodeInfo) -> Scene | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 
 from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import SceneError
@@ -17,44 +17,67 @@ from demorec.core.geometry import Pose
 from demorec.core.plain import from_json
 from demorec.episode.info import Camera, EpisodeInfo, Feature, Simulation
 from demorec.episode.mesh import decode_mesh
-from demorec.episode.scene import Body, Scene, SceneCamera, Shape
+from demorec.episode.scene import Body, Scene, SceneCamera
 from demorec.episode.simulated import simulated_cameras, simulated_features
 from demorec.robots.robot import RobotSpec
 from demorec.robots.urdf import Urdf
 
-_MOST = {"bodies": 255, "goals": 255, "cameras": 64, "arm joints": 64, "gripper joints": 64}
-"""Maximum counts. Segmentation images distinguish 255 bodies; the others are far beyond any known scene."""
+_MOST = {
+    "bodies": 255,  # segmentation images distinguish 255
+    "goals": 255,
+    "cameras": 64,
+    "arm joints": 64,
+    "gripper joints": 64,
+    "features": 256,
+    "elements": 4096,
+}
+"""Maximum counts; where no reason is given, far beyond any known scene."""
+_RANGES: Mapping[str, tuple[float, float]] = {
+    "episode_index": (0, 2**63 - 1),
+    "attempt": (0, 2**31),
+    "root_seed": (0, 2**63 - 1),
+    "fps": (1, 10_000),
+    "physics_hz": (1, 100_000),
+    "hz": (1, 100_000),
+    "scale": (1e-9, 1e4),
+    "mass": (0, 1e6),
+    "yaw_symmetry": (0, 360),
+    "fov_y": (1e-3, math.pi - 1e-3),
+}
+"""Field -> its minimum and maximum, wherever it occurs."""
 _SIZE_LENGTH = {"box": 3, "sphere": 1, "cylinder": 2, "capsule": 2, "mesh": 3, "urdf": 3}
-_MAX_METRES = 1e4
 _MAX_LISTED = 5
+_MAX_TEXT = 10_000
+_FEATURE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*")
+_TOPIC = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*)+")
+_CAMERA = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+_RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera", "language")
+"""Reserved first words of topics."""
+_DATASET = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task", "next", "observation.images")
+"""Column names of datasets."""
 
 
 def read_episode_info(text: str, *, simulated: bool = True) -> EpisodeInfo:
-    """Parse the description of an episode from its JSON.
-
-    Args:
-        text: JSON text.
-        simulated: Whether only a simulated episode is accepted.
-
-    Raises:
-        ValueError: One line with the reason.
-    """
+    """Parse the description of an episode, by default only of a simulated one; ValueError in one line if invalid."""
     info = from_json(text, EpisodeInfo)
     if simulated and info.simulation is None:
         raise ValueError("it does not describe a simulated episode")
-    wrong = find_problems(info)
-    if wrong:
+    if wrong := find_problems(info):
         raise ValueError("; ".join(wrong[:_MAX_LISTED]))
     return info
 
 
-def _episode(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
+def find_problems(info: EpisodeInfo) -> list[str]:
+    """List all problems that make a description invalid, in words; empty if it is valid."""
+    own = list(_in_range("", info, "episode_index", "attempt", "fps"))
+    if info.simulation is None:
+        return [*own, *_external(info)]
+    return [*own, *_simulation(info.simulation)] or list(_contradictions(info, info.simulation))
+
+
+def _simulation(simulation: Simulation) -> Iterator[str]:
     robot, scene = simulation.robot, simulation.scene
-    yield from _within("episode_index", info.episode_index, 0, 2**63 - 1)
-    yield from _within("attempt", info.attempt, 0, 2**31)
-    yield from _within("root_seed", simulation.root_seed, 0, 2**63 - 1)
-    yield from _within("fps", info.fps, 1, 10_000)
-    yield from _within("physics_hz", simulation.physics_hz, 1, 100_000)
+    yield from _in_range("", simulation, "root_seed", "physics_hz")
     yield from _robot(robot)
     yield from _scene(scene)
     placed = len(scene.robot.joint_position)
@@ -72,15 +95,15 @@ def _contradictions(info: EpisodeInfo, simulation: Simulation) -> Iterator[str]:
         yield from _sensor_stream(feature)
     if unknown := [feature.name for feature in info.features if feature not in known]:
         yield f"the features {', '.join(unknown)} are not those of its robot"
-    yield from _unique("features", [feature.name for feature in info.features])
+    yield from _names("features", [feature.name for feature in info.features])
     if info.cameras != simulated_cameras(simulation.scene):
         yield "the cameras are not those of the scene"
 
 
 def _robot(robot: RobotSpec) -> Iterator[str]:
-    yield from _count("arm joints", robot.arm_joints, least=1)
-    yield from _count("gripper joints", robot.gripper.joints, least=0)
-    yield from _unique("joints of the robot", robot.joint_names)
+    yield from _count("arm joints", len(robot.arm_joints), least=1)
+    yield from _count("gripper joints", len(robot.gripper.joints))
+    yield from _names("joints of the robot", robot.joint_names)
     for name in ("home_q", "position_lower", "position_upper", "velocity_limit", "acceleration_limit", "torque_limit"):
         values: tuple[float, ...] = getattr(robot, name)
         if len(values) != len(robot.arm_joints):
@@ -90,31 +113,22 @@ def _robot(robot: RobotSpec) -> Iterator[str]:
 
 
 def _scene(scene: Scene) -> Iterator[str]:
-    yield from _count("bodies", scene.bodies, least=0)
-    yield from _count("goals", scene.goals, least=0)
-    yield from _count("cameras", scene.cameras, least=0)
-    yield from _unique("bodies", [body.name for body in scene.bodies])
-    yield from _unique("cameras", [camera.name for camera in scene.cameras])
+    known, movable = [body.name for body in scene.bodies], [body.name for body in scene.movable]
+    yield from _count("bodies", len(scene.bodies))
+    yield from _count("goals", len(scene.goals))
+    yield from _count("cameras", len(scene.cameras))
+    yield from _names("bodies", known)
+    yield from _names("cameras", [camera.name for camera in scene.cameras])
     yield from _pose("world_from_base", scene.robot.world_from_base)
-    yield from _positive("scale of the robot", scene.robot.scale)
-    yield from _within("hz of the physics", scene.physics.hz, 1, 100_000)
-    yield from _within("solver_iterations", scene.physics.solver_iterations, 1, 10_000)
-    yield from _within("grip_iterations", scene.physics.grip_iterations, 0, 10_000)
-    yield from _positive("contact_breaking_threshold", scene.physics.contact_breaking_threshold)
-    yield from _within("finger_stiffness", scene.physics.finger_stiffness, 1, 1e9)
+    yield from _in_range("the robot", scene.robot, "scale")
+    yield from _in_range("the physics", scene.physics, "hz")
     for body in scene.bodies:
         yield from _body(body)
     for camera in scene.cameras:
-        yield from _camera(camera)
-    movable = {body.name for body in scene.movable}
-    known = {body.name for body in scene.bodies}
+        yield from _scene_camera(camera)
     for goal in scene.goals:
         yield from _pose("onto_from_goal", goal.onto_from_goal)
-        yield from _within("yaw_symmetry of a goal", goal.yaw_symmetry, 0, 360)
-        if goal.area is not None:
-            least_x, least_y, most_x, most_y = goal.area
-            if not (least_x <= most_x and least_y <= most_y and max(map(abs, goal.area)) <= _MAX_METRES):
-                yield f"the area of a goal is from ({least_x}, {least_y}) to ({most_x}, {most_y})"
+        yield from _in_range("a goal", goal, "yaw_symmetry")
         if goal.object not in movable:
             yield f"a goal is for {goal.object!r}, which is not a movable body of the scene"
         if goal.onto and goal.onto not in known:
@@ -122,27 +136,15 @@ def _scene(scene: Scene) -> Iterator[str]:
 
 
 def _body(body: Body) -> Iterator[str]:
-    what = f"the body {body.name!r}"
+    what, shape = f"the body {body.name!r}", body.shape
     yield from _pose(what, body.world_from_body)
-    yield from _shape(what, body.shape)
-    yield from _within(f"yaw_symmetry of {what}", body.yaw_symmetry, 0, 360)
-    yield from _within(f"mass of {what}", body.mass, 0, 1e6)
-    colors = [body.rgba, *(body.texture.colors if body.texture is not None else ())]
-    if not all(0 <= part <= 1 for color in colors for part in color):
-        yield f"a colour of {what} is outside 0 to 1"
-    if body.texture is not None:
-        yield from _within(f"texture scale of {what}", body.texture.scale, 1e-3, 1e4)
-        yield from _within(f"texture seed of {what}", body.texture.seed, 0, 2**63 - 1)
-
-
-def _shape(what: str, shape: Shape) -> Iterator[str]:
+    yield from _in_range(what, body, "yaw_symmetry", "mass")
+    yield from _in_range(f"the shape of {what}", shape, "scale")
     expected = _SIZE_LENGTH[shape.kind]
     if len(shape.size) != expected:
         yield f"the size of {what}, a {shape.kind}, has {len(shape.size)} numbers instead of {expected}"
-    for value in (*shape.size, shape.scale):
-        yield from _positive(f"a size of {what}", value)
-    if max(map(abs, shape.origin)) > _MAX_METRES:
-        yield f"the origin of {what} is far away"
+    if not all(0 < value < 1e4 for value in shape.size):
+        yield f"the size of {what} is {shape.size}"
     if shape.mesh:
         try:
             decode_mesh(shape.mesh)
@@ -150,12 +152,11 @@ def _shape(what: str, shape: Shape) -> Iterator[str]:
             yield f"the mesh of {what}: {error}"
 
 
-def _camera(camera: SceneCamera) -> Iterator[str]:
+def _scene_camera(camera: SceneCamera) -> Iterator[str]:
     what = f"the camera {camera.name!r}"
     yield from _pose(what, camera.mount_from_camera)
     yield from _pixels(what, camera)
-    if not 1e-3 <= camera.fov_y <= math.pi - 1e-3:
-        yield f"fov_y of {what} is {camera.fov_y:g}, it must be between 0 and pi"
+    yield from _in_range(what, camera, "fov_y")
     if not 0 < camera.near < camera.far:
         yield f"{what} sees from {camera.near:g} to {camera.far:g} m"
 
@@ -167,70 +168,41 @@ def _pixels(what: str, camera: Camera | SceneCamera) -> Iterator[str]:
 
 
 def _pose(what: str, pose: Pose) -> Iterator[str]:
-    if float(abs(pose.position).max()) > _MAX_METRES:
-        yield f"the position of {what} is far away"
     if not 0.5 < math.hypot(*pose.quat_xyzw.tolist()) < 2.0:  # `demorec check` judges the precision
         yield f"the rotation of {what} is invalid"
 
 
-def _positive(what: str, value: float) -> Iterator[str]:
-    if not 0 < value <= _MAX_METRES:
-        yield f"{what} is {value:g}"
+def _in_range(what: str, owner: object, *fields: str) -> Iterator[str]:
+    for field in fields:
+        value = getattr(owner, field)
+        low, high = _RANGES[field]
+        if not low <= value <= high:
+            yield f"{field}{what and f' of {what}'} is {value}, allowed are {low:g} to {high:g}"
 
 
-def _within(what: str, value: float, low: float, high: float) -> Iterator[str]:
-    if not low <= value <= high:
-        yield f"{what} is {value}, allowed are {low} to {high}"
+def _count(what: str, count: int, *, least: int = 0) -> Iterator[str]:
+    if not least <= count <= _MOST[what]:
+        yield f"there are {count} {what}, allowed are {least} to {_MOST[what]}"
 
 
-def _count(what: str, items: Iterable[object], *, least: int) -> Iterator[str]:
-    yield from _within(f"the number of {what}", len(tuple(items)), least, _MOST[what])
-
-
-def _unique(what: str, names: Iterable[str], *, commas: bool = True) -> Iterator[str]:
-    allowed = "" if commas else ", allowed are printable characters without commas"
+def _names(what: str, names: Iterable[str]) -> Iterator[str]:
     for name, count in Counter(names).items():
         if count > 1:
             yield f"{count} {what} are called {name!r}"
-        if not name or not name.isprintable() or (not commas and "," in name):
-            yield f"one of the {what} is called {name!r}{allowed}"
-
-
-_FEATURE = re.compile(r"[A-Za-z][A-Za-z0-9_]*(\.[A-Za-z][A-Za-z0-9_]*)*")
-_TOPIC = re.compile(r"(/[A-Za-z][A-Za-z0-9_]*)+")
-_CAMERA = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
-_RESERVED = ("frames", "tf", "tf_static", "robot_description", "camera", "language")
-"""Reserved first words of topics."""
-_DATASET = ("timestamp", "frame_index", "episode_index", "index", "task_index", "task", "next", "observation.images")
-"""Column names of datasets."""
-_MAX_ELEMENTS = 4096
-_MAX_FEATURES = 256
-_MAX_CAMERAS = 64
-_MAX_TEXT = 10_000
-
-
-def find_problems(info: EpisodeInfo) -> list[str]:
-    """List all problems that make a description invalid, in words; empty if it is valid."""
-    if info.simulation is None:
-        return list(_external(info))
-    return list(_episode(info, info.simulation)) or list(_contradictions(info, info.simulation))
+        if not name or not name.isprintable() or "," in name:
+            yield f"one of the {what} is called {name!r}, allowed are printable characters without commas"
 
 
 def _external(info: EpisodeInfo) -> Iterator[str]:
-    yield from _within("episode_index", info.episode_index, 0, 2**31 - 1)
-    yield from _within("fps", info.fps, 1, 10_000)
     if not info.instruction.strip():
         yield "the task text is empty"
     for what, text in (("task text", info.instruction), ("name of the robot", info.robot_name)):
         if len(text) > _MAX_TEXT or not text.isprintable():
             yield f"the {what} is not a single line of at most {_MAX_TEXT} characters"
-    if not 1 <= len(info.features) <= _MAX_FEATURES or len(info.cameras) > _MAX_CAMERAS:
-        yield (
-            f"there are {len(info.features)} features and {len(info.cameras)} cameras, allowed are 1 to {_MAX_FEATURES}"
-            f" and up to {_MAX_CAMERAS}"
-        )
-    yield from _unique("features", [feature.name for feature in info.features], commas=False)
-    yield from _unique("cameras", [camera.name for camera in info.cameras], commas=False)
+    yield from _count("features", len(info.features), least=1)
+    yield from _count("cameras", len(info.cameras))
+    yield from _names("features", [feature.name for feature in info.features])
+    yield from _names("cameras", [camera.name for camera in info.cameras])
     joints: frozenset[str] = frozenset()
     links: frozenset[str] = frozenset()
     if info.urdf:
@@ -254,9 +226,9 @@ def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
     if name.partition(".")[0] in _RESERVED or any(name == own or name.startswith(own + ".") for own in _DATASET):
         yield f"a feature is called {name!r}, which is a reserved name"
     count = len(feature.names)
-    if not 1 <= count <= _MAX_ELEMENTS:
-        yield f"the feature {name!r} has {count} elements, allowed are 1 to {_MAX_ELEMENTS}"
-    yield from _unique(f"elements of the feature {name!r}", feature.names, commas=False)
+    if not 1 <= count <= _MOST["elements"]:
+        yield f"the feature {name!r} has {count} elements, allowed are 1 to {_MOST['elements']}"
+    yield from _names(f"elements of the feature {name!r}", feature.names)
     parts = (("units", feature.units), ("joints", feature.joints), ("calibrations", feature.calibration))
     for what, words in parts:
         if words and len(words) != count:
@@ -264,7 +236,7 @@ def _feature(feature: Feature, joints: frozenset[str]) -> Iterator[str]:
     named = list(filter(None, feature.joints))
     if unknown := [joint for joint in named if joints and joint not in joints]:
         yield f"the feature {name!r} has joints that the URDF lacks: {', '.join(unknown)}"
-    yield from _unique(f"joints of the feature {name!r}", named, commas=False)
+    yield from _names(f"joints of the feature {name!r}", named)
 
 
 def _sensor_stream(feature: Feature) -> Iterator[str]:

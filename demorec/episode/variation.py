@@ -1,4 +1,4 @@
-"""Variation of episodes: presets, and all ranges in one place.
+"""Variation of episodes: presets, all ranges in one place, and the form of recorded camera errors.
 
 A field that is None takes the preset's range. Ranges are sampled uniformly; a single number is the size of a symmetric
 spread, or a probability. Sampled values are recorded: in the scene if they are part of it, otherwise in
@@ -7,13 +7,16 @@ spread, or a probability. Sampled values are recorded: in the scene if they are 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 
 from demorec.core.errors import OptionError
+from demorec.core.geometry import Pose, angle_between
+from demorec.episode.scene import SceneCamera
 
 Range = tuple[float, float]
 Preset = Literal["none", "mild", "full"]
@@ -152,3 +155,51 @@ def resolve(preset: Preset, overrides: Ranges) -> Ranges:
     """Combine the preset's ranges with the user's; only cube_* may remain None."""
     chosen = {own.name: getattr(overrides, own.name) for own in fields(overrides)}
     return replace(PRESETS[preset], **{name: value for name, value in chosen.items() if value is not None})
+
+
+_ERROR_WORDS = ("x", "y", "z", "angle", "qx", "qy", "qz")
+
+
+def error_values(errors: Mapping[str, Pose]) -> dict[str, float]:
+    """Convert deliberate errors of recorded camera poses to their form in an episode's behaviour.
+
+    `errors` has camera name -> true_from_recorded. Each error gives `calibration_NAME_x`, `_y`, `_z` (m), `_angle`
+    (rad), and x, y, z of the quaternion, with positive w, as `_qx`, `_qy`, `_qz`.
+    """
+    values: dict[str, float] = {}
+    for name, error in errors.items():
+        if error != Pose():
+            x, y, z, w = error.quat_xyzw
+            turn = math.copysign(1.0, w) * np.array([x, y, z])
+            numbers = (*error.position, angle_between(error, Pose()), *turn)
+            words = (f"calibration_{name}_{word}" for word in _ERROR_WORDS)
+            values |= {word: float(number) for word, number in zip(words, numbers, strict=True)}
+    return values
+
+
+def stated_error(name: str, behaviour: Mapping[str, float]) -> Pose | None:
+    """Read true_from_recorded of a camera from an episode's behaviour; None if missing or not finite."""
+    numbers = np.array([behaviour.get(f"calibration_{name}_{word}", math.nan) for word in _ERROR_WORDS])
+    position, turn = numbers[:3], numbers[4:]
+    sine = float(np.linalg.norm(turn))
+    if not np.isfinite(numbers).all() or sine >= 1.0:
+        return None
+    return Pose(position=position, quat_xyzw=np.array([*turn, math.sqrt(1.0 - sine * sine)]))
+
+
+def true_cameras(
+    recorded: Sequence[SceneCamera], behaviour: Mapping[str, float]
+) -> tuple[tuple[SceneCamera, ...], dict[str, Pose]]:
+    """Return the cameras at their true poses, and camera name -> true_from_recorded of those with an error.
+
+    Generation draws from these cameras, so that a recording alone reproduces its images.
+    """
+    found = {camera.name: stated_error(camera.name, behaviour) for camera in recorded}
+    errors = {name: error for name, error in found.items() if error is not None}
+    cameras = []
+    for camera in recorded:
+        if camera.name in errors:
+            true = camera.mount_from_camera @ errors[camera.name].inverse()
+            camera = replace(camera, mount_from_camera=true)
+        cameras.append(camera)
+    return tuple(cameras), errors

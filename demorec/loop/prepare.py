@@ -15,11 +15,10 @@ from demorec.core.plain import digest, to_plain
 from demorec.core.registry import is_foreign, modules_of
 from demorec.core.seeding import Purpose, generator
 from demorec.core.tables import CAMERAS, RENDERERS, TASKS, camera_name, load_robot
-from demorec.episode.camera_error import error_values, true_cameras
 from demorec.episode.info import EpisodeInfo, Simulation
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.simulated import simulated_info
-from demorec.episode.variation import Ranges, resolve
+from demorec.episode.variation import Ranges, error_values, resolve, true_cameras
 from demorec.objects.folder import load_shelf
 from demorec.render import Renderer
 from demorec.render.painter import WarmRenderer

@@ -44,35 +44,24 @@ _STEEP = 0.5
 
 @dataclass(frozen=True, kw_only=True)
 class Grasp:
-    """One grasp, relative to the solid's origin; x, y and yaw in axes that turn with it about the vertical.
+    """One grasp, relative to the solid's origin; x, y and yaw in axes that turn with it about the vertical."""
 
-    Attributes:
-        x, y, z: Position of the TCP, metres.
-        yaw: Angle, rad, of the hand's x axis, which runs along the pads; the fingers close across it.
-        width: Distance between the contacts, metres.
-        cost: Smaller is better.
-    """
-
+    # x, y, z: position of the TCP, metres.
     x: float
     y: float
     z: float
-    yaw: float
-    width: float
-    cost: float
+    yaw: float  # angle, rad, of the hand's x axis, which runs along the pads; the fingers close across it
+    width: float  # distance between the contacts, metres
+    cost: float  # smaller is better
 
 
 @functools.lru_cache(maxsize=256)
 def antipodal_grasps(
     text: str, gripper: Gripper, *, task_scale: float = 1.0, scale: float = 1.0, up: tuple[float, float, float]
 ) -> tuple[Grasp, ...]:
-    """Compute the best grasps of a solid with the hand pointing down, best first; empty if none fits.
+    """Compute the best grasps of a solid (`text` as in `Shape.mesh`) with the hand pointing down, best first.
 
-    Args:
-        text: Solid as text, as in `Shape.mesh`.
-        gripper: Gripper of the hand.
-        task_scale: As in `RobotSpec`.
-        scale: Scale of the solid.
-        up: Vertical of the world in the solid's axes.
+    `up` is the vertical of the world in the solid's axes. Empty if no grasp fits.
     """
     mesh = decode_mesh(text)
     points, normals = _surface(mesh, CLOUD)

@@ -19,17 +19,11 @@ HELD_OUT = 5
 
 @dataclass(frozen=True, kw_only=True)
 class Material:
-    """Density, friction and appearance.
+    """Density, friction and appearance."""
 
-    Attributes:
-        density: (low, high) kg/m^3 of the whole solid, including the content of a tin or bottle.
-        friction: (low, high) lateral coefficient.
-        patterns: Textures, one of which an object gets.
-    """
-
-    density: tuple[float, float]
-    friction: tuple[float, float]
-    patterns: tuple[Pattern, ...]
+    density: tuple[float, float]  # (low, high) kg/m^3 of the whole solid, including the content of a tin or bottle
+    friction: tuple[float, float]  # (low, high) lateral coefficient
+    patterns: tuple[Pattern, ...]  # textures, one of which an object gets
 
 
 MATERIALS: Mapping[str, Material] = {
@@ -45,23 +39,15 @@ MATERIALS: Mapping[str, Material] = {
 
 @dataclass(frozen=True, kw_only=True)
 class Kind:
-    """Objects of one name.
+    """Objects of one name."""
 
-    Attributes:
-        noun: Its word in instructions.
-        material: Row of `MATERIALS`.
-        shape: Number 0 .. count - 1 -> that shape, roughly in its resting pose; always the same.
-        count: Number of different shapes.
-        colors: Names of its possible colours; empty for all.
-        yaw_symmetry: As in `Body.yaw_symmetry`.
-    """
-
-    noun: str
-    material: str
+    noun: str  # its word in instructions
+    material: str  # row of `MATERIALS`
+    # Number 0 .. count - 1 -> that shape, roughly in its resting pose; always the same.
     shape: Callable[[int], SolidMesh]
     count: int
-    colors: tuple[str, ...] = ()
-    yaw_symmetry: int = 1
+    colors: tuple[str, ...] = ()  # names of its possible colours; empty for all
+    yaw_symmetry: int = 1  # as in `Body.yaw_symmetry`
 
     def numbers(self, split: Split) -> Sequence[int]:
         """Numbers of the shapes of a split; with fewer than `HELD_OUT` shapes none is held out."""

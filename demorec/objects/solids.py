@@ -42,10 +42,7 @@ def lathe(profile: Sequence[Point2], *, cavity: Sequence[Point2] = ()) -> SolidM
 def dish(floor: float, rim: float, height: float, *, thickness: float) -> SolidMesh:
     """Make a vessel with a flat floor and an outward-leaning wall, hollow in physics too, its floor at z = 0.
 
-    Args:
-        floor, rim: Inner radii of floor and rim, metres.
-        height: Height of the rim, metres.
-        thickness: Thickness of floor and wall, metres.
+    `floor` and `rim` are inner radii; all lengths are metres.
     """
     solid = lathe([(floor, 0.0), (rim, height)], cavity=[(rim - thickness, height), (floor, thickness)])
     rings = np.arange(4 * SIDES).reshape(4, SIDES)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 from demorec.core.geometry import Array
-from demorec.episode.info import Feature, SensorStream, sensor_feature
+from demorec.episode.info import OBSERVATION, Feature, SensorStream
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import Arm
 
@@ -40,7 +40,7 @@ class Sensor:
         """Describe the sensor of a robot."""
         elements = self.elements(robot)
         return Feature(
-            name=sensor_feature(self.quantity),
+            name=OBSERVATION + self.quantity,
             names=tuple(elements),
             units=tuple(elements.values()),
             source=self.meaning,

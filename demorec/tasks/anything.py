@@ -17,11 +17,11 @@ from demorec.objects.shelf import MATERIALS, Kind, Material
 from demorec.objects.solids import dish
 from demorec.robots.robot import RobotSpec
 from demorec.sim.solids import ROLLING_FRICTION, at_rest, with_parts
+from demorec.tasks.base import Layout, TableTask
 from demorec.tasks.furniture import COLORS, OTHER_COLORS, green_target, walls, words_for
 from demorec.tasks.grasping import found_grasps
-from demorec.tasks.placing import Layout, TableTask
+from demorec.tasks.pick import IN_TRAY, TRAY_FLOOR, TRAYS, tray
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler, wording
-from demorec.tasks.trays import IN_TRAY, TRAY_FLOOR, TRAYS, tray
 
 BESIDE_TRAY = Region(x=(0.33, 0.68), y=(-0.30, 0.15))
 EVERYWHERE = Region(x=(0.33, 0.68), y=(-0.30, 0.30))

@@ -6,8 +6,8 @@ import math
 
 from demorec.episode.episode import SuccessCheck
 from demorec.sim.world import World
+from demorec.tasks.base import Layout, TableTask, on_table, onto_cube, random_cube, start_and_target
 from demorec.tasks.furniture import cube, green_target, mark
-from demorec.tasks.placing import Layout, TableTask, on_table, onto_cube, random_cube, start_and_target
 from demorec.tasks.sampling import WORKSPACE, Region, Sampler
 from demorec.tasks.success import at_most
 

@@ -142,19 +142,12 @@ WHITE = (1.0, 1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, kw_only=True)
 class Thing:
-    """A kind of object.
+    """A kind of object."""
 
-    Attributes:
-        noun: Its word in instructions.
-        shape: Draws its geometry.
-        yaw_symmetry: As in `Body.yaw_symmetry`.
-        painted: Whether it gets a colour and the colour's word; a mesh keeps its colours.
-    """
-
-    noun: str
+    noun: str  # its word in instructions
     shape: Callable[[Sampler], Shape]
-    yaw_symmetry: int
-    painted: bool = True
+    yaw_symmetry: int  # as in `Body.yaw_symmetry`
+    painted: bool = True  # whether it gets a colour and the colour's word; a mesh keeps its colours
 
 
 def _box(sampler: Sampler) -> Shape:

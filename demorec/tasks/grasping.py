@@ -66,9 +66,7 @@ def nearest_first(yaws: Iterable[float], now: float) -> list[float]:
 def is_above(here: Pose, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
     """Check whether the hand can get from one `world_from_tcp` to another just by descending.
 
-    Args:
-        here, wanted: Current pose and target.
-        beside: Maximum horizontal distance, metres; beyond 1 cm also limited by the height above.
+    The horizontal distance may be up to `beside` metres; beyond 1 cm it is also limited by the height above.
     """
     above = float(here.position[2] - wanted.position[2])
     aside = math.dist(here.position[:2], wanted.position[:2])
@@ -78,10 +76,7 @@ def is_above(here: Pose, wanted: Pose, *, beside: float = ABOVE_M) -> bool:
 def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[float]:
     """List the hand yaws, rad, at which the fingers close over two opposite faces that fit between them.
 
-    Args:
-        body, pose: Body to grasp, and its pose in the world.
-        now: Current hand yaw, allowed for round bodies.
-        open_width: Opening of the gripper, metres.
+    For round bodies they include the current one, `now`.
     """
     vertical = int(np.argmax(np.abs(pose.rotation[2])))
     if body.yaw_symmetry == 0 and vertical == 2:
@@ -99,12 +94,6 @@ def grasp_yaws(body: Body, pose: Pose, now: float, open_width: float) -> list[fl
 
 def grasps_of(body: Body, pose: Pose, *, now: float, robot: RobotSpec, behaviour: Behaviour) -> list[Pose]:
     """List `world_from_tcp` of grasps with the behaviour's offset and errors, nearest to the current yaw first.
-
-    Args:
-        body, pose: Body to grasp, and its pose in the world.
-        now: Current hand yaw, rad.
-        robot: Robot with the hand.
-        behaviour: Variation in how the expert does it.
 
     For a mesh from a file, grasps across its narrower side come first.
     """
@@ -183,11 +172,7 @@ def _perturbed(grasp: Pose, behaviour: Behaviour) -> Pose:
 def places_of(body: Body, pose: Pose, wanted: Pose, *, hand: Pose, yaw_symmetry: int) -> list[Pose]:
     """List `world_from_tcp` that put a held body at its target, compensating its offset in the hand.
 
-    Args:
-        body, pose: Held body, and its pose in the world.
-        wanted: Target pose in the world, resting on the intended face.
-        hand: Current `world_from_tcp`.
-        yaw_symmetry: Number of equivalent yaws; 0: only the current one.
+    At the target (`wanted`) it rests on the intended face; with a `yaw_symmetry` of 0 only the current yaw is listed.
     """
     hand_from_object = (hand.inverse() @ pose).position
     now = hand_yaw(hand)
@@ -209,16 +194,11 @@ def grasps_beside(
     others: Collection[tuple[Body, Pose]],
     robot: RobotSpec,
 ) -> Iterator[Pose]:
-    """Yield poses of the open hand next to a body that touch nothing: grasps that miss.
+    """Yield poses of the open hand next to a body that touch neither it nor other bodies: grasps that miss.
 
-    Args:
-        grasps: `world_from_tcp` of grasps of it.
-        body, pose: Body to miss, and its pose in the world.
-        x, y: Offset from the body's centre in the hand's frame, metres. x is increased where the fingers would touch
-            the body. For each grasp the side of its sign (for 0: forward) comes first, then the other one; a blocked
-            side is omitted, so there may be none.
-        others: All other bodies and their poses.
-        robot: Robot with the hand.
+    x and y are the offset from the body's centre in the hand's frame, metres; x is increased where the fingers would
+    touch the body. For each grasp the side of its sign (for 0: forward) comes first, then the other one; a blocked
+    side is omitted, so there may be none.
     """
     for grasp in grasps:
         hand_x, hand_y = grasp.rotation[:, 0], grasp.rotation[:, 1]

@@ -29,23 +29,15 @@ _CONTROL_STEP = 1 / 30
 
 
 class Reach:
-    """Reachability of poses for the arm of a scene.
+    """Reachability of poses for the arm of a scene: a robot at the scene's scale, with or without its kinematics.
 
-    Args:
-        scene: Scene at the start.
-        robot: Robot at the scene's scale.
-        arm: Its kinematics, if already available.
-
-    Attributes:
-        arm: Its kinematics.
-        home: (n,) home configuration, rad.
-        start: (n,) configuration at the start, rad.
-        limits: Limits of its motions: below the joints' own limits, to leave room for noise.
+    Configurations are (n,) rad.
     """
 
     def __init__(self, scene: Scene, robot: RobotSpec, arm: ArmKinematics | None = None) -> None:
         self.arm = arm or arm_kinematics(robot, scale=scene.robot.scale)
         self.home, self.start = np.array(robot.home_q), np.array(scene.robot.joint_position)
+        # Below the joints' own limits, to leave room for noise.
         self.limits = MotionLimits(
             joint_velocity=0.6 * np.array(robot.velocity_limit),
             joint_acceleration=0.8 * np.array(robot.acceleration_limit),
@@ -95,10 +87,8 @@ class Reach:
         """Plan joint targets (T, n) to a pose in a straight line, or with all joints at once; None if neither works.
 
         Args:
-            world_from_tcp: Target pose.
-            start: (n,) current commanded configuration, rad.
-            speed: Peak speed of the TCP, m/s.
-            pace: Factor on it, on the speed of turning and on that of the joints.
+            world_from_tcp, start: Target pose, and current commanded configuration.
+            speed, pace: Peak speed of the TCP, m/s, and a factor on all speeds.
             dt: Control step, s.
             may_sink: Maximum depth, metres, of the TCP below both ends of the line when it leaves the line; None: it
                 must not leave it.
@@ -131,14 +121,8 @@ def within(reaches: Callable[[Pose], bool], poses: Iterable[Pose], *, up_to: flo
 
 
 def serves(scene: Scene, goals: Iterable[Goal], robot: RobotSpec, behaviour: Behaviour) -> bool:
-    """Check whether the arm reaches everything that the goals require, in order: a grasp, above it, and a matching
-    placement.
-
-    Args:
-        scene: Scene at the start.
-        goals: Its goals, in order.
-        robot: Robot at the scene's scale.
-        behaviour: Variation in how the expert does it.
+    """Check whether the arm of a robot at the scene's scale reaches everything that the goals require, in order: a
+    grasp, above it, and a matching placement.
     """
     reach = Reach(scene, robot)
     now = hand_yaw(reach.tcp(reach.start))

@@ -38,20 +38,16 @@ _ROUNDS = 2
 def finish(expert: Expert, goals: Sequence[Goal]) -> Iterator[Step]:
     """Serve every goal, in order, from any state of the world, without touching those already met.
 
-    Args:
-        expert: Expert made for the current world; its behaviour should not miss on purpose.
-        goals: Final placements of objects.
-
-    Raises:
-        ExpertFailure: An object or goal is out of reach, or several attempts failed.
+    The expert is made for the current world and does not miss on purpose. Raises ExpertFailure if an object or goal is
+    out of reach, or after several attempts.
     """
-    held = _held(expert)
+    held = next((body.name for body in expert.world.scene.movable if expert.holds(body.name)), "")
     yield from _stop(expert, holding=bool(held))
     if held and expert.holds(held):
         yield from _place_held(expert, held, goals)
     begun = _begun(expert, goals)
-    if begun is None:
-        yield from _stand_clear(expert)
+    if begun is None and not _is_clear(expert):
+        yield from _rise(expert)
     for _ in range(_ROUNDS):
         for goal in goals:
             if not is_served(expert.world, goal):
@@ -80,10 +76,6 @@ def _begun(expert: Expert, goals: Sequence[Goal]) -> Goal | None:
 def begin_again(expert: Expert) -> Iterator[Step]:
     """Stop, release any held object, and move the hand to where a script can begin."""
     yield from _stop(expert, holding=False)
-    yield from _stand_clear(expert)
-
-
-def _stand_clear(expert: Expert) -> Iterator[Step]:
     if not _is_clear(expert):
         yield from _rise(expert)
 
@@ -110,11 +102,6 @@ def put_back(world: World, name: str) -> Goal:
     """Make the goal of an object at its initial position."""
     body = world.body(name)
     return Goal(object=name, onto="", onto_from_goal=body.world_from_body, yaw_symmetry=body.yaw_symmetry)
-
-
-def _held(expert: Expert) -> str:
-    """Return the object that the fingers hold; "" if none."""
-    return next((body.name for body in expert.world.scene.movable if expert.holds(body.name)), "")
 
 
 def _stop(expert: Expert, *, holding: bool) -> Iterator[Step]:
@@ -150,7 +137,8 @@ def _place_held(expert: Expert, name: str, goals: Sequence[Goal]) -> Iterator[St
 
 def _is_clear(expert: Expert) -> bool:
     """Check whether the hand is high enough to move anywhere, and open or empty (it then opens while moving)."""
-    return (_is_open(expert) or not _held(expert)) and expert.tcp().position[2] >= _lowest_clear(expert)
+    is_empty = not any(expert.holds(body.name) for body in expert.world.scene.movable)
+    return (is_empty or _is_open(expert)) and expert.tcp().position[2] >= _lowest_clear(expert)
 
 
 def _is_open(expert: Expert) -> bool:

@@ -30,23 +30,10 @@ class FingerBoxes(NamedTuple):
     """Boxes of the fingers along the axes of the TCP, with the hand as open as in tasks.
 
     PyBullet's boxes are a few millimetres too large.
-
-    Attributes:
-        low, high: (n, 3) corners of the boxes, metres.
     """
 
-    low: Array
-    high: Array
-
-    @property
-    def centres(self) -> Array:
-        """Centres (n, 3), metres."""
-        return (self.low + self.high) / 2
-
-    @property
-    def depth(self) -> float:
-        """Distance of the finger tips beyond the TCP, metres."""
-        return float(self.high[:, 2].max())
+    centres: Array  # (n, 3), metres
+    depth: float  # distance of the finger tips beyond the TCP, metres
 
 
 def check_robot(spec: RobotSpec, *, uses_workspace: bool) -> None:
@@ -117,7 +104,7 @@ def finger_boxes(spec: RobotSpec) -> FingerBoxes:
         boxes = np.array([client.getAABB(arm.body, link) for link in arm.finger_links])
     finally:
         client.disconnect()
-    return FingerBoxes(low=boxes[:, 0], high=boxes[:, 1])
+    return FingerBoxes(centres=boxes.mean(axis=1), depth=float(boxes[:, 1, 2].max()))
 
 
 def finger_problem(spec: RobotSpec, fingers: FingerBoxes) -> str:

@@ -24,15 +24,12 @@ STRATIFIED_NUMBERS = 12
 
 @dataclass(frozen=True, kw_only=True)
 class Region:
-    """A rectangle on the table, metres, world frame, intersected with a ring about the robot's base.
+    """A rectangle on the table, metres, world frame, intersected with a ring about the robot's base."""
 
-    Attributes:
-        x, y: (low, high).
-        min_radius, max_radius: Range of distances from the base at (0, 0) that the hand reaches while pointing down.
-    """
-
+    # x, y: (low, high).
     x: tuple[float, float]
     y: tuple[float, float]
+    # min_radius, max_radius: range of distances from the base at (0, 0) that the hand reaches while pointing down.
     min_radius: float = 0.30
     max_radius: float = 0.72
 
@@ -63,29 +60,20 @@ WORKSPACE = Region(x=(0.35, 0.65), y=(-0.25, 0.25))
 
 @dataclass
 class Sampler:
-    """Draws the numbers of a layout.
+    """Draws the numbers of a layout."""
 
-    Attributes:
-        rng: The stream of purpose "scene".
-        unit_point: Coordinates in 0..1 of a stratified point (Sobol, Latin hypercube), used by the first placements,
-            one per call of `placement`; empty for plain random sampling.
-        ranges: Resolved ranges of the run, for `named` and for the initial joints.
-        split: "train" keeps every point out of the held-out rectangle, "eval" puts the first one into it.
-        fixed: Whether to use the task's exact layout, if it has one.
-        shelves: Object sets, for tasks that draw from them.
-        object_split: Subset of their shapes: `demorec.objects.shelf.Split`.
-        can_grasp: Whether the robot's gripper can grasp a mesh.
-        is_free: Whether an object may be at a point (x, y), in addition to the condition of `point`.
-    """
-
-    rng: np.random.Generator
+    rng: np.random.Generator  # the stream of purpose "scene"
+    # Coordinates in 0..1 of a stratified point (Sobol, Latin hypercube), used by the first placements, one per call of
+    # `placement`; empty for plain random sampling.
     unit_point: Sequence[float] = ()
-    ranges: Ranges = PRESETS["mild"]
+    ranges: Ranges = PRESETS["mild"]  # resolved ranges of the run, for `named` and for the initial joints
+    # "train" keeps every point out of the held-out rectangle, "eval" puts the first one into it.
     split: Literal["all", "train", "eval"] = "all"
-    fixed: bool = False
-    shelves: Sequence[Shelf] = ()
-    object_split: Split = "all"
-    can_grasp: Callable[[Shape], bool] = lambda shape: True
+    fixed: bool = False  # whether to use the task's exact layout, if it has one
+    shelves: Sequence[Shelf] = ()  # object sets, for tasks that draw from them
+    object_split: Split = "all"  # subset of their shapes: `demorec.objects.shelf.Split`
+    can_grasp: Callable[[Shape], bool] = lambda shape: True  # whether the robot's gripper can grasp a mesh
+    # Whether an object may be at a point (x, y), in addition to the condition of `point`.
     is_free: Callable[[tuple[float, float]], bool] = lambda point: True
     _used: int = field(default=0, init=False)
     _points: int = field(default=0, init=False)
@@ -152,11 +140,7 @@ def stratified_point(
 ) -> tuple[float, ...]:
     """Compute the stratified coordinates in 0..1 of one episode's layout; empty for "random".
 
-    Args:
-        method: A scrambled Sobol sequence, or one Latin hypercube per `block` episodes (scipy.stats.qmc).
-        root_seed: Root seed of the run.
-        episode_index: Index of the point.
-        block: Episodes in one Latin hypercube.
+    They follow a scrambled Sobol sequence, or one Latin hypercube per `block` episodes (scipy.stats.qmc).
     """
     if method == "random":
         return ()

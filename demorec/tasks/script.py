@@ -20,29 +20,22 @@ class ExpertFailure(Exception):
 
 @dataclass(frozen=True, kw_only=True)
 class Behaviour:
-    """Variation in how the expert does one episode; recorded as `EpisodeInfo.behaviour`.
+    """Variation in how the expert does one episode; recorded as `EpisodeInfo.behaviour`."""
 
-    Attributes:
-        speed: Factor on the speeds of all motions, except that objects never touch down faster than at 1.
-        approach_height, lift_height: Heights above the grasp, metres.
-        grasp_offset: Shift of the grasp along the fingers' faces, metres.
-        action_noise: Standard deviation of the exploration noise on the executed joint targets, rad.
-        miss_x, miss_y: Deliberate error of the first grasp in the hand's frame, metres, x along the fingers' faces; 0
-            if none. The actual miss may be larger, on the other side or omitted, so that nothing is touched.
-        perception_x, perception_y: Error of every perceived object position, metres.
-        perception_yaw: Error of every perceived object yaw, rad.
-    """
-
-    speed: float = 1.0
+    speed: float = 1.0  # factor on the speeds of all motions, except that objects never touch down faster than at 1
+    # approach_height, lift_height: heights above the grasp, metres.
     approach_height: float = 0.12
     lift_height: float = 0.15
-    grasp_offset: float = 0.0
-    action_noise: float = 0.02
+    grasp_offset: float = 0.0  # shift of the grasp along the fingers' faces, metres
+    action_noise: float = 0.02  # standard deviation of the exploration noise on the executed joint targets, rad
+    # miss_x, miss_y: deliberate error of the first grasp in the hand's frame, metres, x along the fingers' faces; 0 if
+    # none. The actual miss may be larger, on the other side or omitted, so that nothing is touched.
     miss_x: float = 0.0
     miss_y: float = 0.0
+    # perception_x, perception_y: error of every perceived object position, metres.
     perception_x: float = 0.0
     perception_y: float = 0.0
-    perception_yaw: float = 0.0
+    perception_yaw: float = 0.0  # error of every perceived object yaw, rad
 
     @property
     def misses(self) -> bool:
@@ -56,23 +49,14 @@ class Behaviour:
 
 @dataclass(frozen=True, kw_only=True)
 class Step:
-    """Decision of an agent, such as the script, for one control step; recorded in the `Frame` of that step.
+    """Decision of an agent, such as the script, for one control step; recorded in the `Frame` of that step."""
 
-    Attributes:
-        action: The label that a policy learns.
-        command: Command for the motors; None: the action.
-        phase: "approach", "lift", ...
-        noise_allowed: Whether exploration noise is harmless now (free motion, away from objects).
-        events: Events since the previous step.
-        is_deliberate_miss: Whether this belongs to a deliberate miss.
-    """
-
-    action: Action
-    command: Action | None = None
-    phase: str = ""
-    noise_allowed: bool = False
-    events: tuple[Event, ...] = ()
-    is_deliberate_miss: bool = False
+    action: Action  # the label that a policy learns
+    command: Action | None = None  # command for the motors; None: the action
+    phase: str = ""  # "approach", "lift", ..
+    noise_allowed: bool = False  # whether exploration noise is harmless now (free motion, away from objects)
+    events: tuple[Event, ...] = ()  # events since the previous step
+    is_deliberate_miss: bool = False  # whether this belongs to a deliberate miss
 
 
 def lasting(condition: Callable[[], bool], *, steps: int) -> Callable[[], bool]:

@@ -56,27 +56,18 @@ CARRIED_ABOVE_M = 0.04
 
 
 class Expert:
-    """The arm's skills in one episode; its methods yield control steps.
-
-    Attributes:
-        world: World after reset.
-        behaviour: Speeds, heights and errors.
-        reach: Reachability of poses.
-        joint_target, gripper_target: Command of the next step: (n_arm,) rad, and metres.
-        phase: Current phase.
-        num_retries: Number of repeated attempts.
-        trouble: (phase, reason) of the last problem.
-    """
+    """The arm's skills in one episode, in a world after reset; its methods yield control steps."""
 
     def __init__(self, world: World, behaviour: Behaviour | None = None) -> None:
         self.world = world
         self.behaviour = behaviour or Behaviour()
         robot = world.robot
         self.reach = Reach(world.scene, robot, world.arm.kinematics)
-        self.joint_target, self.gripper_target = world.arm.target.copy(), world.arm.gripper_target
+        self.joint_target = world.arm.target.copy()  # (n_arm,) rad of the next step
+        self.gripper_target = world.arm.gripper_target  # metres, of the next step
         self.phase = "start"
         self.num_retries = 0
-        self.trouble = ("", "")
+        self.trouble = ("", "")  # (phase, reason) of the last problem
         self._events: list[Event] = []
         self._free, self._clear_height = False, -math.inf
         self._missing = self._has_missed = False
@@ -90,7 +81,6 @@ class Expert:
         return self.world.robot.gripper.open_width
 
     def _out_of_reach(self, what: str, poses: Sequence[Pose]) -> ExpertFailure:
-        """Note why the first of the poses is unreachable, and return the exception to raise."""
         why = self.reach.why_not(poses[0], self.joint_target) if poses else ""
         self.note("unreachable", f"{what} is out of reach" + (f": {why}" if why else ""), trouble=True)
         return ExpertFailure(self.phase, "unreachable")
@@ -153,8 +143,7 @@ class Expert:
         """Move in a straight line; if the arm cannot follow it and the hand is above everything, joint by joint.
 
         Args:
-            world_from_tcp: Target pose.
-            speed: Peak speed, m/s; multiplied by the behaviour's speed.
+            world_from_tcp, speed: Target pose, and peak speed, m/s, times the behaviour's speed.
             free: Whether exploration noise is allowed.
             clear_height: Minimum height of the TCP, metres, for exploration noise; by default the hand is above
                 everything.
@@ -202,12 +191,8 @@ class Expert:
     def pick_and_place(self, goal: Goal, *, is_begun: bool = False) -> Iterator[Step]:
         """Bring one object to its goal, repeating after a miss, a drop or a bad placement.
 
-        Args:
-            goal: Goal of the object.
-            is_begun: As in `pick`, at the first attempt.
-
-        Raises:
-            ExpertFailure: Out of reach, or three attempts failed.
+        `is_begun` is as in `pick`, at the first attempt. Raises ExpertFailure if it is out of reach, or after three
+        attempts.
         """
         for attempt in range(MAX_TRIES):
             if attempt > 0:
@@ -220,10 +205,8 @@ class Expert:
         raise ExpertFailure(*self.trouble)
 
     def reachable_grasp(self, name: str, *, above_by: float, lift_by: float = 0.0) -> Pose:
-        """Choose `world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and `above_by` higher.
-
-        Raises:
-            ExpertFailure: Out of reach at every yaw.
+        """Choose `world_from_tcp` to grasp an object, or to miss it on purpose, reachable there and `above_by` higher;
+        ExpertFailure if out of reach at every yaw.
         """
         found = None
         if self._missing:
@@ -240,10 +223,8 @@ class Expert:
         raise self._out_of_reach(f"{name} at {place}", self.grasps(name))
 
     def reachable_place(self, position: tuple[float, float, float]) -> Pose:
-        """Choose `world_from_tcp` at a position, the hand down at the nearest yaw reachable in a straight line.
-
-        Raises:
-            ExpertFailure: Out of reach at every yaw.
+        """Choose `world_from_tcp` at a position, the hand down at the nearest yaw reachable in a straight line;
+        ExpertFailure if there is none.
         """
         now = hand_yaw(self.tcp())
         places = [hand_down(position, yaw) for yaw in nearest_first(symmetric_yaws(now, 24), now)]
@@ -256,9 +237,7 @@ class Expert:
     def pick(self, name: str, *, is_begun: bool = False) -> Generator[Step, None, bool]:
         """Grasp and lift an object; the generator returns whether it is held.
 
-        Args:
-            name: Name of the object.
-            is_begun: Another controller brought the hand here: skip the approach if it is above the object already.
+        If another controller brought the hand here (`is_begun`), it does not approach from above the object.
         """
         world, behaviour = self.world, self.behaviour
         self.phase = "perceive"
@@ -293,9 +272,7 @@ class Expert:
     def place(self, goal: Goal, *, is_begun: bool = False) -> Generator[Step, None, bool]:
         """Carry the held object to its goal and release it; the generator returns whether it is placed correctly.
 
-        Args:
-            goal: Goal of the object.
-            is_begun: Another controller brought the hand here: only descend if it is above the goal already.
+        If another controller brought the hand here (`is_begun`), it only descends from above the goal.
         """
         world, name = self.world, goal.object
         self.phase = "transport"
@@ -353,7 +330,6 @@ class Expert:
         return self.world.arm.gripper_width() > self._closed_width + self._scale * by
 
     def _recover(self, world_from_tcp: Pose) -> Iterator[Step]:
-        """Release and rise."""
         self.phase = "recover"
         self.joint_target = self.world.arm.arm_position()
         yield from self.open_gripper(max_seconds=0.3)
@@ -368,16 +344,11 @@ class Expert:
         return clear_first(grasps, self._others(name), world.robot)
 
     def _others(self, name: str) -> list[tuple[Body, Pose]]:
-        """List all bodies except one, with their poses."""
         world = self.world
         return [(other, world.pose(other.name)) for other in world.scene.bodies if other.name != name]
 
     def _place_pose(self, goal: Goal, *, keep_yaw: bool = False) -> Pose:
-        """Compute `world_from_tcp` that puts the held object at its goal, compensating its offset in the hand.
-
-        Raises:
-            ExpertFailure: Out of reach at every allowed yaw.
-        """
+        """Compute `world_from_tcp` that puts the held object at its goal; ExpertFailure if that is out of reach."""
         body, pose = self.world.body(goal.object), self.world.pose(goal.object)
         symmetry = 0 if keep_yaw else goal.yaw_symmetry or ANY_YAW
         wanted, hand = goal_pose(self.world, goal), self.tcp()

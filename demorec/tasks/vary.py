@@ -56,25 +56,20 @@ def vary_physics(scene: Scene, ranges: Ranges, rng: np.random.Generator, *, dist
     Raises:
         SceneError: The distractors do not fit.
     """
-    bodies = [_other_dynamics(body, ranges, rng) if body.movable else body for body in scene.bodies]
+    bodies = []
+    for body in scene.bodies:
+        if body.movable:
+            mass, friction = body.mass * ranges.draw("mass_factor", rng), ranges.draw("friction_factor", rng)
+            damping = ranges.draw("damping", rng)
+            body = replace(body, mass=mass, lateral_friction=body.lateral_friction * friction)
+            body = replace(body, linear_damping=damping, angular_damping=damping)
+        bodies.append(body)
     x, y, z = scene.physics.gravity
     physics = replace(scene.physics, gravity=(x, y, z + ranges.draw("gravity_offset", rng)))
     scene = replace(scene, bodies=tuple(bodies), physics=physics)
     scene = _lower_table(scene, -ranges.draw("table_height", rng))
     low, high = ranges.range("distractors") if distractors else (0, 0)
     return _with_distractors(scene, int(rng.integers(int(low), int(high) + 1)), rng)
-
-
-def _other_dynamics(body: Body, ranges: Ranges, rng: np.random.Generator) -> Body:
-    mass, friction = ranges.draw("mass_factor", rng), ranges.draw("friction_factor", rng)
-    damping = ranges.draw("damping", rng)
-    return replace(
-        body,
-        mass=body.mass * mass,
-        lateral_friction=body.lateral_friction * friction,
-        linear_damping=damping,
-        angular_damping=damping,
-    )
 
 
 def _lower_table(scene: Scene, drop: float) -> Scene:
@@ -96,8 +91,8 @@ def _lower_table(scene: Scene, drop: float) -> Scene:
 def _with_distractors(scene: Scene, count: int, rng: np.random.Generator) -> Scene:
     sampler = Sampler(rng)
     others = [body for body in scene.bodies if body.role in ("object", "target", "distractor")]
-    taken = [_footprint(body.world_from_body) for body in others]
-    taken += [_footprint(scene.world_from_goal(goal)) for goal in scene.goals]
+    poses = [*(body.world_from_body for body in others), *(scene.world_from_goal(goal) for goal in scene.goals)]
+    taken = [(float(pose.position[0]), float(pose.position[1])) for pose in poses]
     bodies = list(scene.bodies)
     for index in range(count):
         point = sampler.point(
@@ -117,10 +112,6 @@ def _from_outline(body: Body, point: tuple[float, float]) -> float:
     x, y, _ = body.world_from_body.inverse().apply(np.array([*point, 0.0]))
     width, depth, _ = body.shape.extents
     return math.hypot(max(0.0, abs(x) - width / 2), max(0.0, abs(y) - depth / 2))
-
-
-def _footprint(pose: Pose) -> tuple[float, float]:
-    return float(pose.position[0]), float(pose.position[1])
 
 
 def _distractor(name: str, point: tuple[float, float], sampler: Sampler) -> Body:

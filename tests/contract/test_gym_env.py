@@ -24,7 +24,6 @@ from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
 from demorec.episode.episode import Trajectory
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.observation_rows import ObservationRows
 from demorec.extensions.policies.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
@@ -84,8 +83,7 @@ def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_pa
     """The features exported from a file equal those that a policy would observe."""
     with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, trajectory = recording.info, recording.trajectory()
-    rows = ObservationRows.of_trajectory(trajectory)
-    expected = features.observation_vectors(rows, info.simulated.robot, info.simulated.scene, privileged=True)
+    expected = features.observation_vectors(trajectory, info.simulated.robot, info.simulated.scene, privileged=True)
     # The first task runs to its end, the others until they touch an object.
     count = trajectory.num_frames if task == "pick_place" else min(trajectory.num_frames, 2 * FRAMES)
 

@@ -11,9 +11,9 @@ import numpy as np
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Scene
 from demorec.robots.robot import RobotSpec
+from demorec.tasks.base import Layout, on_table, random_cube
 from demorec.tasks.grasping import hand_down, raised
 from demorec.tasks.pick import PickPlace
-from demorec.tasks.placing import Layout, on_table, random_cube
 from demorec.tasks.sampling import Region, Sampler
 from demorec.tasks.script import Step, steady_width
 from demorec.tasks.skills import Expert

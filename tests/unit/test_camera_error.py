@@ -8,15 +8,13 @@ import numpy as np
 import pytest
 
 from demorec.core.geometry import Pose
-from demorec.episode.camera_error import error_values, stated_error
+from demorec.episode.variation import error_values, stated_error
 
 
 @pytest.mark.parametrize(
     "lie",
     [
-        {"calibration_front_angle": 0.02},
         {"calibration_front_angle": math.nan},
-        {"calibration_front_qx": 0.02},
         {"calibration_front_qy": 1.5},
         {"calibration_front_x": math.inf},
     ],

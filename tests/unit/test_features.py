@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from support.recording import HOME, PANDA
 
 from demorec.core.geometry import Pose
-from demorec.episode.episode import Trajectory, frame_time_ns
+from demorec.episode.episode import Observations, Trajectory, frame_time_ns
 from demorec.episode.features import (
     EE_POSE,
     ENVIRONMENT_STATE,
@@ -22,7 +22,6 @@ from demorec.episode.features import (
     observation_vectors,
     pose_from_delta,
 )
-from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
 
 
@@ -60,14 +59,16 @@ def make_scene(rng: np.random.Generator) -> Scene:
     )
 
 
-def make_rows(rng: np.random.Generator, scene: Scene, count: int) -> ObservationRows:
+def make_rows(rng: np.random.Generator, scene: Scene, count: int) -> Observations:
     poses = {body.name: np.array([random_pose(rng).vector() for _ in range(count)]) for body in scene.movable}
-    return ObservationRows(
+    return Observations(
         joint_position=rng.normal(size=(count, 9)),
         joint_velocity=rng.normal(size=(count, 9)),
+        joint_effort=np.zeros((count, 9)),
         gripper_width=rng.uniform(0, 0.08, size=count),
         base_from_tcp=np.array([random_pose(rng).vector() for _ in range(count)]),
         object_poses=poses,
+        contact_force=np.zeros(count),
         sensed={},
     )
 

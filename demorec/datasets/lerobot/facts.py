@@ -24,7 +24,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from demorec.annotate.progress import StageRun, dense_stages, progress, proportions
+from demorec.annotate.timeline import StageRun, dense_stages, progress, proportions
 from demorec.core.errors import ExportError, describe_error
 from demorec.datasets.lerobot.files import open_table, rows_in
 

@@ -11,10 +11,9 @@ from typing import Any
 import numpy as np
 
 from demorec.annotate import Statement
-from demorec.annotate.attempts import episode_timeline
 from demorec.annotate.boxes import seen_objects
-from demorec.annotate.progress import dense_runs
 from demorec.annotate.statements import episode_statements
+from demorec.annotate.timeline import dense_runs, episode_timeline
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.episode import DONE, REWARD, SCALARS, SUCCESS, ExportCamera, ExportEpisode
@@ -202,7 +201,7 @@ def _episode_boxes(episode: LeRobotEpisode) -> dict[str, SeenByCamera]:
     taken = {camera.name for camera in episode.cameras}
     for camera in episode.info.simulated.scene.cameras:
         if camera.name in taken and episode.recording.has_segmentation(camera.name):
-            entries = tuple(seen_objects(episode.recording, episode.rows, camera))
+            entries = tuple(seen_objects(episode.recording, episode.rows, camera.name))
             boxes[IMAGE_PREFIX + camera.name] = camera.width, camera.height, entries
     if not boxes:
         raise ConfigError(

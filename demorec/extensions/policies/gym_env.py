@@ -24,10 +24,9 @@ from demorec.core.errors import ConfigError, SceneError
 from demorec.core.registry import check_choice
 from demorec.core.tables import CAMERAS, TASKS, environment_name
 from demorec.episode import features
-from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, SuccessCheck
+from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, Observations, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.info import EpisodeInfo, Feature
-from demorec.episode.observation_rows import ObservationRows
 from demorec.episode.scene import Scene
 from demorec.episode.simulated import on_request, with_simulation
 from demorec.episode.variation import Preset
@@ -331,7 +330,7 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
     def _observation(self, situation: Situation) -> dict[str, Any]:
         simulated = self.info.simulated
         vectors = features.observation_vectors(
-            ObservationRows.of_observation(situation.observation),
+            Observations.of(situation.observation),
             simulated.robot,
             simulated.scene,
             privileged=self.privileged,

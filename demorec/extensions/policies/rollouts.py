@@ -29,7 +29,7 @@ from demorec.episode.features import (
     StateKind,
     state_names,
 )
-from demorec.episode.info import sensor_feature
+from demorec.episode.info import OBSERVATION
 from demorec.episode.simulated import with_simulation
 from demorec.extensions.policies.evaluation import (
     Evaluation,
@@ -60,7 +60,7 @@ from demorec.runs.run_file import EPISODES, FAILED, Attempt
 from demorec.sim.sensors import SENSORS
 from demorec.sim.world import World
 
-_SENSORS = [sensor_feature(sensor.quantity) for sensor in SENSORS]
+_SENSORS = [OBSERVATION + sensor.quantity for sensor in SENSORS]
 
 MAKE_ROLLOUT = "demorec.extensions.policies.rollouts:make_rollout"
 

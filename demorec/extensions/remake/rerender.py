@@ -20,12 +20,11 @@ from demorec.core.plain import digest, from_plain, to_json
 from demorec.core.registry import nearest_match, split_name
 from demorec.core.seeding import generator
 from demorec.core.tables import CAMERAS, RENDERERS, camera_name
-from demorec.episode.camera_error import true_cameras
 from demorec.episode.episode import Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene, SceneCamera
 from demorec.episode.simulated import with_simulation
-from demorec.episode.variation import Ranges, resolve
+from demorec.episode.variation import Ranges, resolve, true_cameras
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.mcap import EpisodeWriter, Recording, open_simulated
 from demorec.mcap.frames import frames_of
