@@ -17,7 +17,7 @@ from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.extensions.remake.deep.check import deep_check
+from demorec.extensions.remake.deep_check import deep_check
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
 

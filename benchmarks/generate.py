@@ -24,7 +24,6 @@ import sys
 import tempfile
 import threading
 import time
-from collections import Counter
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -165,7 +164,7 @@ def our_episodes(folder: Path) -> list[tuple[int, float]]:
     """Frames and CPU seconds of each episode, including its share of the export."""
     run = json.loads((folder / "run.json").read_text())
     export = (run["export"] or {}).get("seconds", 0.0) / len(run["episodes"])
-    return [(line["num_frames"], sum(line["seconds"].values()) + export) for line in run["episodes"]]
+    return [(line["num_frames"], line["seconds"] + export) for line in run["episodes"]]
 
 
 def todays_episodes(folder: Path) -> list[tuple[int, float]]:
@@ -283,26 +282,23 @@ def scaling(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def memory(args: argparse.Namespace) -> dict[str, Any]:
-    """Peak memory of driver and workers, and seconds by stage, for runs of several lengths."""
+    """Peak memory of driver and workers, and CPU seconds an episode, for runs of several lengths."""
     rows = {}
     for count in args.memory:
         with tempfile.TemporaryDirectory(prefix="demorec-bench-") as temporary:
             (command,) = ours("demorec 2 workers", count, Path(temporary) / "out", args)
             subprocess.run([*command, "--no-export"], check=True, stdout=subprocess.DEVNULL)
             run = json.loads((Path(temporary) / "out/run.json").read_text())
-            session, stages = run["sessions"][-1], Counter[str]()
-            for line in run["episodes"]:
-                stages.update(line["seconds"])
+            session = run["sessions"][-1]
             rows[count] = {
                 "driver_mb": session["peak_driver_bytes"] / 1e6,
                 "worker_mb": session["peak_worker_bytes"] / 1e6,
-                "cpu_s_per_episode": {stage: seconds / count for stage, seconds in stages.items()},
+                "cpu_s_per_episode": sum(line["seconds"] for line in run["episodes"]) / count,
             }
             row = rows[count]
-            told = ", ".join(f"{stage} {seconds:.3f}" for stage, seconds in row["cpu_s_per_episode"].items())
             print(
                 f"{count:6} episodes: driver {row['driver_mb']:.0f} MB, worker {row['worker_mb']:.0f} MB; "
-                f"CPU s an episode: {told}",
+                f"CPU s an episode: {row['cpu_s_per_episode']:.3f}",
                 flush=True,
             )
     return rows
@@ -321,7 +317,7 @@ def make_nothing(plan: EpisodePlan, folder: Path) -> Attempt:
         digest=f"{index:064x}",
         num_frames=219,
         num_bytes=720_000,
-        seconds={"simulation": 0.123456789, "rendering": 0.123456789, "recording": 0.123456789},
+        seconds=0.370370367,
     )
 
 

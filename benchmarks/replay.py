@@ -69,7 +69,7 @@ def main() -> None:
             timed("check", start)
             assert report.verdict == "good", report
             start = time.process_time()
-            [(replayed, _)] = replay_all([open_file(path, ReplayOptions())], ReplayOptions())
+            [(replayed, _)] = replay_all([open_file(path)], ReplayOptions())
             timed("replay", start)
             identical += replayed.is_identical
             with Recording(path) as recording:

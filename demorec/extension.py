@@ -60,7 +60,6 @@ EXTENSION = Extension(
         **_checks("file", "opens", "checksums", "topics", "readable", "complete", "frame_times", "stamps"),
         **_checks("file", "video_frames", "missing_images", "images_decode"),
         **_checks("run", "run_files", "run_complete", "run_agrees"),
-        **_checks("run_dataset", "run_dataset"),
-        **_checks("sidecar", "dataset_sidecar"),
+        **_checks("dataset", "run_dataset", "dataset_sidecar"),
     },
 )

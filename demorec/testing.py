@@ -20,8 +20,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from demorec.check.proof import prove
-from demorec.check.report import CheckOptions, Subject, check_subject
+from demorec.check.report import CheckOptions, Subject, check_subject, prove
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.plain import from_json, to_json
 from demorec.core.registry import modules_of

@@ -11,7 +11,7 @@ import inspect
 import logging
 import shlex
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
@@ -113,29 +113,33 @@ class CheckResult:
 
 @dataclass(frozen=True, kw_only=True)
 class Check:
-    """One check.
+    """One check, and the decorator `check` that makes it from a generator of faults.
 
     Attributes:
-        name, family: A noun, and its group.
+        family: Its group.
         on: Forms that it can check.
         needs: Required data or roles, in a few words.
         measures: Its finding in at most 50 characters.
         unit: Unit of its values.
         why, do: Why a fault matters, and the fix; `{path}` and `{episode}` are filled in.
         needs_images: Whether images must be decoded for it alone.
-        find: The generator.
+        name, find: The generator's name, a noun, and the generator.
     """
 
-    name: str
     family: Family
-    on: tuple[Form, ...]
+    on: tuple[Form, ...] = ("episodes",)
     needs: str
     measures: str
-    unit: str
+    unit: str = ""
     why: str
     do: str
-    needs_images: bool
-    find: Callable[[Any], Iterator[Fault]]
+    needs_images: bool = False
+    name: str = ""
+    find: Callable[[Any], Iterator[Fault]] = field(default=lambda subject: iter(()), repr=False)
+
+    def __call__(self, find: Callable[[Any], Iterator[Fault]]) -> Check:
+        """Return the check with its generator."""
+        return replace(self, name=find.__name__, find=find)
 
     @property
     def page(self) -> str:
@@ -178,34 +182,8 @@ class Check:
         return Finding(**{**vars(fault), "do": do}, check=self.name, why=self.why)
 
 
-def check(
-    *,
-    family: Family,
-    on: tuple[Form, ...] = ("episodes",),
-    needs: str,
-    measures: str,
-    unit: str = "",
-    why: str,
-    do: str,
-    needs_images: bool = False,
-) -> Callable[[Callable[[Any], Iterator[Fault]]], Check]:
-    """Make a `Check` from a generator; the function's name becomes the check's."""
-
-    def wrap(function: Callable[[Any], Iterator[Fault]]) -> Check:
-        return Check(
-            name=function.__name__,
-            family=family,
-            on=on,
-            needs=needs,
-            measures=measures,
-            unit=unit,
-            why=why,
-            do=do,
-            needs_images=needs_images,
-            find=function,
-        )
-
-    return wrap
+check = Check
+"""Decorator of a generator of faults, whose name becomes the check's."""
 
 
 def listed(wrong: Sequence[str], severity: Severity = "broken", shown: int = 3) -> Iterator[Fault]:

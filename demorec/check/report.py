@@ -1,17 +1,18 @@
-"""Run the checks over recordings, runs and datasets."""
+"""Run the checks over recordings, runs and datasets, and the proofs of extensions that can remake recordings."""
 
 from __future__ import annotations
 
+import pkgutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
 from pathlib import Path
 from typing import Literal
 
 from demorec.check.base import RANK, Check, Checkable, CheckResult, Finding, Form, Verdict
-from demorec.check.episode import CheckedEpisode
+from demorec.check.file import CheckedEpisode
 from demorec.check.run import CheckedRun
 from demorec.core.errors import check_option
+from demorec.core.extension import rows_of
 from demorec.core.processes import process_pool
 from demorec.core.tables import FILE_CHECKS
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings, find
@@ -44,27 +45,15 @@ class CheckOptions:
             FILE_CHECKS.check_name(name)
         check_option("workers", self.workers, 1, 1024)
 
-    def checks(self, *forms: Form) -> list[Check]:
-        """Selected checks of some forms, in table order."""
-        wanted = set(forms)
-        return [
-            check for check in _all_checks() if wanted & set(check.on) and (not self.only or check.name in self.only)
-        ]
-
-
-@cache
-def _all_checks() -> tuple[Check, ...]:
-    return tuple(FILE_CHECKS.load(name) for name in FILE_CHECKS.names())
+    def checks(self, form: Form) -> list[Check]:
+        """Selected checks of a form, in table order."""
+        names = [name for name in FILE_CHECKS.names() if not self.only or name in self.only]
+        return [check for check in map(FILE_CHECKS.load, names) if form in check.on]
 
 
 @dataclass(frozen=True, kw_only=True)
 class Subject:
-    """Something to check.
-
-    Attributes:
-        path: Its path.
-        kind: Its kind.
-    """
+    """Something to check."""
 
     path: Path
     kind: SubjectKind
@@ -72,11 +61,7 @@ class Subject:
 
 @dataclass(frozen=True, kw_only=True)
 class SubjectReport(Subject):
-    """All results about one subject.
-
-    Attributes:
-        results: Results in table order.
-    """
+    """All results about one subject, in table order."""
 
     results: tuple[CheckResult, ...]
 
@@ -164,3 +149,29 @@ def _run(options: CheckOptions, subject: Checkable, form: Form) -> Iterator[Chec
 def _within(path: Path, finding: Finding) -> Finding:
     """Remove the subject's path from a message; the report prints it above."""
     return replace(finding, message=finding.message.removesuffix(f": {path}").replace(f"{path}/", ""))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Proof:
+    """Result of a proof of one recording.
+
+    Attributes:
+        path: The recording.
+        level: "warn" if this machine cannot prove it, "fail" if the remake differs.
+        problem: The difference; "" unless it failed.
+    """
+
+    path: Path
+    level: Literal["pass", "warn", "fail"]
+    problem: str = ""
+
+
+def prove(paths: Sequence[Path], allowed: Sequence[str] = ()) -> Iterator[Proof]:
+    """Yield the proofs of recordings; none without an extension for it.
+
+    Args:
+        paths: The recordings.
+        allowed: The user's modules that may be imported if the recordings name them.
+    """
+    for _, target in rows_of("proofs"):
+        yield from pkgutil.resolve_name(target)(paths, allowed)

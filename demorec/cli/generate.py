@@ -45,7 +45,6 @@ class Generate:
       generate-dataset --num-episodes 50 --out recordings/cubes
       generate-dataset --config run.toml --seed 7        (flags override the file)
       generate-dataset --cameras front wrist --width 320 --height 240 --codec av1
-      generate-dataset --num-episodes 1000 --dry-run   (time, size and success rate)
       generate-dataset --executor ray --address auto --out /shared/cubes
       generate-dataset --config cubes/run.json --out again   (compares bit for bit)
     """
@@ -97,8 +96,6 @@ class Generate:
     """At the end, generate the first episode and one in N again from config and seed, and compare every number and
     image with the recording (demorec check --deep: all episodes); 0: none.
     """
-    dry_run: bool = False
-    """Make a few pilot episodes in a temporary folder and estimate time, size and success rate of the whole run."""
     episodes: Annotated[GenerateConfig, arg(name="episode")] = field(default_factory=GenerateConfig)
     """Options that determine the data."""
 
@@ -130,13 +127,6 @@ class Generate:
         refuse_inside([options.out])
         if original is not None:
             _prepare_comparison(original, options.out)
-        if self.dry_run:
-            from demorec.cli.generate_report import print_estimate
-            from demorec.generate.estimate import estimate
-
-            print_estimate(*estimate(episodes, options), options)
-            return 0
-
         from demorec.cli.generate_report import check_run, print_comparison, print_result
         from demorec.core.processes import terminate_as_interrupt
         from demorec.generate.run import generate

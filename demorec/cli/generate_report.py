@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import shlex
 import shutil
 import sys
@@ -11,13 +10,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from demorec.cli.shared.output import aligned, counted, duration, say, size_in_words, tell
+from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.core.processes import available_cores
 from demorec.core.replacing import shown
-from demorec.generate.contents import set_aside
-from demorec.generate.executor import Made
-from demorec.generate.options import RunOptions, RunResult
-from demorec.runs.run_file import DATASET, EPISODES, STARTING, UNFINISHED, ExportRecord, RunFile
+from demorec.generate.options import RunResult
+from demorec.runs.run_file import DATASET, EPISODES, UNFINISHED, ExportRecord, RunFile
 
 if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
@@ -35,8 +32,7 @@ def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int
     Returns:
         The entry for the closing table, and one line for each failed check.
     """
-    from demorec.check.proof import prove
-    from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
+    from demorec.check.report import CheckOptions, check_subjects, find_subjects, prove, useful_workers
 
     beyond = {result.folder / attempt.file for attempt in result.run.beyond}
     subjects = [subject for subject in find_subjects([result.folder]) if subject.path not in beyond]
@@ -93,8 +89,8 @@ def print_result(result: RunResult, export: ExportRecord | None, checked: tuple[
         rate = sum(bool(a.success) for a in result.made) / wall * 60
         made = f"{wall:.1f} s for making episodes with {counted(session.workers, 'worker')}, {rate:.1f} a minute"
         rows.append(("wall time", f"{made}; export and checks are extra"))
-    if aside := set_aside(folder):
-        rows.append(("set aside", f"{', '.join(aside)}: {folder / UNFINISHED}"))
+    if aside := sorted(path.name for path in (folder / UNFINISHED).glob("*")):
+        rows.append(("set aside", f"{shown(aside)} in {folder / UNFINISHED}"))
     rows.append(("run digest", run.digest))
     if export is not None:
         rows.append(("dataset digest", export.dataset_digest))
@@ -150,36 +146,3 @@ def _failures(run: RunFile) -> str:
     if not causes:
         return ""
     return "; failed attempts: " + ", ".join(f"{count} x {cause}" for cause, count in causes.most_common(5))
-
-
-def print_estimate(measured: Sequence[Made], tried: Sequence[Made], dataset_bytes: int, options: RunOptions) -> None:
-    """Print the table of a dry run from the result of `estimate`."""
-    assert options.out is not None
-    last, cores = measured[-1].attempt, available_cores()
-    num_workers, successes = options.workers or cores, sum(bool(report.attempt.success) for report in tried)
-    each = sum(last.seconds.values())
-    attempts = options.num_episodes * len(tried) / max(successes, 1)
-    # Wall-clock time with one core per worker, without the export.
-    seconds = measured[0].attempt.seconds.get(STARTING, 0.0) + each * math.ceil(attempts / num_workers)
-    stages = ", ".join(f"{stage} {value:.2f}" for stage, value in last.seconds.items())
-    workers = counted(num_workers, "worker")
-    if options.executor == "local" and num_workers > cores:
-        workers += f" on {cores} cores: at least {duration(seconds * num_workers / cores)}"
-    total_bytes = (last.num_bytes + dataset_bytes) * options.num_episodes
-    sizes = f"recording {size_in_words(last.num_bytes)}"
-    if dataset_bytes:
-        sizes += f" and dataset {size_in_words(dataset_bytes)}"
-    out = options.out.absolute()
-    free_bytes = shutil.disk_usage(next(place for place in (out, *out.parents) if place.exists())).free
-    rows = [
-        ("success", f"{successes} of {len(tried)} at the first try"),
-        ("CPU s/episode", f"{each:.2f} ({stages}), {last.num_frames} frames"),
-        ("time", f"{duration(seconds)} for {options.num_episodes} episodes with {workers}; the export is extra"),
-        ("size", f"{size_in_words(total_bytes)} ({sizes} an episode)"),
-        ("memory", f"{size_in_words(max(report.peak_bytes for report in measured))} a worker"),
-        ("free disk", f"{size_in_words(free_bytes)} at {options.out}"),
-    ]
-    say(*aligned(rows))
-    if total_bytes > free_bytes:
-        tell("The disk is too small for this run.")
-    say("Nothing was kept; leave --dry-run out to generate.")

@@ -18,7 +18,7 @@ from demorec.core.files import free_name, open_locked, sha256_of, sync_path
 from demorec.core.own_versions import differences
 from demorec.core.plain import to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
-from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, is_dataset_file
+from demorec.datasets.lerobot.paths import DATASET, is_dataset_file
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
 from demorec.runs.run_file import (
@@ -40,26 +40,7 @@ _SCRATCH = re.compile(r".+-\d+-\d+")  # worker folder: host, process, number
 _PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}(\.part)?")
 _RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # damaged, or of another run
 _REPORT = re.compile(r"error_episode_\d+\.txt")
-_CARD = re.compile(rf"{CARD_PATH}(\.\d+)?")  # edited by a user, so that --overwrite does not delete it
 _SET_ASIDE_DATASET = re.compile(rf"({DATASET_FOLDER}(?:\.\d+)?)/(.*)")
-
-
-def set_aside(folder: Path) -> list[str]:
-    """Count the files that a run has left in its unfinished/, by kind, in words; the user's are excluded."""
-    names = list(files_below(folder / UNFINISHED))
-    datasets = {match[1] for name in names if (match := _SET_ASIDE_DATASET.fullmatch(name))}
-    others = [name for name in names if not _SET_ASIDE_DATASET.fullmatch(name)]
-    parts = [name for name in others if _PART.fullmatch(name)]
-    empty = sum((folder / UNFINISHED / name).lstat().st_size == 0 for name in parts)
-    counted = [
-        (len(datasets), "dataset", " that the run did not leave like this"),
-        (_number(_RECORDING_ASIDE, others), "recording", " not of this run, or damaged"),
-        (len(parts) - empty, "unfinished recording", " (demorec recover keeps the complete frames)"),
-        (empty, "unfinished recording", " in which nothing was written"),
-        (_number(_REPORT, others), "error report", ""),
-        (_number(_CARD, others), "edited dataset card", ""),
-    ]
-    return [f"{count} {noun}{'' if count == 1 else 's'}{more}" for count, noun, more in counted if count]
 
 
 def clear_scratch(folder: Path, run: RunFile) -> None:
@@ -78,10 +59,6 @@ def clear_scratch(folder: Path, run: RunFile) -> None:
                     path.unlink()
         with suppress(OSError):  # it contains something else
             scratch.rmdir()
-
-
-def _number(kind: re.Pattern[str], names: list[str]) -> int:
-    return sum(bool(kind.fullmatch(name)) for name in names)
 
 
 def foreign_recordings(

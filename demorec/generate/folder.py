@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import platform
-import sys
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -52,6 +51,16 @@ from demorec.runs.run_file import (
 )
 
 
+def _machine() -> dict[str, str]:
+    """Describe the machine of a session, for human readers."""
+    return {
+        "host": platform.node(),
+        "system": platform.platform(),
+        "cpu": cpu_type(),
+        "cores": str(available_cores()),
+    }
+
+
 class RunFolder:
     """An opened run. Lines are saved at intervals; one lost in a crash is read back from its recording.
 
@@ -69,7 +78,7 @@ class RunFolder:
         self._made: list[Attempt] = []
         self._peak_worker_bytes = 0
         self._earlier = run.sessions
-        self._session = RunSession(started=utc_now(), machine=machine())
+        self._session = RunSession(started=utc_now(), machine=_machine())
         self._has_session = False
         self._started = time.monotonic()
         self._saved_at = -1e9
@@ -216,18 +225,6 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
     return folder
 
 
-def machine() -> dict[str, str]:
-    """Describe the machine of a session, for human readers."""
-    return {
-        "host": platform.node(),
-        "system": platform.platform(),
-        "processor": _processor(),
-        "cpu": cpu_type(),
-        "cores": str(available_cores()),
-        "python": sys.version.split()[0],
-    }
-
-
 def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFile, str]:
     """Find the folder's run, if it is the requested one, and the problem of its run.json ("" if none).
 
@@ -285,11 +282,3 @@ def _told_as_unusable(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise resource_error(error) or write_error("The output folder", error, path, GenerationError) from error
-
-
-def _processor() -> str:
-    with suppress(OSError):
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    return platform.processor() or platform.machine()

@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from demorec.check.run_dataset import export_options
+from demorec.check.dataset import export_options
 from demorec.core.config import GenerateConfig, parse_config
 from demorec.core.errors import ConfigError, RecordingError, describe_error
 from demorec.datasets.lerobot.export import export_lerobot

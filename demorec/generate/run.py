@@ -21,9 +21,8 @@ from demorec.core.processes import available_cores, handled
 from demorec.core.registry import split_name
 from demorec.core.tables import RENDERERS, load_robot
 from demorec.generate.contents import Inspector
-from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, Made, Raised, Report
+from demorec.generate.executor import MAKE_EPISODE, POLL_S, Executor, LocalExecutor, Made, Raised, Report
 from demorec.generate.folder import RunFolder, open_run
-from demorec.generate.local import LocalExecutor
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.robots.assets import allow_models
 from demorec.runs.recorded import inspect_recording

@@ -10,12 +10,11 @@ from __future__ import annotations
 import os
 import platform
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import Any
 
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, SceneError
@@ -23,11 +22,7 @@ from demorec.core.own_versions import version_differences
 from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
 from demorec.mcap import EpisodeWriter
 from demorec.runs.recorded import inspect_recording, place_recording
-from demorec.runs.run_file import EPISODES, FAILED, STARTING, UNFINISHED, Attempt, recording_name
-
-SIMULATION, RENDERING, RECORDING = "simulation", "rendering", "recording"
-STAGES = (SIMULATION, RENDERING, RECORDING)
-"""Stages of every attempt; a worker's first one also has STARTING."""
+from demorec.runs.run_file import EPISODES, FAILED, UNFINISHED, Attempt, recording_name
 
 
 def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
@@ -39,11 +34,11 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
         DemorecError: No trustworthy recording could be made, for a reason that another attempt would not fix.
         OSError: The folder cannot be written to.
     """
-    began, seconds = time.process_time(), dict.fromkeys(STAGES, 0.0)
+    began = time.process_time()
     with _scratch_folder(folder) as scratch:
         path = scratch / recording_name(plan.episode_index, plan.attempt, success=False)
         try:
-            _record(plan, path, began, seconds)
+            record_episode(plan, path, _simulators)
         except SceneError as error:
             for part in scratch.iterdir():
                 part.unlink()
@@ -59,71 +54,36 @@ def make_episode(plan: EpisodePlan, folder: Path) -> Attempt:
                 num_bytes=0,
                 phase="scene",
                 reason=str(error),
-                seconds=_with_rest(seconds, began),
+                seconds=time.process_time() - began,
             )
-        with _counted(seconds, RECORDING):
-            attempt, *_ = inspect_recording(path)
-            file = f"{EPISODES if attempt.success else FAILED}/" + recording_name(
-                plan.episode_index, plan.attempt, success=attempt.success
-            )
-            place_recording(path, folder / file)
-    return replace(attempt, file=file, seconds=_with_rest(seconds, began))
+        attempt, *_ = inspect_recording(path)
+        name = recording_name(plan.episode_index, plan.attempt, success=attempt.success)
+        file = f"{EPISODES if attempt.success else FAILED}/{name}"
+        place_recording(path, folder / file)
+    return replace(attempt, file=file, seconds=time.process_time() - began)
 
 
-def _record(plan: EpisodePlan, path: Path, began: float, seconds: dict[str, float]) -> None:
-    starts = not _simulators.is_warm
+def record_episode(plan: EpisodePlan, path: Path, simulators: SimulatorCache) -> None:
+    """Simulate an attempt and record it.
+
+    Raises:
+        ConfigError: The user's modules were edited since the start of the run: a fresh worker would mix versions.
+        DemorecError: It cannot be simulated, drawn or written here.
+    """
     episode = prepare(plan)
-    _check_versions(plan, episode.info.versions)
-    world, renderer = _simulators.acquire(episode.info)
-    timed: Any = _Timed(renderer, seconds, RENDERING) if renderer else None
-    session = Session.of_episode(world, episode, timed)
-    with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
-        recording = _Timed(writer, seconds, RECORDING)
-        for frame in session.run(ScriptAgent(episode)):
-            if starts:  # including the first frame's images: a worker's first drawing compiles
-                seconds |= {STARTING: time.process_time() - began, RENDERING: 0.0}
-                starts = False
-            recording.write(frame)
-        recording.finish(session.outcome)
-
-
-def _check_versions(plan: EpisodePlan, here: Mapping[str, str]) -> None:
-    """Raise if the user's modules were edited during the run: a fresh worker would mix versions."""
-    different = () if plan.versions is None else version_differences(plan.versions, here)
-    if different:
+    here = episode.info.versions
+    if different := () if plan.versions is None else version_differences(plan.versions, here):
         raise ConfigError(f"The inputs of the run's episodes have changed since its start: {'; '.join(different)}")
+    world, renderer = simulators.acquire(episode.info)
+    session = Session.of_episode(world, episode, renderer)
+    with EpisodeWriter(path, episode.info, video=plan.config.video) as writer:
+        for frame in session.run(ScriptAgent(episode)):
+            writer.write(frame)
+        writer.finish(session.outcome)
 
 
 _simulators = SimulatorCache()
 """Simulators of this process."""
-
-
-@contextmanager
-def _counted(seconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Count the CPU seconds of the context for a stage."""
-    began = time.process_time()
-    try:
-        yield
-    finally:
-        seconds[stage] += time.process_time() - began
-
-
-def _with_rest(seconds: dict[str, float], began: float) -> dict[str, float]:
-    """Compute stage -> CPU seconds of an attempt that ends now; time outside other stages is simulation."""
-    return seconds | {SIMULATION: time.process_time() - began - sum(seconds.values())}
-
-
-class _Timed:
-    """A renderer or writer with its methods' time counted for a stage."""
-
-    def __init__(self, timed: object, seconds: dict[str, float], stage: str) -> None:
-        self._timed, self._counted = timed, _counted(seconds, stage)
-
-    def __getattr__(self, name: str) -> Any:
-        return self._counted(getattr(self._timed, name))
-
-    def close(self) -> None:
-        """Do nothing; the owner closes the wrapped object."""
 
 
 @contextmanager

@@ -222,11 +222,6 @@ class SimulatorCache:
         self._renderers = WarmRenderer()
         self._key: object = None
 
-    @property
-    def is_warm(self) -> bool:
-        """Whether an episode was simulated before."""
-        return self._world is not None
-
     def acquire(self, info: EpisodeInfo) -> tuple[World, Renderer | None]:
         """Return a world and a renderer (None without cameras) for this kind of episode, reusing the current ones.
 

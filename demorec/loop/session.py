@@ -12,7 +12,7 @@ from typing import Protocol, Self
 
 import numpy as np
 
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Array
 from demorec.episode.episode import (
     TIME_LIMIT,
     Action,
@@ -187,11 +187,6 @@ class Session:
         """Send a command and advance by one control step."""
         self.world.apply(command)
         self._arrive(self.frame_index + 1)
-
-    def place(self, frame_index: int, *, joint_position: Array, object_poses: Mapping[str, Pose]) -> None:
-        """Set the world to a recorded frame, without physics; arguments as in `World.set_state`."""
-        self.world.set_state(joint_position=joint_position, object_poses=object_poses)
-        self._arrive(frame_index)
 
     def _arrive(self, frame_index: int) -> None:
         self.frame_index = frame_index

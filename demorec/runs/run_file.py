@@ -31,8 +31,6 @@ IMPORT_NAME = "import.json"
 """File next to run.json with the sources and findings of `demorec import`
 (`demorec.extensions.imports.import_file`).
 """
-STARTING = "starting"
-"""One-time work of a worker before its first frame: compiling or loading, and filling caches for later episodes."""
 
 
 class DamagedRunFileError(DemorecError):
@@ -52,8 +50,7 @@ class Attempt:
         digest: Hash of its content (states, actions, packets, relevant metadata).
         num_frames, num_bytes: Size of the recording.
         phase, reason: Phase and reason of the failure; "" on success.
-        seconds: stage -> CPU seconds: "simulation", "rendering", "recording", and "starting" for a worker's first
-        attempt. Not part of any digest.
+        seconds: CPU seconds; not part of any digest.
         instruction: Instruction in words, of an external episode.
         drops: "frames" or camera -> number of frames or images that could not be recorded, of an external episode.
     """
@@ -69,7 +66,7 @@ class Attempt:
     num_bytes: int
     phase: str = ""
     reason: str = ""
-    seconds: Mapping[str, float] = field(default_factory=dict)
+    seconds: float = 0.0
     instruction: str = ""
     drops: Mapping[str, int] = field(default_factory=dict)
 

@@ -45,10 +45,7 @@ def test_the_run_matches_the_request(reference: RunResult) -> None:
         f"episode_{i:06d}.mcap" for i in range(NUM_EPISODES)
     ]
     assert not list((reference.folder / "unfinished").iterdir())
-    first, *later = (attempt.seconds for attempt in reference.run.attempts)
-    assert set(first) == {"starting", "simulation", "rendering", "recording"}
-    assert all(set(seconds) == {"simulation", "rendering", "recording"} for seconds in later)
-    assert all(value > 0 for seconds in (first, *later) for value in seconds.values())
+    assert all(attempt.seconds > 0 for attempt in reference.run.attempts)
 
 
 @pytest.mark.slow
@@ -163,7 +160,7 @@ def test_the_command_generates_checks_and_exports(
         told = capsys.readouterr().out
         assert f"1 of 1 asked, {made} attempt{'s' if made != 1 else ''} made now" in told
         assert load_run_file(out).digest in told
-        for word in ("success", "frames", "recordings", "dataset", "simulation", "rendering", "export", "checks"):
+        for word in ("success", "frames", "recordings", "dataset", "checks"):
             assert word in told
     assert verified == [2], "once, two frames of the episode"
     assert exit_code(*args, "--fps", "60", program=generate_dataset_main) == 2

@@ -102,10 +102,7 @@ def test_an_offset_and_a_lag_show_in_their_joints(
         assert largest == pytest.approx(3.0, abs=0.1)
         assert max(tracking[joint][1] for joint in ARM if joint != "elbow_flex") < 0.1
     lagging = changed(dataset, tmp_path / "late", late)
-    plain, delayed = (replayed(capsys, lagging, *DEGREES, *more) for more in ((), ("--delay", 3)))
-    for before, after in zip(plain, delayed, strict=True):
-        assert before["shoulder_pan"][1] > 1.0
-        assert after["shoulder_pan"][1] < 0.1
+    assert all(tracking["shoulder_pan"][1] > 1.0 for tracking in replayed(capsys, lagging, *DEGREES))
     # More than a hundredth of a radian off: not as recorded, if a comparison was requested.
     assert exit_code("replay", *DEGREES, "--tolerance", 0.01, lagging) == 1
 
@@ -116,7 +113,6 @@ def test_an_offset_and_a_lag_show_in_their_joints(
         (("--robot", "so101"), "or --motor-units is missing"),
         (("--robot", "panda", "--motor-units", "degrees"), "they belong to another robot"),
         (("--motor-units", "degrees"), "add --robot so101"),
-        ((*DEGREES, "--states"), "--states and --export-hz are for recordings with a scene"),
         ((*DEGREES, "--view"), "leave out --out and --view"),
         ((), "--robot replays a real arm's actions"),
     ],

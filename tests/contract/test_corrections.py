@@ -105,7 +105,7 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     assert taken is not None
     assert (taken.reasons, taken.num_frames) == (("the policy is stuck",), len(phases) - handover)
     options = ReplayOptions()
-    report, _ = next(iter(replay_all([open_file(path, options)], options)))
+    report, _ = next(iter(replay_all([open_file(path)], options)))
     assert report.is_identical, report
 
 
@@ -270,7 +270,7 @@ def test_a_policy_is_notified_when_handed_back_to_and_the_episode_replays(expert
     differs = (trajectory.action_joint_target != trajectory.command_joint_target).any(axis=1)
     assert not differs[by_policy].any()
     options = ReplayOptions()
-    report, _ = next(iter(replay_all([open_file(path, options)], options)))
+    report, _ = next(iter(replay_all([open_file(path)], options)))
     assert report.is_identical, report
     export(path, tmp_path / "dataset", intervention=True)
     assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [

@@ -20,8 +20,8 @@ from support.mcap import rewritten
 
 from demorec.cli.generate_report import check_run
 from demorec.core.plain import to_plain
-from demorec.extensions.remake.deep.check import DeepReport, deep_check, deep_checks
-from demorec.extensions.remake.deep.contents import Contents, content_differences
+from demorec.extensions.remake.byte_comparison import Contents, content_differences
+from demorec.extensions.remake.deep_check import DeepReport, deep_check, deep_checks
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.extensions.remake.rerender import rerender
 from demorec.generate.options import RunResult
@@ -176,7 +176,6 @@ def test_one_bit_of_one_number(blind: Path, tmp_path: Path, simulators: Simulato
     report = deep_check(spoilt, simulators)
     assert found(report) == {("/ee_pose", "pose.position.x", (5,))}
     assert report.level == "fail"
-    assert "from frame 5 on (the EE pose)" in report.replay  # commands and joint states are correct
 
 
 @pytest.mark.slow
@@ -218,7 +217,7 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
     """Change one value at a time: it is named, and nothing else is."""
     again = Contents.of(filmed)
     with Recording(filmed) as recording:
-        info = recording.info
+        fps = recording.info.fps
     count = 0
     for key, text in again.metadata[record].items():
         if key == "crc32":  # made again with each change
@@ -235,12 +234,11 @@ def test_every_field_of_the_metadata(record: str, filmed: Path) -> None:
                 container[place] = "x" if value is None or isinstance(value, dict | list) else other(value)
             metadata = {**again.metadata[record], key: spoilt if isinstance(spoilt, str) else json.dumps(spoilt)}
             recorded = replace(again, metadata={**again.metadata, record: metadata})
-            differences, images = content_differences(recorded, again, info, info.fps)
+            differences = content_differences(recorded, again, fps)
             if name.startswith(("info.versions", "info.simulation.cpu")):  # reported separately
                 assert not differences
                 continue
             assert [(d.stream, d.field) for d in differences] == [(f"metadata {record}", name)]
-            assert not images
             count += 1
     assert count > (300 if record == EPISODE else 20)
 
@@ -301,13 +299,9 @@ def test_a_config_that_this_version_cannot_read_is_not_provable_here(
     assert levels == ["fail", "warn"]
 
 
-# ----------------------------------------------------------------------------------------------------- the images
-
-
 @pytest.mark.slow
-def test_images_that_differ_are_measured(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
+def test_images_that_differ_are_named(filmed: Path, tmp_path: Path, simulators: SimulatorCache) -> None:
     spoilt = Spoilt(filmed)
-    spoilt.image("wrist", lambda frame, image: 255 - image if frame == 0 else image)
     depth = spoilt.images[9]["front"].depth
     labels = spoilt.images[12]["wrist"].segmentation
     assert depth is not None
@@ -316,16 +310,9 @@ def test_images_that_differ_are_measured(filmed: Path, tmp_path: Path, simulator
     labels[40, 40] = labels[40, 40] + 1
     report = deep_check(spoilt.write(tmp_path / "spoilt.mcap"), simulators)
     assert report.level == "fail"
-    images = {d.stream: d for d in report.differences if d.field == "image"}
-    colours = {f"/camera/{camera}/{stream}" for camera in ("front", "wrist") for stream in ("h264", "video")}
-    assert set(images) == {*colours, "/camera/front/depth", "/camera/wrist/segmentation"}  # everything is encoded again
-    assert images["/camera/front/depth"].frames == (9,)
-    assert images["/camera/front/depth"].recorded == "the image differs in 1 of 9216 pixels, by up to 0.001 m"
-    assert images["/camera/wrist/segmentation"].frames == (12,)
-    found = {camera: images[f"/camera/{camera}/h264"] for camera in ("front", "wrist")}
-    assert all(difference.frames[0] == 0 for difference in found.values())
-    levels = {camera: int(difference.recorded.split()[-4]) for camera, difference in found.items()}
-    assert levels["front"] < 40 < 150 < levels["wrist"] <= 255
+    images = {d.stream: d.frames for d in report.differences if d.field == "image"}
+    assert images["/camera/front/depth"] == (9,)
+    assert images["/camera/wrist/segmentation"] == (12,)
     assert all(d.field == "image" or d.stream.endswith("/histogram") for d in report.differences)
 
 

@@ -44,6 +44,6 @@ def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch
         assert trajectory.object_poses["red_cube"][:, 2].max() < start[2] + 0.005  # pushed, not carried
         assert math.dist(end[:2], scene.goals[0].onto_from_goal.position[:2]) < 0.02
         options = ReplayOptions(allowed=("my_pushing_tasks",))
-        ((report, _),) = replay_all([open_file(path, options)], options)
+        ((report, _),) = replay_all([open_file(path)], options)
         assert report.is_identical
         assert checked(path).verdict == "good"

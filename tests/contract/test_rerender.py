@@ -10,7 +10,7 @@ import pytest
 from support.check import checked, simulate
 from support.commands import exit_code
 
-from demorec.extensions.remake.deep.check import deep_check
+from demorec.extensions.remake.deep_check import deep_check
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.extensions.remake.rerender import rerender
 from demorec.mcap import Recording

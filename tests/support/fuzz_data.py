@@ -178,7 +178,7 @@ class FuzzedData:
             ["view", path, "--save", self.folder / "out.rrd"],
             [*lerobot, "--privileged"], [*lerobot, "--action", "ee_delta"],
             ["export", "hdf5", path, "--out", self.folder / "out.hdf5"],
-            ["recover", path, "--out", self.folder / "out.mcap"], ["replay", path], ["replay", path, "--states"],
+            ["recover", path, "--out", self.folder / "out.mcap"], ["replay", path],
             ["render", path, "--cameras", "front", "--width", "32", "--height", "32", "--workers", "1",
              "--out", self.folder / "out.mcap"],
         )  # fmt: skip

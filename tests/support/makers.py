@@ -161,5 +161,5 @@ def line_of(path: Path, content: dict[str, object], file: str) -> Attempt:
         num_bytes=path.stat().st_size,
         phase="" if content["success"] else "lift",
         reason="" if content["success"] else "dropped",
-        seconds={"simulation": 0.25},
+        seconds=0.25,
     )

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shlex
 import shutil
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -13,7 +12,6 @@ from support.check import simulate_run
 
 from demorec.cli.generate_report import check_run, next_commands
 from demorec.core.config import GenerateConfig
-from demorec.generate.contents import set_aside
 from demorec.generate.options import RunResult
 from demorec.runs.run_file import Generation, RunFile, load_run_file, save_run_file
 
@@ -37,40 +35,6 @@ def test_the_users_modules_are_allowed_in_them() -> None:
     result = replace(result, run=result.run.with_generation(config=config))
     for line in next_commands(result):
         assert shlex.split(line)[2:] == ["/data", "--allow", "mytask", "--allow", "lab.arms"]
-
-
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [
-        ((), []),
-        (
-            ("dataset/meta/info.json", "dataset/README.md", "dataset.1/meta/info.json"),
-            ["2 datasets that the run did not leave like this"],
-        ),
-        (
-            (
-                "episode_000003.mcap",
-                "host-12-0/episode_000004.mcap.part",
-                "host-12-0/episode_000005.mcap.part",
-                "error_episode_000004.txt",
-            ),
-            [
-                "1 recording not of this run, or damaged",
-                "1 unfinished recording (demorec recover keeps the complete frames)",
-                "1 unfinished recording in which nothing was written",
-                "1 error report",
-            ],
-        ),
-        (("README.md", "README.md.1"), ["2 edited dataset cards"]),
-        (("notes.txt", "episode_notes.txt", "draft.part", "error_list.txt", "mine/episode_000001.mcap"), []),
-    ],
-)
-def test_files_set_aside_are_described(tmp_path: Path, names: Sequence[str], words: list[str]) -> None:
-    for name in names:
-        file = tmp_path / "unfinished" / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_bytes(b"" if "000005" in name else b"something")
-    assert set_aside(tmp_path) == words
 
 
 @pytest.mark.slow

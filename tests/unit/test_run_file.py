@@ -40,7 +40,7 @@ def a_run() -> RunFile:
             num_frames=5,
             num_bytes=9,
             reason="" if success else "dropped",
-            seconds={"simulation": 0.1 + 0.2},
+            seconds=0.1 + 0.2,
         )
         for (episode, attempt), success in expected_attempts(6, seed=3).items()
     ]
@@ -146,7 +146,7 @@ def test_the_digest_depends_on_content_and_on_nothing_else() -> None:
     run = a_run()
     same = [
         replace(run, sessions=()).with_generation(export=None, versions={}, num_episodes=9),
-        run.with_attempts([replace(a, seconds={}, sha256="", num_bytes=0) for a in reversed(run.attempts)]),
+        run.with_attempts([replace(a, seconds=0.0, sha256="", num_bytes=0) for a in reversed(run.attempts)]),
     ]
     assert {other.digest for other in same} == {run.digest}
     first, *rest = run.attempts

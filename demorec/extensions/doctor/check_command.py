@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from demorec.check.report import Subject, SubjectReport
     from demorec.extensions.doctor.diagnosis import Diagnosis
     from demorec.extensions.doctor.evidence import Evidence
-    from demorec.extensions.remake.deep.check import DeepReport
+    from demorec.extensions.remake.deep_check import DeepReport
 
 
 _SHOWN = 12
@@ -168,7 +168,7 @@ class CheckCommand:
         return text
 
     def _remade(self, subjects: Sequence[Subject], workers: int) -> Iterator[DeepReport]:
-        from demorec.extensions.remake.deep.check import deep_checks, deep_dataset_checks
+        from demorec.extensions.remake.deep_check import deep_checks, deep_dataset_checks
 
         allowed = allowed_modules(self.allow)
         paths = [subject.path for subject in subjects if subject.kind == "recording"]
@@ -195,8 +195,6 @@ def deep_lines(report: DeepReport, *, verbose: bool = False) -> Iterator[str]:
     details += [str(difference) for difference in shown]
     if len(report.differences) > len(shown):
         details.append(f"and {counted(len(report.differences) - len(shown), 'field')} more (--all shows them)")
-    if report.replay:
-        details.append(f"Replayed: {report.replay}")
     yield from (f"      {detail}" for detail in details)
 
 

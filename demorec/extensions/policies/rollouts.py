@@ -50,8 +50,7 @@ from demorec.extensions.policies.policy import (
     trained_action,
 )
 from demorec.extensions.policies.turns import Turns, correcting_behaviour
-from demorec.generate.executor import Raised
-from demorec.generate.local import LocalExecutor
+from demorec.generate.executor import LocalExecutor, Raised
 from demorec.loop import make_world
 from demorec.mcap import EpisodeWriter
 from demorec.robots.robot import RobotSpec

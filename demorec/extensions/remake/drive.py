@@ -7,7 +7,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from itertools import chain, repeat, zip_longest
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
@@ -16,16 +16,14 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.files import make_folder
 from demorec.core.geometry import Array
-from demorec.core.seeding import generator
 from demorec.core.tables import TASKS
-from demorec.episode.episode import Action, Frame, Observation, Outcome, SuccessCheck
+from demorec.episode.episode import Frame, Observation, Outcome, SuccessCheck
 from demorec.episode.simulated import with_simulation
 from demorec.extensions.remake.demonstration import JOINTS, OPENING, POSE_OF, Demonstration, ReplayOptions, seen_in
 from demorec.extensions.remake.rerender import config_as, finished_outcome, recorded_view, view_behaviour, view_painter
 from demorec.loop import Session, SimulatorCache, Step
 from demorec.loop.actions import ActionDecoder
 from demorec.mcap import EpisodeWriter
-from demorec.mcap.frames import pose_of
 from demorec.render.painter import Painter
 from demorec.robots.assets import allow_models
 from demorec.sim.world import World
@@ -46,7 +44,6 @@ class ReplayReport:
         joint_error, joint_error_step: Largest difference of an arm joint, rad, and its step.
         gripper_error: Largest difference of the opening, m.
         object_error, object_error_step, object_error_name: Largest distance of an object from its recorded place, m.
-        compares_objects: Whether object positions were recorded; datasets have none.
         recorded_success, success: Success of the recording and of the replay; None if unknown or not judged.
         is_outcome_as_recorded: Both are equal, or one is unknown. A failure with a recorded reason (the expert gave up)
         remains one even if the conditions hold.
@@ -68,7 +65,6 @@ class ReplayReport:
     object_error: float
     object_error_step: int
     object_error_name: str
-    compares_objects: bool
     recorded_success: bool | None
     success: bool | None
     is_outcome_as_recorded: bool
@@ -89,135 +85,82 @@ def replay(
 
     Args:
         demonstration: Demonstration to replay.
-        world: World of its robot and rate (`World(info.simulated.robot, fps=demonstration.fps)`); it is reset.
+        world: World of its robot and rate; it is reset.
         options: Options of the replay.
         painter: Draws the frames' images; None for none.
         sink: Called with every frame of the replay before its command is sent.
 
     Returns:
-        The report, and the outcome of the replay; with `states`, which judges nothing, the recorded outcome.
+        The report, and the outcome of the replay.
     """
     d = demonstration
-    task = None if options.states or d.is_measured else TASKS.load(d.info.simulated.task, options.allowed)()
+    task = None if d.is_measured else TASKS.load(d.info.simulated.task, options.allowed)()
     session = Session(world, d.info.simulated.scene, task, painter=painter)
-    agent = DemonstrationAgent(d, options)
+    agent = DemonstrationAgent(d)
     seen: list[Observation] = []
-    for frame in _placed(session, d) if options.states else session.run(agent):
+    for frame in session.run(agent):
         seen.append(frame.observation)
         if sink is not None:
             sink(frame)
-    outcome = _recorded_outcome(d, world) if options.states else session.outcome
-    return _report(d, seen, outcome, is_judged=not options.states, unreachable=agent.num_unreachable), outcome
+    return _report(d, seen, session.outcome, unreachable=agent.num_unreachable), session.outcome
 
 
 class DemonstrationAgent:
-    """Agent that sends the recorded commands, delayed, with noise or unchanged."""
+    """Agent that sends the recorded commands; label, phase and events are those of the recorded frames, if any."""
 
     num_retries = 0
 
-    def __init__(self, demonstration: Demonstration, options: ReplayOptions) -> None:
-        self._demonstration, self._options = demonstration, options
-        self._decoder: ActionDecoder | None = None
-        self._num_held = 0
-
-    @property
-    def num_unreachable(self) -> int:
+    def __init__(self, demonstration: Demonstration) -> None:
+        self._demonstration = demonstration
+        self.num_unreachable = 0
         """Number of steps with an unreachable pose, or a target that is not finite."""
-        return self._num_held + (0 if self._decoder is None else self._decoder.num_unreachable)
 
     def decide(self, world: World) -> Iterator[Step]:
-        """See `demorec.loop.Agent`; label, phase and events are taken from the recorded frame, if any."""
-        recorded = chain(self._demonstration.recorded, repeat(None))
-        for command in self._sent(world):
-            yield _step(command, next(recorded))
-
-    def _sent(self, world: World) -> Iterator[Action]:
-        d, options = self._demonstration, self._options
-        rng = generator(
-            root_seed=options.seed, episode_index=d.info.episode_index, attempt=d.info.attempt, purpose="noise"
-        )
-        for _ in range(options.delay):
-            yield world.hold()
-        for command in self._commands(world):
-            if not np.isfinite(command.joint_target).all():  # from a damaged dataset: the arm stays in place
-                self._num_held += 1
-                command = replace(world.hold(), gripper_target=command.gripper_target)
-            if options.noise > 0.0:
-                low, high = world.arm.kinematics.lower, world.arm.kinematics.upper
-                target = command.joint_target + rng.normal(0.0, options.noise, len(command.joint_target))
-                command = world.arm.action(np.clip(target, low, high), command.gripper_target)
-            yield command
-
-    def _commands(self, world: World) -> Iterable[Action]:
+        """See `demorec.loop.Agent`."""
         d = self._demonstration
+        for frame in d.recorded:
+            yield Step(
+                action=frame.action,
+                command=frame.command,
+                phase=frame.phase,
+                events=frame.events,
+                is_deliberate_miss=frame.is_deliberate_miss,
+            )
         if d.actions is None or d.action_kind is None:
-            return d.commands
-        self._decoder = ActionDecoder(world, d.action_kind, is_limited=False)
-        return map(self._decoder.command, d.actions)
+            return
+        decoder = ActionDecoder(world, d.action_kind, is_limited=False)
+        num_held = 0
+        for action in d.actions:
+            command = decoder.command(action)
+            if not np.isfinite(command.joint_target).all():  # from a damaged dataset: the arm stays in place
+                num_held += 1
+                command = replace(world.hold(), gripper_target=command.gripper_target)
+            self.num_unreachable = num_held + decoder.num_unreachable
+            yield Step(action=command)
 
     def failure(self, failed: Sequence[str]) -> tuple[str, str]:
         """See `demorec.loop.Agent`."""
         return ("replay", failed[0]) if failed else ("", "")
 
 
-def _step(command: Action, recorded: Frame | None) -> Step:
-    if recorded is None:
-        return Step(action=command)
-    return Step(
-        action=recorded.action,
-        command=command,
-        phase=recorded.phase,
-        events=recorded.events,
-        is_deliberate_miss=recorded.is_deliberate_miss,
-    )
-
-
-def _placed(session: Session, d: Demonstration) -> Iterator[Frame]:
-    """Yield frames with the recorded states in sequence, without physics."""
-    session.reset()
-    for step, recorded in zip(range(d.num_steps), chain(d.recorded, repeat(None)), strict=False):
-        session.place(
-            step,
-            joint_position=d.compared[JOINTS][step],
-            object_poses={name: pose_of(d.compared[f"{POSE_OF}{name}"][step]) for name in d.objects},
-        )
-        command = session.world.hold() if recorded is None else recorded.command
-        yield session.frame(_step(command, recorded))
-
-
-def _recorded_outcome(d: Demonstration, world: World) -> Outcome:
-    success = bool(d.success)
-    return Outcome(
-        success=success,
-        checks=() if d.outcome is None else d.outcome.checks,
-        failure_phase="" if success else "replay",
-        failure_reason="" if success else "unknown",
-        num_frames=d.num_steps,
-        final_state_digest=world.state_digest(),
-    )
-
-
-def _report(
-    d: Demonstration, seen: Sequence[Observation], outcome: Outcome, *, is_judged: bool, unreachable: int
-) -> ReplayReport:
-    off = _differences(d, seen[: d.num_steps])
+def _report(d: Demonstration, seen: Sequence[Observation], outcome: Outcome, *, unreachable: int) -> ReplayReport:
+    off = _differences(d, seen)
     differs = np.array([~(np.abs(values).max(axis=1) <= d.tolerance) for values in off.values()])  # as NaN does
     first = None
     if differs.any():
         step = int(differs.any(axis=0).argmax())
         first = step, list(off)[int(differs[:, step].argmax())]
-    elif is_judged and d.outcome is not None and d.outcome.final_state_digest:
+    elif d.outcome is not None and d.outcome.final_state_digest:
         if d.outcome.final_state_digest != outcome.final_state_digest:
-            first = d.num_steps, "the final state"
+            first = len(seen), "the final state"
         elif d.outcome.checks != outcome.checks:
-            first = d.num_steps, _other_condition(outcome.checks, d.outcome.checks)
+            first = len(seen), _other_condition(outcome.checks, d.outcome.checks)
     arm = np.abs(off[JOINTS][:, : len(d.info.simulated.robot.arm_joints)]).max(axis=1)
     distances = np.array([np.linalg.norm(off[f"{POSE_OF}{name}"][:, :3], axis=1) for name in d.objects])
     number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
     distance = float(distances[number, step]) if len(distances) else 0.0
-    checks = outcome.checks if is_judged else ()
-    failed = tuple(check.name for check in checks if not check.passed)
-    success = not failed if checks else None
+    failed = tuple(check.name for check in outcome.checks if not check.passed)
+    success = not failed if outcome.checks else None
     return ReplayReport(
         name=d.name,
         num_steps=len(seen),
@@ -231,7 +174,6 @@ def _report(
         object_error=distance,
         object_error_step=step,
         object_error_name="" if distance == 0.0 else d.objects[number],
-        compares_objects=bool(d.objects),
         recorded_success=d.success,
         success=success,
         is_outcome_as_recorded=None in (success, d.success) or success == d.success or (d.gave_up and not d.success),
@@ -257,23 +199,19 @@ def _differences(d: Demonstration, seen: Sequence[Observation]) -> dict[str, Arr
     """Compared quantity -> (T, D), replayed minus recorded values."""
     width = d.compared[JOINTS].shape[1]  # datasets have only the arm's joints
     now = [seen_in(observation) | {JOINTS: observation.joint_position[:width]} for observation in seen]
-    return {
-        name: np.array([values[name] for values in now]) - recorded[: len(seen)]
-        for name, recorded in d.compared.items()
-    }
+    return {name: np.array([values[name] for values in now]) - recorded for name, recorded in d.compared.items()}
 
 
-def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0, bitwise: bool = True) -> bool:
-    """Whether a replay agrees with the recording.
+def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0) -> bool:
+    """Whether a replay agrees with the recording: a recording's states and outcome, a dataset's outcome.
 
     Args:
         report: Report of the replay.
         tolerance: Maximum difference (m, rad) of equal states; for a real arm's data, 0 means unlimited.
-        bitwise: Whether the states must be equal; otherwise (changed commands) only the outcome counts.
     """
     if report.tracking and tolerance:
         return max(report.joint_error, report.gripper_error) <= tolerance
-    if not report.is_bitwise or not bitwise:
+    if not report.is_bitwise:
         return report.is_outcome_as_recorded
     errors = report.joint_error, report.gripper_error, report.object_error
     return report.is_outcome_as_recorded and (report.is_identical or 0.0 < max(errors) <= tolerance)
@@ -287,7 +225,8 @@ def replay_all(
     Args:
         demonstrations: Demonstrations to replay.
         options: Options of the replay.
-        out: Folder for recordings of the replays; None records nothing.
+        out: Folder for recordings of the replays, under the same names and with images of the recorded cameras; one
+            that the same call has already made stays. None records nothing.
         overwrite: Whether recordings there may be replaced.
 
     Yields:
@@ -295,55 +234,42 @@ def replay_all(
 
     Raises:
         NotAllowedError: A demonstration's task is in a module that `options` do not allow.
+        ConfigError: A new recording would replace its own source, or a file with that name exists already.
     """
     allow_models(options.allowed)
     with closing(SimulatorCache()) as simulators:
-        for demonstration in demonstrations:
-            if not (options.states or demonstration.is_measured):
-                TASKS.check_name(demonstration.info.simulated.task, options.allowed)  # before anything is created
-            if out is not None:
-                yield record_replay(demonstration, simulators, options, out, overwrite=overwrite)
+        for d in demonstrations:
+            if not d.is_measured:
+                TASKS.check_name(d.info.simulated.task, options.allowed)  # before anything is created
+            if out is None:
+                yield _replay_blind(d, simulators, options), None
                 continue
-            yield _replay_blind(demonstration, simulators, options), None
+            path = out / (d.name if d.source is not None else f"{d.name}.mcap")
+            report = _record_replay(d, simulators, options, path, overwrite=overwrite)
+            yield report, None if d.source is None else (d.source, path)
 
 
-def record_replay(
-    demonstration: Demonstration, simulators: SimulatorCache, options: ReplayOptions, out: Path, *, overwrite: bool
-) -> tuple[ReplayReport, tuple[Path, Path] | None]:
-    """Replay and record it, with images of the recording's cameras, to a file with the same name in `out`.
-
-    A recording that the same call has already made stays, unless it is to be replaced.
-
-    Returns:
-        As in `replay_all`.
-
-    Raises:
-        ConfigError: The new recording would replace its own source, or a file with that name exists already.
-    """
-    d = demonstration
-    path = out / (d.name if d.source is not None else f"{d.name}.mcap")
+def _record_replay(
+    d: Demonstration, simulators: SimulatorCache, options: ReplayOptions, path: Path, *, overwrite: bool
+) -> ReplayReport:
     if d.source is not None and path.resolve() == d.source.resolve():
-        raise ConfigError(f"The replay would replace its own source: choose another --out: {out}")
+        raise ConfigError(f"The replay would replace its own source: choose another --out: {path.parent}")
+    make_folder(path.parent)
     view = recorded_view(d.info)
-    make_folder(out)
     behaviour = view_behaviour(d.info, view)
-    origin = f"replay of {d.digest[:16]}{options.changes}"
-    info = with_simulation(replace(d.info, fps=d.fps, origin=origin), behaviour=behaviour)
-    pair = None if d.source is None else (d.source, path)
+    info = with_simulation(replace(d.info, origin=f"replay of {d.digest[:16]}"), behaviour=behaviour)
     if not overwrite and finished_outcome(path, info) is not None:
-        return _replay_blind(d, simulators, options), pair
+        return _replay_blind(d, simulators, options)
     video = config_as(d.info.simulated.config.get("video", {}), VideoConfig)
     world, renderer = simulators.acquire(info)
     painter = view_painter(renderer, view, d.info.simulated.config) if renderer else None
     with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
         report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
         writer.finish(outcome)
-    return report, pair
+    return report
 
 
 def _replay_blind(d: Demonstration, simulators: SimulatorCache, options: ReplayOptions) -> ReplayReport:
     """Replay without images."""
-    blind = replace(d.info.simulated.scene, cameras=())
-    info = with_simulation(replace(d.info, fps=d.fps), scene=blind, config={})
-    world, _ = simulators.acquire(info)
+    world, _ = simulators.acquire(with_simulation(d.info, scene=replace(d.info.simulated.scene, cameras=()), config={}))
     return replay(d, world, options)[0]

@@ -11,5 +11,5 @@ EXTENSION = Extension(
         "replay": CommandRow(target="demorec.extensions.remake.replay_command:Replay", group="look", limits="drawing"),
         "render": CommandRow(target="demorec.extensions.remake.render_command:Render", group="make", limits="drawing"),
     },
-    proofs={"remake": "demorec.extensions.remake.deep.check:proofs"},
+    proofs={"remake": "demorec.extensions.remake.deep_check:proofs"},
 )

@@ -1,4 +1,4 @@
-"""`demorec replay`: send recorded actions or states to the simulator."""
+"""`demorec replay`: send recorded actions to the simulator."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ class Replay:
 
     Recordings must replay bit-exactly (on the same type of machine); demorec check --deep also compares labels, phases
     and images. Datasets have float32 actions without the executed exploration noise; for them success and deviations
-    are reported. Exit code 0: as recorded (bit-exact; for a dataset or with --noise, --delay or --export-hz: the
-    recorded outcome); 1: not as recorded. Recordings that the same command has already written to --out stay.
+    are reported. Exit code 0: as recorded (bit-exact; for a dataset: the recorded outcome); 1: not as recorded.
+    Recordings that the same command has already written to --out stay.
 
     With --robot, a simulated arm executes a real arm's actions, from its dataset or imported recordings, on an empty
     table, and the distance from the measured states is reported for each joint. Exit code 1: a distance over
@@ -41,7 +41,6 @@ class Replay:
       demorec replay recordings/cubes/episodes/episode_000000.mcap
       demorec replay recordings/cubes --episodes 0:10
       demorec replay datasets/cubes
-      demorec replay recordings/cubes --noise 0.01 --delay 2 --export-hz 10
       demorec replay episode.mcap --out replayed --view
       demorec replay --robot so101 --motor-units degrees datasets/desk
     """
@@ -50,16 +49,6 @@ class Replay:
     """Recordings, runs, folders of recordings, or exported datasets."""
     episodes: str = ""
     """Episodes to replay, by number: 0:100, ::2, 3,5,8:10; all by default."""
-    states: bool = False
-    """Set the recorded states one after another instead of sending the actions."""
-    export_hz: int | None = None
-    """Send commands at this rate; must divide the recorded rate."""
-    noise: float = 0.0
-    """Standard deviation of noise added to every joint target, rad."""
-    delay: int = 0
-    """Delay of every command, in steps."""
-    seed: int = 0
-    """Seed of the noise."""
     tolerance: float = 0.0
     """Largest difference, in m and rad, that still counts as recorded; for another type of machine."""
     robot: str = ""
@@ -87,11 +76,6 @@ class Replay:
 
         allowed = (*allowed_modules(self.allow), *modules_of([self.robot]))
         options = ReplayOptions(
-            states=self.states,
-            export_hz=self.export_hz,
-            noise=self.noise,
-            delay=self.delay,
-            seed=self.seed,
             allowed=allowed,
             robot=load_robot(self.robot, allowed) if self.robot else None,
             motors=self.motors.named,
@@ -120,7 +104,7 @@ class Replay:
                         pairs.append(written)
             if not reports:
                 raise ConfigError(f"No episode has a number within {self.episodes!r}.")
-            good = [is_as_recorded(r, tolerance=self.tolerance, bitwise=options.is_plain) for r in reports]
+            good = [is_as_recorded(r, tolerance=self.tolerance) for r in reports]
             if self.json:
                 from demorec.core.plain import to_plain
 
@@ -163,16 +147,18 @@ def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: s
 
 def _found(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
     from demorec.datasets.options import parse_episodes
-    from demorec.extensions.remake.demonstration import dataset_demonstrations, open_file
+    from demorec.extensions.remake.demonstration import dataset_demonstrations, open_dataset, open_file
+    from demorec.extensions.remake.real_arm import open_real_arm, real_arms
 
-    wanted = parse_episodes(episodes)
+    robot, wanted = options.robot, parse_episodes(episodes)
     for path in paths:
         found = _replayable(path)
         if found.kind == "dataset":
-            yield from dataset_demonstrations(path, wanted, options)
+            dataset = open_dataset(path, wanted, options)
+            yield from dataset_demonstrations(dataset, wanted) if robot is None else real_arms(dataset, robot, wanted)
             continue
         for file in found.recordings:
-            demonstration = open_file(file, options)
+            demonstration = open_file(file) if robot is None else open_real_arm(file, robot, options)
             if wanted(demonstration.info.episode_index):
                 yield demonstration
 
@@ -223,14 +209,14 @@ def _compared(reports: Sequence[ReplayReport]) -> str:
     from demorec.extensions.remake.demonstration import POSE_OF
 
     found = dict.fromkeys(name for report in reports for name in report.compared)
-    names = [name for name in found if not name.startswith(POSE_OF)]
-    objects = ["poses of objects"] if any(report.compares_objects for report in reports) else []
-    return (
-        f"Compared: {', '.join([name.removeprefix('the ') for name in names] + objects)}; not labels, phases, images."
-    )
+    names = [name.removeprefix("the ") for name in found if not name.startswith(POSE_OF)]
+    objects = ["poses of objects"] if len(names) < len(found) else []
+    return f"Compared: {', '.join(names + objects)}; not labels, phases, images."
 
 
 def _summary(reports: Sequence[ReplayReport], good: int) -> str:
+    from demorec.extensions.remake.demonstration import POSE_OF
+
     judged = [report for report in reports if report.success is not None]
     parts = [f"{len(reports)} replayed, {sum(r.is_identical for r in reports)} identical, {good} as recorded"]
     if judged:
@@ -239,10 +225,9 @@ def _summary(reports: Sequence[ReplayReport], good: int) -> str:
         f"{max(report.joint_error for report in reports):.2g} rad",
         f"gripper {max(report.gripper_error for report in reports) * 1e3:.2g} mm",
     ]
-    if any(report.compares_objects for report in reports):
+    if any(name.startswith(POSE_OF) for report in reports for name in report.compared):
         largest.append(f"objects {max(report.object_error for report in reports) * 1e3:.2g} mm")
-    parts.append(f"largest difference {', '.join(largest)}")
-    return "; ".join(parts) + "."
+    return "; ".join([*parts, f"largest difference {', '.join(largest)}"]) + "."
 
 
 def _show(pairs: Sequence[tuple[Path, Path]]) -> None:

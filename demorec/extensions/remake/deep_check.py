@@ -1,4 +1,9 @@
-"""The deep check: remake a recording, or an episode of a dataset, and compare all of it."""
+"""`demorec check --deep`: remake a recording, or an episode of a dataset, from its description, and compare every byte.
+
+The script runs again from config and seed; for a derived recording (a replay, a render) the commands are sent again.
+Differences are reported by stream, field and frame. This finds every error in a recording of demorec except errors that
+the program itself reproduces.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +15,8 @@ from functools import partial
 from pathlib import Path
 from typing import Literal
 
-from demorec.check.dataset import CheckedDataset, DescribedEpisode
-from demorec.check.proof import Proof
-from demorec.check.run_dataset import episode_differences, export_options
+from demorec.check.dataset import CheckedDataset, DescribedEpisode, episode_differences, export_options
+from demorec.check.report import Proof
 from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
 from demorec.core.own_versions import version_differences
@@ -22,12 +26,12 @@ from demorec.core.tables import RENDERERS
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
-from demorec.extensions.remake.deep.contents import Contents, RemakeDifference, coded_topics, content_differences
-from demorec.extensions.remake.deep.images import image_differences
+from demorec.extensions.remake.byte_comparison import Contents, RemakeDifference, content_differences
 from demorec.extensions.remake.demonstration import ReplayOptions, open_demonstration
 from demorec.extensions.remake.drive import replay
 from demorec.extensions.remake.rerender import config_as, recorded_view, view_painter
-from demorec.loop import ScriptAgent, Session, SimulatorCache, prepare
+from demorec.generate.worker import record_episode
+from demorec.loop import SimulatorCache
 from demorec.mcap import EpisodeWriter, Recording, open_simulated
 from demorec.robots.assets import allow_models
 
@@ -42,7 +46,6 @@ class DeepReport:
         there are any, nothing is provable here, and differences are warnings.
         differences: Everything that differs, ordered by the first frame.
         error: Reason why it could not be remade; "" if it could.
-        replay: Result of replaying its own commands in its own scene, in words; "" unless numbers differ.
         is_derived: Whether it is a replay or a render, whose labels, phases and events are copied.
         num_frames: Number of recorded frames.
     """
@@ -51,7 +54,6 @@ class DeepReport:
     versions: tuple[str, ...] = ()
     differences: tuple[RemakeDifference, ...] = ()
     error: str = ""
-    replay: str = ""
     is_derived: bool = False
     num_frames: int = 0
 
@@ -89,10 +91,10 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             report = replace(report, versions=_unlike_here(info, allowed))
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
-            differences = tuple(_differences(recording, again))
-            if not report.is_derived and any(d.field != "image" for d in differences):
-                report = replace(report, replay=_replayed(recording, simulators, allowed))
-            return replace(report, differences=differences)
+            found, made = Contents.of(path), Contents.of(again)
+            if recording.is_recovered:
+                made.cut_off(found)
+            return replace(report, differences=tuple(content_differences(found, made, info.fps)))
     except DemorecError as error:
         return _impossible(report, error)
 
@@ -153,22 +155,16 @@ def remake(recording: Recording, path: Path, simulators: SimulatorCache, allowed
         _generate_again(recording.info, path, simulators, allowed)
 
 
-def _generate_again(recorded: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
-    """`remake` of a generated episode, which needs only its description; same errors."""
-    config = _recorded_config(recorded, allowed)
-    episode = prepare(EpisodePlan(config=config, episode_index=recorded.episode_index, attempt=recorded.attempt))
-    world, renderer = simulators.acquire(episode.info)
-    session = Session.of_episode(world, episode, renderer)
-    with EpisodeWriter(path, episode.info, video=config.video) as writer:
-        for frame in session.run(ScriptAgent(episode)):
-            writer.write(frame)
-        writer.finish(session.outcome)
+def _generate_again(info: EpisodeInfo, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
+    config = _recorded_config(info, allowed)
+    plan = EpisodePlan(config=config, episode_index=info.episode_index, attempt=info.attempt)
+    record_episode(plan, path, simulators)
 
 
 def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
     allow_models(allowed)
     options = ReplayOptions(allowed=tuple(allowed))
-    demonstration = open_demonstration(recording, options)
+    demonstration = open_demonstration(recording)
     info = with_simulation(recording.info, config_digest=digest(recording.info.simulated.config))
     RENDERERS.check_name(str(info.simulated.config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
@@ -185,31 +181,6 @@ def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, al
                 success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
             )
         writer.finish(outcome)
-
-
-def _differences(recording: Recording, again: Path) -> Iterator[RemakeDifference]:
-    """Sorted by the first frame, with differences outside frames first."""
-    found, made = Contents.of(recording.path), Contents.of(again)
-    with open_simulated(again) as remade:
-        if recording.is_recovered:
-            made.cut_off(found)
-        differences, images = content_differences(found, made, remade.info, recording.info.fps)
-        differences += image_differences(found, made, remade, coded_topics(remade.info), images)
-    yield from sorted(differences, key=lambda difference: difference.frames[:1])
-
-
-def _replayed(recording: Recording, simulators: SimulatorCache, allowed: Sequence[str]) -> str:
-    """Describe a replay of the recorded commands in the recorded scene, which locates the fault."""
-    options = ReplayOptions(allowed=tuple(allowed))
-    try:
-        demonstration = open_demonstration(recording, options)
-        report, _ = replay(demonstration, simulators.acquire(recording.info)[0], options)
-    except DemorecError as error:
-        return f"cannot be replayed ({error})"
-    if report.first_difference is None:
-        return "its commands, sent again in its recorded scene, give its recorded states to the bit"
-    step, what = report.first_difference
-    return f"its commands, sent again in its recorded scene, give other states from frame {step} on ({what})"
 
 
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:

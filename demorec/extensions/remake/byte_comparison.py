@@ -1,7 +1,7 @@
 """Compare two recordings of one episode byte by byte, and name the fields that differ.
 
 Recordings contain no clock, host or path, so that a remake on the same type of machine has the same bytes in every
-message. Encoded images that differ are decoded in `images`.
+message.
 """
 
 from __future__ import annotations
@@ -16,14 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from demorec.core.plain import parse_json
-from demorec.episode.info import EpisodeInfo
-from demorec.mcap.channels import camera_topic
 from demorec.mcap.container import Container
 from demorec.mcap.messages import Value, message_fields
 from demorec.mcap.metadata import EPISODE
 
-CODED = ("h264", "video", "image/compressed", "depth", "segmentation")
-"""Camera streams with messages that hold an encoded image in the field `data`."""
 _SEAL = "crc32"
 """Derived from the other values of a metadata record."""
 _MADE_BY = ("info.versions", "info.simulation.cpu")
@@ -68,8 +64,7 @@ class RemakeDifference:
         return text if self.largest is None or len(self.frames) < 2 else f"{text}; at most {self.largest:.3g} apart"
 
 
-def difference_in_words(value: Value | None) -> str:
-    """A value in words; None if missing."""
+def _in_words(value: Value | None) -> str:
     if value is None:
         return "nothing"
     if isinstance(value, bytes):
@@ -133,31 +128,13 @@ class Contents:
             other.metadata.pop(name, None)
 
 
-def coded_topics(info: EpisodeInfo) -> dict[str, str]:
-    """Topic -> camera, for all streams of encoded images."""
-    return {
-        camera_topic(camera.name, stream): camera.name for camera in info.simulated.scene.cameras for stream in CODED
-    }
+def content_differences(recorded: Contents, again: Contents, fps: int) -> list[RemakeDifference]:
+    """List the fields that differ by their first frame, those outside frames first; `fps` is of the recording."""
+    found = _gathered(_all_differing(recorded, again, fps))
+    return sorted(found, key=lambda difference: difference.frames[:1])
 
 
-def content_differences(
-    recorded: Contents, again: Contents, info: EpisodeInfo, fps: int
-) -> tuple[list[RemakeDifference], dict[str, list[int]]]:
-    """Differences except those of encoded images; and topic -> ascending frames with different encoded images.
-
-    Args:
-        recorded, again: The two files.
-        info: Description of the remake.
-        fps: Frames per second of the recording.
-    """
-    images: dict[str, list[int]] = {}
-    return list(_gathered(_all_differing(recorded, again, info, fps, images))), images
-
-
-def _all_differing(
-    recorded: Contents, again: Contents, info: EpisodeInfo, fps: int, images: dict[str, list[int]]
-) -> Iterator[Differing]:
-    """Yield single differences; frames with different encoded images are added to `images`."""
+def _all_differing(recorded: Contents, again: Contents, fps: int) -> Iterator[Differing]:
     for name in recorded.attachments.keys() | again.attachments.keys():
         a, b = recorded.attachments.get(name), again.attachments.get(name)
         if a != b:
@@ -166,7 +143,6 @@ def _all_differing(
         for path, a, b in _metadata_differences(recorded.metadata.get(name), again.metadata.get(name)):
             if not (name == EPISODE and path.startswith(_MADE_BY)):
                 yield f"metadata {name}", path, None, a, b
-    coded = coded_topics(info)
     for topic in dict.fromkeys((*again.channels, *recorded.channels)):
         if topic not in recorded.channels or topic not in again.channels:
             ours, theirs = (sum(map(len, c.messages.get(topic, {}).values())) for c in (recorded, again))
@@ -175,8 +151,8 @@ def _all_differing(
         for name, a, b in _differing(recorded.channels[topic], again.channels[topic]):
             yield topic, name, None, a, b
         for name, frame, a, b in _topic_differences(topic, recorded, again, fps):
-            if topic in coded and name == "data":
-                images.setdefault(topic, []).append(frame)
+            if name == "data" and isinstance(a, bytes) and isinstance(b, bytes):
+                yield topic, "image", frame, a, b
             else:
                 yield topic, name, frame, a, b
 
@@ -188,7 +164,7 @@ def _gathered(found: Iterable[Differing]) -> Iterator[RemakeDifference]:
     for stream, name, frame, a, b in found:
         key = stream, name
         if key not in groups:
-            groups[key] = difference_in_words(a), difference_in_words(b), {}
+            groups[key] = _in_words(a), _in_words(b), {}
         if frame is not None:
             groups[key][2][frame] = None
         if (apart := _apart(a, b)) is not None:
