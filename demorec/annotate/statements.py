@@ -47,8 +47,9 @@ _MIN_MOVE_M = 0.005
 _MIN_OPENING_CHANGE_M = 0.0025
 
 _GoalWords = dict[str, str]
-"""Words of a goal at one moment: "object" ("the red cube"), "place" ("the blue tray", or "its place" without an object
-there), and the prepositions of the place: "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at")."""
+"""Words of a goal at one moment: "object" ("the red cube") and "place" ("the blue tray", or "its place" if empty).
+
+Its prepositions are "into" ("into", "onto" or "to") and "inside" ("in", "on" or "at")."""
 
 
 def episode_statements(
@@ -158,7 +159,7 @@ class _Narrator:
         yield from latest.items()
 
     def _deed(self, before: PhaseSegment, segment: PhaseSegment) -> str:
-        """Return what was done when one segment of an attempt follows another; "" if nothing to remember."""
+        """Return the deed done when one segment of an attempt follows another; "" for none."""
         attempt, words = segment.attempt, self._words[segment.attempt.first]
         object_ = words["object"]
         if before.phase in ("lift", "hold") and segment.phase != "recover":

@@ -16,8 +16,8 @@ _GRIPPER = re.compile("gripper|finger", re.IGNORECASE)
 def read_names(names: object, count: int) -> tuple[str, ...] | None:
     """Read the names of `count` elements; None if they are missing or their number differs.
 
-    Known forms: a list; nested lists, as written by Unitree; lists in an object under a common word, such as
-    `{"motors": [...]}` of LeRobot 2 or `{"axes": [...]}`; an object from each name to its index.
+    Known forms are a list, and nested lists, as written by Unitree. Lists may be in an object under a common word, such
+    as `{"motors": [...]}` of LeRobot 2 or `{"axes": [...]}`. An object may map each name to its index.
     """
     if isinstance(names, dict) and (places := list(names.values())) and all(type(place) is int for place in places):
         names = sorted(names, key=names.__getitem__) if sorted(places) == list(range(count)) else None

@@ -1,9 +1,9 @@
 """The input and output vectors of policies: one computation for the export and for the environments.
 
 A policy trained on an exported dataset receives the same numbers in closed loop only if both come from the same
-arithmetic. So all functions here work on rows (T frames, or one) with additions, multiplications, divisions and square
-roots alone: IEEE 754 rounds these equally on every CPU and for every array length, unlike NumPy's vectorised sines. The
-result is rounded once, at the end, if float32 is requested.
+arithmetic. So all functions here work on rows (T frames, or one) with the four basic operations and square roots alone.
+IEEE 754 rounds these equally on every CPU and for every array length, unlike NumPy's vectorised sines. The result is
+rounded once, at the end, if float32 is requested.
 
 Frames: all vectors are in the robot's base frame (equal to the world's if the robot is at its origin).
 """
@@ -157,7 +157,7 @@ def _environment(rows: Observations, robot: RobotSpec, scene: Scene) -> _Columns
     """Compute first the inputs a policy learns best from, then raw poses (metres, rad; base frame).
 
     First the TCP: position, yaw of the hand as sine and cosine. Per goal, the object: position, full extents, position
-    relative to the TCP in base axes and in hand axes, and, for a body with a yaw symmetry of 2 pi / n, its yaw as sine
+    relative to the TCP in base axes and in hand axes. A body with a yaw symmetry of 2 pi / n also has its yaw as sine
     and cosine of n times the angle, absolute and relative to the hand. The same for the target pose (with the extents
     of the body that supports it, 0 for a goal in the world; the yaw is relative to the object). The offsets object -
     TCP, goal - TCP and goal - object follow again as near-field components d / (|d| + NEAR), in -1..1 and steep around

@@ -36,7 +36,7 @@ class SceneMotion:
 class Episode(Protocol):
     """An open episode of any source; unknown parts are absent.
 
-    Methods and properties raise DemorecError if the files cannot be read. Those with a body return what is unknown.
+    Methods and properties raise DemorecError if the files cannot be read. A body returns the value of an unknown part.
     """
 
     path: Path  # file, or folder of the dataset
