@@ -179,15 +179,17 @@ def _environment(rows: Observations, robot: RobotSpec, scene: Scene) -> _Columns
         goal_label, from_object = f"{label}.goal", f"{label}.goal.from_{goal.object}"
         yield from _placed(label, object_, body.shape.extents, tcp)
         if n := body.yaw_symmetry:
-            yield _yaw_names(f"{label}.yaw", n), _yaw(object_, n)
-            yield _yaw_names(f"{label}.from_tcp.yaw", n), _difference(_yaw(object_, n), _yaw(tcp, n))
+            yaw = _yaw(object_, n)
+            yield _yaw_names(f"{label}.yaw", n), yaw
+            yield _yaw_names(f"{label}.from_tcp.yaw", n), _difference(yaw, _yaw(tcp, n))
         yield from _placed(goal_label, wanted, onto_size, tcp)
         yield _near(f"{label}.from_tcp", tcp, object_)
         yield _near(f"{goal_label}.from_tcp", tcp, wanted)
         yield _near(from_object, object_, wanted)
         if n := goal.yaw_symmetry:
-            yield _yaw_names(f"{goal_label}.yaw", n), _yaw(wanted, n)
-            yield _yaw_names(f"{from_object}.yaw", n), _difference(_yaw(wanted, n), _yaw(object_, n))
+            yaw = _yaw(wanted, n)
+            yield _yaw_names(f"{goal_label}.yaw", n), yaw
+            yield _yaw_names(f"{from_object}.yaw", n), _difference(yaw, _yaw(object_, n))
     yield from _velocities(rows, robot)
     for body in scene.movable:
         yield tuple(f"{body.name}.pose.{axis}" for axis in _POSE), poses[body.name]
