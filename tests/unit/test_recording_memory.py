@@ -23,7 +23,6 @@ READERS: dict[str, Callable[[Recording], Iterable[object]]] = {
     "depth": lambda recording: recording.depth("front"),
     "segmentation": lambda recording: recording.segmentation("front"),
     "joint_samples": lambda recording: recording.joint_samples(),
-    "events": lambda recording: recording.events(),
 }
 
 
