@@ -165,7 +165,7 @@ class EpisodeFile(Closing):
     def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
         """Read as `_read`, for a topic of images; RecordingError unless they are at their due times."""
         due_ns = self._layout.due_ns(self.num_frames)
-        due = None if due_ns is None else iter(due_ns.tolist())
+        due = None if due_ns is None else iter(due_ns)
         for time_ns, image in self._read(topic, read):
             if due is not None and time_ns != next(due, None):
                 raise self._wrong_times(topic)
