@@ -21,6 +21,10 @@ MIN_GAIN = 0.7
 """Minimum natural logarithm of the factor by which an episode's own lag reduces the unexplained variance: two."""
 MIN_GRIPPER_SHIFT = 4.0
 """Minimum difference, frames, of the lag of a gripper, which moves seldom and may be held open by an object."""
+MAX_GRIPPER_LAG = -2
+"""Maximum lag, frames, of a gripper whose action is late: it moves first. Widths of objects change positive lags."""
+MIN_GRIPPER_WAIT_S = 0.3
+"""Minimum additional delay of a gripper whose action is early."""
 MIN_GRIPPER_GAIN = 1.4
 """As MIN_GAIN, for a gripper: a factor of four."""
 MIN_LEAD = 0.25
@@ -301,17 +305,18 @@ def _gripper_faults(evidence: Evidence, element: int, column: int) -> Iterator[F
                 message=f"{name} moves against its action (correlation {correlation:+.2f}, usual "
                 f"{usual_correlation:+.2f})",
             )
-    yield from _gripper_lags(name, lags)
+    yield from _gripper_lags(name, lags, evidence.fps)
 
 
-def _gripper_lags(name: str, lags: Mapping[int, tuple[int, Array]]) -> Iterator[Fault]:
+def _gripper_lags(name: str, lags: Mapping[int, tuple[int, Array]], fps: float) -> Iterator[Fault]:
     """Find episodes in which a gripper follows its action much earlier or later than in the others."""
     if len(lags) <= MIN_OTHERS:
         return
     usual_lag, spread = usual([lag for lag, _ in lags.values()], floor=0.5)
     for number, (lag, curve) in lags.items():
         shift = lag - usual_lag
-        if abs(shift) < max(MIN_GRIPPER_SHIFT, 6 * spread):
+        is_late = lag <= MAX_GRIPPER_LAG
+        if abs(shift) < max(MIN_GRIPPER_SHIFT, 6 * spread) or not (is_late or shift > MIN_GRIPPER_WAIT_S * fps):
             continue
         unexplained = 1 - np.minimum(curve, 1 - 1e-9) ** 2
         usual_place = round(len(curve) // 2 + usual_lag)

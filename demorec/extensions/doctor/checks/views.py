@@ -24,6 +24,8 @@ MIN_SHIFT = 1.5
 MIN_GAIN = 1.4
 """Minimum factor by which an episode's own lag reduces the unexplained variance, compared with the usual one."""
 
+MIN_TAKE_EXPLAINED = 0.65
+"""As MIN_EXPLAINED, to find images of another take: where the fit is poor, another state fits better by chance."""
 MIN_TAKES = 8
 """Minimum number of episodes to find one of another take: a fit to fewer does not reach where only one episode goes."""
 MIN_OTHER_RATIO = 0.5
@@ -92,6 +94,9 @@ def image_take(evidence: Evidence) -> Iterator[Fault]:
     """
     judged = dict(_judged(evidence, MIN_TAKES))
     usual_bests = {camera: float(np.median([fit.best for fit in fits.values()])) for camera, fits in judged.items()}
+    judged = {camera: fits for camera, fits in judged.items() if usual_bests[camera] >= MIN_TAKE_EXPLAINED}
+    if not judged:
+        raise NotMeasuredError("the state explains too little of the images")
     confirmed = {
         number
         for camera, fits in judged.items()
