@@ -9,11 +9,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import get_args
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
-from demorec.check.dataset import CheckedDataset
 from demorec.core.errors import ConfigError, ExportError, RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.episode import Frame, Observation, Outcome, gave_up
@@ -25,6 +24,9 @@ from demorec.mcap.frames import frames_of
 from demorec.robots.motors import Motors
 from demorec.robots.robot import RobotSpec
 from demorec.sim.sensors import SENSORS
+
+if TYPE_CHECKING:
+    from demorec.check.dataset import CheckedDataset
 
 JOINTS, OPENING, POSE_OF = "joint positions", "gripper opening", "the pose of "
 
@@ -147,6 +149,8 @@ def open_file(path: Path) -> Demonstration:
 
 def open_dataset(path: Path, wanted: Callable[[int], bool], options: ReplayOptions) -> CheckedDataset:
     """Open a dataset whose wanted episodes are all readable; ExportError otherwise."""
+    from demorec.check.dataset import CheckedDataset  # loads pyarrow
+
     dataset = CheckedDataset(path, motors=options.motors, named=options.named)
     if missing := dataset.missing:
         raise ExportError(missing)

@@ -148,9 +148,10 @@ def demonstrations(paths: Sequence[Path], options: ReplayOptions, *, episodes: s
 def _found(paths: Sequence[Path], options: ReplayOptions, *, episodes: str) -> Iterator[Demonstration]:
     from demorec.datasets.options import parse_episodes
     from demorec.extensions.remake.demonstration import dataset_demonstrations, open_dataset, open_file
-    from demorec.extensions.remake.real_arm import open_real_arm, real_arms
 
     robot, wanted = options.robot, parse_episodes(episodes)
+    if robot is not None:
+        from demorec.extensions.remake.real_arm import open_real_arm, real_arms  # loads pyarrow
     for path in paths:
         found = _replayable(path)
         if found.kind == "dataset":
