@@ -188,20 +188,19 @@ def _run(path: Path, named: NamedRoles) -> Described:
     from demorec.runs.run_file import load_any_run_file
 
     run = load_any_run_file(path)
-    is_external = run.generation is None
-    if named and not is_external:
-        raise ConfigError(SIMULATED_ROLES)
-    plain: dict[str, Any] = {"kind": "external run" if is_external else "run", "path": str(path), **run.plain()}
-    plain |= {"complete": run.is_complete, "digest": run.digest}
+    plain: dict[str, Any] = {"path": str(path), **run.plain(), "complete": run.is_complete, "digest": run.digest}
     left_out: list[dict[str, Any]] = []
-    if is_external:
+    state = "complete" if run.is_complete else "unfinished"
+    if run.generation is None:
+        state = f"external, {state}"
         roles, left_out = _roles_of_run(path, run, named), dropped_by_import(path)
-        plain |= {"roles": _plain_roles(roles), "left_out": left_out}
+        plain |= {"kind": "external run", "roles": _plain_roles(roles), "left_out": left_out}
         content = _external_facts(run, roles)
+    elif named:
+        raise ConfigError(SIMULATED_ROLES)
     else:
-        plain["config_digest"] = run.config_digest
+        plain |= {"kind": "run", "config_digest": run.config_digest}
         content = _generated_facts(path, run)
-    state = f"{'external, ' if is_external else ''}{'complete' if run.is_complete else 'unfinished'}"
     frames, fps = sum(attempt.num_frames for attempt in run.attempts), run.fps or run.config.fps
     facts = [
         ("run", f"{path} ({state})"),
@@ -210,7 +209,8 @@ def _run(path: Path, named: NamedRoles) -> Described:
         *content,
         ("digest", run.digest),
     ]
-    rows = [("episode", "attempt", "outcome", "frames", "size", "file", "task" if is_external else "")]
+    has_tasks = any(line.instruction for line in run.attempts)
+    rows = [("episode", "attempt", "outcome", "frames", "size", "file", "task" if has_tasks else "")]
     for line in run.attempts:
         outcome, size = _outcome(line.success, line.phase, line.reason), size_in_words(line.num_bytes)
         numbers = str(line.episode_index), str(line.attempt), outcome, str(line.num_frames)

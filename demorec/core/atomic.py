@@ -29,8 +29,10 @@ _LOCK, _JOURNAL, _NEW, _OLD = "lock", "journal.json", "new", "old"
 """Content of a workshop: the lock, the journal of moves, the new targets and the old ones."""
 _MARK = b"demorec is writing here; its next command to the same place removes this folder.\n"
 _AT_FDCWD = -100
-_NO_REPLACE, _EXCHANGE = 1, 2
-"""Flags of renameat2(2)."""
+_NO_REPLACE = 1
+"""Flag of renameat2(2): fail if the target exists."""
+_EXCHANGE = 2
+"""Flag of renameat2(2): exchange both."""
 _UNSUPPORTED = (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP)
 
 Snapshot = dict[str, list[int]]

@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,8 +34,6 @@ from demorec.episode.features import (
 
 _MARK = "<!-- written by demorec, which renews it at every export unless it was edited ({digest}) -->\n"
 """Last line of a card; its digest reveals whether the card was edited."""
-_OWN_LICENCE = "apache-2.0"
-"""Licence of data that demorec simulated, unless the user names another one."""
 _MAX_TASKS = 20
 _MEANING = {
     **dict.fromkeys(AUTOMATIC_FEATURES, "filled in by LeRobot's rules"),
@@ -66,15 +65,38 @@ _ACTION_MEANING: Mapping[ActionKind, str] = {
     "translation (m) and rotation vector (rad) in base axes, applied from the left; gripper opening (m), absolute",
 }
 
-_SIMULATED_ROWS = (
-    "Row t holds the observation at time t, taken before the action of row t is applied; the action is the "
+
+@dataclass(frozen=True, kw_only=True)
+class _Wording:
+    """Parts of a card that depend on the origin of the data; `{demonstrations}` and `{robot}` are filled in."""
+
+    licence: str
+    tags: str
+    content: str
+    made: str
+    packets: str
+    rows: str
+
+
+_SIMULATED = _Wording(
+    licence="apache-2.0",  # of data that demorec simulated, unless the user names another one
+    tags="- simulation\n",
+    content="scripted {demonstrations} by a simulated {robot} arm in PyBullet",
+    made="Recorded and exported by demorec",
+    packets="stored as recorded",
+    rows="Row t holds the observation at time t, taken before the action of row t is applied; the action is the "
     "expert's target for the next frame. Where exploration noise was added to the motor commands, the action is "
-    "derived from the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock."
+    "derived from the clean target. Frame times are multiples of the simulation's frame period, not of a wall clock.",
 )
-_RECORDED_ROWS = (
-    "Row t holds the data of frame t in the recordings; the table above has the origin of each feature. LeRobot's "
-    "timestamps are multiples of the nominal period; the recordings have the exact timestamps of the frames and the "
-    "age of each sample."
+_RECORDED = _Wording(
+    licence="",
+    tags="",
+    content="{demonstrations} of {robot}",
+    made="Exported by demorec",
+    packets="unchanged",
+    rows="Row t holds the data of frame t in the recordings; the table above has the origin of each feature. "
+    "LeRobot's timestamps are multiples of the nominal period; the recordings have the exact timestamps of the frames "
+    "and the age of each sample.",
 )
 _CARD = """---
 {license}task_categories:
@@ -155,9 +177,9 @@ def _card(
     configs: Mapping[str, Any] = read_json(root / CONFIGS_PATH)  # empty if demorec simulated no episode
     rows = list(rows_in(root, f"{SIDECAR_DIR}/episodes", ["root_seed", "origin"]))
     # recordings of other robots have no seed
-    is_simulated = bool(configs) and all(row["root_seed"] is not None for row in rows)
+    wording = _SIMULATED if configs and all(row["root_seed"] is not None for row in rows) else _RECORDED
     meaning = {**_MEANING, **{name: markdown(source) for name, source in meanings.items() if source}}
-    if is_simulated:
+    if wording is _SIMULATED:
         meaning |= {**_SIMULATED_MEANING, ACTION: _ACTION_MEANING[options.action]}
         if options.state == "joint_ee":
             meaning[STATE] = f"{meaning[STATE]}, {meaning[EE_POSE]}"
@@ -170,34 +192,31 @@ def _card(
     listed = [f"- {markdown(task)}" for task in tasks[:_MAX_TASKS]]
     if len(tasks) > _MAX_TASKS:
         listed.append(f"- and {len(tasks) - _MAX_TASKS} more")
-    licence = options.license or (_OWN_LICENCE if is_simulated else None)
+    licence = options.license or wording.licence
     card = _CARD.format(
-        license="" if licence is None else f"license: {licence}\n",
-        simulation="- simulation\n" if is_simulated else "",
+        license=f"license: {licence}\n" if licence else "",
+        simulation=wording.tags,
         repo_id=options.repo_id,
-        summary=_summary(info, is_simulated=is_simulated, is_transcoded=is_transcoded),
+        summary=_summary(info, wording, is_transcoded=is_transcoded),
         success=_success(root),
         tasks="\n".join(listed),
         features="\n".join(features),
-        rows=_SIMULATED_ROWS if is_simulated else _RECORDED_ROWS,
+        rows=wording.rows,
     )
     is_one_run = len(configs) == 1 and not options.append and not any(row["origin"] for row in rows)
     return card + _AGAIN if is_one_run else card
 
 
-def _summary(info: DatasetInfo, *, is_simulated: bool, is_transcoded: bool) -> str:
-    demonstrations = "demonstration" if info.total_episodes == 1 else "demonstrations"
-    robot = markdown(str(info.robot_type))
-    if is_simulated:
-        content = f"scripted {demonstrations} by a simulated {robot} arm in PyBullet"
-        made, packets = "Recorded and exported by demorec", "stored as recorded"
-    else:
-        content, made, packets = f"{demonstrations} of {robot}", "Exported by demorec", "unchanged"
+def _summary(info: DatasetInfo, wording: _Wording, *, is_transcoded: bool) -> str:
+    content = wording.content.format(
+        demonstrations="demonstration" if info.total_episodes == 1 else "demonstrations",
+        robot=markdown(str(info.robot_type)),
+    )
     minutes = info.total_frames / info.fps / 60
-    images = "some images were encoded again" if is_transcoded else f"video packets are {packets}"
+    images = "some images were encoded again" if is_transcoded else f"video packets are {wording.packets}"
     return (
         f"{info.total_episodes} {content}, {info.total_frames} frames at {info.fps} Hz ({minutes:.1f} minutes), "
-        f"in the LeRobot v3.0 format. {made}; {images}."
+        f"in the LeRobot v3.0 format. {wording.made}; {images}."
     )
 
 
