@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -54,25 +53,6 @@ def test_a_truncated_bag_is_listed_up_to_its_end(
     plain = json.loads(capsys.readouterr().out)
     assert 0 < plain["messages"] < len(notes)
     assert plain["problems"]
-
-
-def test_messages_without_a_log_time_are_named_and_not_in_the_length(
-    notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (topic, *_), times = [note.topic for note in notes], [note.log_ns for note in notes[2:]]
-    untimed = [replace(note, log_ns=0) if place < 2 else note for place, note in enumerate(notes)]
-    path = bags.write_mcap(untimed, tmp_path / "x.mcap")
-    assert exit_code("info", path, "--json") == 0
-    plain = json.loads(capsys.readouterr().out)
-    assert plain["seconds"] == pytest.approx((max(times) - min(times)) / 1e9)
-    assert plain["messages"] == len(notes)
-    assert any(problem.startswith(f"{topic}: messages without a log time") for problem in plain["problems"])
-    assert all(row["rate"] > 1 for row in plain["topics"] if row["messages"] > 3)
-    simulated = [replace(note, log_ns=note.log_ns - notes[0].log_ns) for note in notes]
-    assert exit_code("info", bags.write_mcap(simulated, tmp_path / "simulated.mcap"), "--json") == 0
-    plain = json.loads(capsys.readouterr().out)
-    assert plain["seconds"] == pytest.approx((notes[-1].log_ns - notes[0].log_ns) / 1e9)
-    assert plain["problems"] == []
 
 
 @pytest.mark.parametrize("command", ["info", "check", "view", "import"])

@@ -244,12 +244,6 @@ def _external_storage(group: h5py.Group, name: str) -> None:
     group.create_dataset(name, (5, 7), "f8", external=[("/etc/passwd", 0, 280)])
 
 
-def _virtual(group: h5py.Group, name: str) -> None:
-    layout = h5py.VirtualLayout((5, 7), "f8")
-    layout[:] = h5py.VirtualSource("/tmp/other.hdf5", "x", shape=(5, 7))
-    group.create_virtual_dataset(name, layout)
-
-
 def _set(place: str, row: int, value: float) -> Callable[[h5py.File], None]:
     def change(file: h5py.File) -> None:
         file[place][row] = value
@@ -283,38 +277,18 @@ FAULTS: dict[str, tuple[Callable[[h5py.File], object], str]] = {
     ),
     "num_samples": (_attribute("data/demo_1", "num_samples", 9), "num_samples is 9"),
     "nan": (_set("data/demo_1/obs/object", 3, float("nan")), "data/demo_1/obs/object is nan in row 3 (object_0)"),
-    "infinite": (_set("data/demo_10/actions", 0, float("inf")), "data/demo_10/actions is inf in row 0"),
     "texts": (_replaced("actions", lambda group, name: group.__setitem__(name, ["a"] * 5)), "it holds objects"),
-    "claims": (
-        _replaced("actions", lambda group, name: group.create_dataset(name, (10**12, 7), "f8", chunks=(10**6, 7))),
-        "not all of its rows were written",
-    ),
     "unwritten": (
         _replaced("actions", lambda group, name: group.create_dataset(name, (5, 7), "f8")), "not all of its rows"
-    ),
-    "another shape": (
-        _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 2, 7)))), "is an array of 5x2x7"
     ),
     "another width": (
         _replaced("actions", lambda group, name: group.__setitem__(name, np.zeros((5, 8)))), "The episodes differ"
     ),
     "images of integers": (_images(np.zeros((5, 8, 8, 3), np.int32)), "images are uint8 of rows"),
-    "images of one colour": (_images(np.zeros((5, 8, 8, 1), np.uint8)), "images are uint8 of rows"),
     "soft link": (_soft_link, "data/demo_1/actions is a link"),
     "external link": (_external_link, "data/demo_1 is a link"),
-    "masked external link": (_external_link, "data/demo_1 is a link"),
-    "whole numbers": (
-        _replaced("actions", lambda group, name: group.__setitem__(name, np.full((5, 7), 2**53 + 1))),
-        "whole numbers that float64 cannot hold",
-    ),
     "external storage": (_replaced("actions", _external_storage), "its numbers are in other files"),
-    "virtual": (_replaced("actions", _virtual), "its numbers are in other files"),
     "rate": (_attribute("data", "env_args", '{"env_kwargs": {"control_freq": 12.5}}'), "12.5 rows a second"),
-    "no rate": (_attribute("data", "env_args", "{"), "give clock.fps in the mapping"),
-    "huge rate": (
-        _attribute("data", "env_args", '{"env_kwargs": {"control_freq": 1' + "0" * 400 + "}}"), "inf rows a second"
-    ),
-    "text of a number": (_attribute("data/demo_1", "num_samples", "5"), "num_samples is '5'"),
     "mask": (_without_masked, "demo_7"),
 }  # fmt: skip
 
@@ -325,8 +299,6 @@ def test_bad_input_is_refused_in_one_sentence(name: str, tmp_path: Path, capsys:
     file = write_robomimic(tmp_path / "demo.hdf5")
     changes = {'# mask = "train"': 'mask = "train"'} if name == "mask" else {}
     mapping, before = suggested(file, changes), file.read_bytes()
-    if name == "masked external link":
-        mapping.write_text(mapping.read_text().replace('# mask = "train"', 'mask = "valid"'))
     with h5py.File(file, "r+") as opened:
         fault(opened)
     assert file.read_bytes() != before
@@ -344,40 +316,13 @@ def _refused(file: Path, mapping: Path, told: str, capsys: pytest.CaptureFixture
     assert not list(run.rglob("*.mcap*"))
 
 
-@pytest.mark.parametrize(("value", "shown"), [("true", "'true'"), (float("nan"), "nan")])
-def test_an_outcome_is_a_boolean_or_a_number(
-    value: object, shown: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_outcome_is_a_boolean_or_a_number(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = write_robomimic(tmp_path / "demo.hdf5")
     mapping = suggested(file, {'# success = "rewards"': 'success = "outcome"'})
     with h5py.File(file, "r+") as opened:
         for name in DEMOS:
-            opened[f"data/{name}"].attrs["outcome"] = value
-    _refused(file, mapping, f"has outcome = {shown}, allowed are booleans and numbers", capsys)
-
-
-def test_a_mask_leaves_links_out(tmp_path: Path) -> None:
-    file = write_robomimic(tmp_path / "demo.hdf5")
-    mapping = suggested(file, {'# mask = "train"': 'mask = "train"'})
-    with h5py.File(file, "r+") as opened:
-        _external_link(opened)
-    assert import_hdf5([file], mapping, tmp_path / "run").num_episodes == 2
-
-
-def test_a_suggestion_lists_what_no_filter_reads(tmp_path: Path) -> None:
-    file = write_aloha(tmp_path / "episode_0.hdf5")
-    with h5py.File(file, "r+") as opened:
-        settings = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
-        settings.set_chunk((8, 7))
-        settings.set_filter(32015, h5py.h5z.FLAG_OPTIONAL, ())  # Zstandard, which h5py does not include
-        space = h5py.h5s.create_simple((8, 7))
-        group = opened["observations"].id
-        stored = h5py.h5d.create(group, b"effort", h5py.h5t.NATIVE_DOUBLE, space, settings)
-        stored.write_direct_chunk((0, 0), bytes(8 * 7 * 8), 0)
-    lines = suggested_hdf5_mapping(file, print)
-    told = "observations/effort cannot be read (it is compressed in a way that is not installed here)"
-    assert f"#     {told}" in lines
-    assert 'dataset = "observations/qpos"' in lines
+            opened[f"data/{name}"].attrs["outcome"] = "true"
+    _refused(file, mapping, "has outcome = 'true', allowed are booleans and numbers", capsys)
 
 
 def test_a_truncated_file_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -403,9 +348,7 @@ def test_damaged_compression_is_reported(tmp_path: Path, capsys: pytest.CaptureF
 
 JPEG_FAULTS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
     "cut off": (lambda row: row[:300].ljust(len(row), b"\0"), "holds no whole JPEG file in row 2"),
-    "no jpeg": (lambda row: b"\x89PNG".ljust(200, b"x") + b"\xff\xd9", "in row 2"),
     "another size": (lambda row: jpeg(np.zeros((16, 16, 3), np.uint8), 50), "changes its size to 16x16 in row 2"),
-    "empty": (lambda row: b"", "holds no whole JPEG file in row 2"),
 }
 
 
@@ -426,10 +369,8 @@ def test_jpeg_files_must_be_whole(name: str, tmp_path: Path, capsys: pytest.Capt
 @pytest.mark.parametrize(
     ("words", "told"),
     [
-        (("import", "hdf5"), "Name an HDF5 file"),
         (("import", "hdf5", "demo.hdf5"), "An import needs --mapping and --out"),
         (("import", "hdf5", "demo.toml", "--suggest"), "The file is not a recording"),
-        (("import", "hdf5", "none.hdf5", "--suggest"), "No such file"),
         (("import", "hdf5", "other.hdf5", "--suggest"), "The layout is not robomimic's or Isaac Lab's"),
         (("import", "hdf5", "demo.hdf5", "demo.hdf5", "--mapping", "demo.toml", "--out", "run"), "given twice"),
         (("import", "hdf5", "demo.hdf5", "--mapping", "bad.toml", "--out", "run"), "Did you mean 'dataset'?"),
@@ -452,28 +393,25 @@ def test_wrong_requests_are_refused(
     assert (err.count("\n"), out) == (1, "")
 
 
-@pytest.mark.parametrize("robot", ["robot", "g1.hand", "Robot 2"])
-def test_the_state_of_isaac_lab_is_the_absolute_one(robot: str, tmp_path: Path) -> None:
+def test_the_state_of_isaac_lab_is_the_absolute_one(tmp_path: Path) -> None:
     """obs/joint_pos is relative to a pose that the file does not contain; the simulator's state is absolute."""
-    file = write_isaac(tmp_path / "demo.hdf5", robot=robot)
+    file = write_isaac(tmp_path / "demo.hdf5", robot="g1.hand")
     result, run = imported(file, changes={"# fps = 20 ": "fps = 50 "})
     assert result.num_episodes == 2
     with h5py.File(file) as source:
         for demo, path in zip(("demo_0", "demo_1"), recordings(run), strict=True):
-            absolute = source[f"data/{demo}/states/articulation/{robot}/joint_position"][:]
+            absolute = source[f"data/{demo}/states/articulation/g1.hand/joint_position"][:]
             relative = source[f"data/{demo}/obs/joint_pos"][:]
             assert np.abs(absolute - relative).max() > 0.1
             with Recording(path) as recording:
-                table, info = recording.table(), recording.info
+                table = recording.table()
             np.testing.assert_array_equal(table.features["observation.state"], absolute)
             np.testing.assert_array_equal(table.features["observation.joint_pos"], relative)
             pose = np.hstack([source[f"data/{demo}/obs/{name}"][:] for name in ("eef_pos", "eef_quat")])
             np.testing.assert_array_equal(table.features["observation.ee_pose"], pose)
-            names = {feature.name: feature.names for feature in info.features}
-            assert names["observation.ee_pose"][3:] == ("qw", "qx", "qy", "qz")
 
 
-@pytest.mark.parametrize("layout", ["isaac", "root", "aloha", "unknown"])
+@pytest.mark.parametrize("layout", ["isaac", "aloha", "unknown"])
 def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "demo.hdf5"
     if layout == "unknown":
@@ -481,10 +419,10 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
             file["log/values"] = np.zeros((3, 2))
     else:
         writers: dict[str, Callable[[Path], Path]]
-        writers = {"isaac": write_isaac, "root": write_groups_at_root, "aloha": write_aloha}
+        writers = {"isaac": write_isaac, "aloha": write_aloha}
         writers[layout](path)
     with h5py.File(path) as file:
-        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "root": ("demo_0", 3, 15), "aloha": ("/", 1, 8),
+        first, count, rows = {"isaac": ("data/demo_0", 2, 12), "aloha": ("/", 1, 8),
                               "unknown": ("/", None, 0)}[layout]  # fmt: skip
         expected: dict[str, list[int]] = {}
         file[first].visititems(
@@ -505,8 +443,6 @@ def test_info_needs_no_rate_and_no_mapping(layout: str, tmp_path: Path, capsys: 
     [
         ("action", "observation", ("demo_0", "demo_2", "demo_10")),
         ("actions", "obs", ("Trial 4", "ep-3", "x")),
-        ("action", "state", ("0", "7")),
-        ("actions", "qpos", ("x",)),
     ],
 )
 def test_episodes_that_are_groups_at_the_root(action: str, state: str, demos: tuple[str, ...], tmp_path: Path) -> None:

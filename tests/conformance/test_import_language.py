@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -126,24 +125,6 @@ def test_subtasks_are_shown_at_their_time(kind: str, tmp_path: Path) -> None:
             shown += [(time / 1e9, page) for time, (page,) in zip(seconds, pages, strict=True)]
     assert [page for _, page in shown] == [f"**Now**\n\n{text}" for _, text in expected]
     assert [time for time, _ in shown] == pytest.approx([time for time, _ in expected], abs=1e-6)
-
-
-def test_a_suggestion_names_the_texts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = [*ARM, *texts("/subtask", SAID), *texts("/task", ((0.0, "stack the cups"),))]
-    bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap")
-    assert exit_code("import", "--suggest", bag) == 0
-    text = capsys.readouterr().out
-    assert tomllib.loads(text)["task"]["topic"] == "/task"
-    assert "subtasks" not in tomllib.loads(text)
-    lines = text.splitlines()
-    first = lines.index("# [subtasks]")
-    chosen = "\n".join(
-        [*lines[:first], *(line.removeprefix("# ") for line in lines[first : first + 2]), *lines[first + 2 :]]
-    )
-    mapping = bag_mappings.write_mapping(chosen, tmp_path / "robot.toml")
-    assert exit_code("import", bag, "--mapping", mapping, "--out", tmp_path / "run") == 0
-    with Recording(recordings(tmp_path / "run")[0]) as opened:
-        assert [said for _, said in opened.subtasks] == ["grasp the cup", "lift the cup", "put it down"]
 
 
 def test_all_kinds_means_the_known_ones(tmp_path: Path) -> None:

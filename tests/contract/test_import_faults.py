@@ -47,19 +47,6 @@ def test_a_fault_is_named(name: str, notes: bags.Notes, tmp_path: Path) -> None:
     assert not list((tmp_path / "run").glob("episodes/*"))
 
 
-def test_copies_are_counted_next_to_messages_without_a_time(notes: bags.Notes, tmp_path: Path) -> None:
-    """Every third message is repeated, and the last header has no time; `copied_episodes` must not count it."""
-    topic = "/follower/joint_states"
-    twice = hurt(notes, "duplicated messages")
-    last = max(note.log_ns for note in twice if note.topic == topic)
-    unstamped = bags.changed(twice, topic, lambda k, note: replace(note, header_ns=0) if note.log_ns == last else note)
-    found = _findings(bags.write_mcap(unstamped, tmp_path / "bag.mcap"), tmp_path)
-    copies = len(twice) - len(notes)
-    assert copies > 10
-    assert f"{copies} messages have the time of another one" in found["duplicates"]
-    assert "1 of " in found["unstamped"]
-
-
 def test_a_truncated_bag_is_named(notes: bags.Notes, tmp_path: Path) -> None:
     bag = bags.write_mcap(bags.in_order(notes), tmp_path / "bag.mcap", chunk_size=20_000)
     data = bag.read_bytes()
@@ -67,15 +54,12 @@ def test_a_truncated_bag_is_named(notes: bags.Notes, tmp_path: Path) -> None:
     assert "cut_off" in _findings(bag, tmp_path)
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_a_clean_bag_gives_no_finding(seed: int, tmp_path: Path) -> None:
+def test_a_clean_bag_gives_no_finding(notes: bags.Notes, tmp_path: Path) -> None:
     """Ordinary jitter, latency, a resting robot and a gripper that is commanded only on change are not faults."""
-    seconds = 2.0 + 0.3 * seed
-    notes = bags.so101(seconds)
     resting = bags.changed(
         notes, "/leader/joint_states", lambda k, note: bags.with_body(note, position=note.body["position"].round(1))
     )
-    bag = bags.write_mcap(bags.in_order(resting if seed % 2 else notes), tmp_path / "bag.mcap")
+    bag = bags.write_mcap(bags.in_order(resting), tmp_path / "bag.mcap")
     assert _findings(bag, tmp_path) == {}
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import io
-import json
 import tempfile
-import tomllib
 from contextlib import redirect_stderr, redirect_stdout
 from dataclasses import replace
 from pathlib import Path
@@ -103,52 +101,6 @@ def test_the_pixel_format_decides_what_a_video_of_a_bag_holds(kind: tuple[str, s
         assert (code, is_mapped) == (0, True), error
         with Recording(recordings(run)[0]) as recording:
             assert set(recording.cameras) == {"high", "wrist"}
-
-
-@pytest.mark.slow
-@settings(max_examples=8, **FEW)  # type: ignore[arg-type]
-@given(
-    rate=st.floats(10, 50),
-    factor=st.floats(0.25, 4),
-    command_rate=st.sampled_from([None, 0.5, 1.0, 2.0]),
-    start_s=st.sampled_from([0.0, 12.5, 1e9]),
-    jitter=st.sampled_from([0.0, 0.1]),
-    seed=st.integers(0, 99),
-)
-def test_a_bag_with_simulated_time_loses_no_message_in_silence(
-    rate: float, factor: float, command_rate: float | None, start_s: float, jitter: float, seed: int
-) -> None:
-    """`rate` messages a second by the log; the headers run `factor` times as fast, `command_rate` times as often."""
-    topics = {"/joint_states": rate} | ({} if command_rate is None else {"/joint_command": rate * command_rate})
-    notes = []
-    for topic, topic_rate in topics.items():
-        for note in bags.joints(topic, ("a", "b"), bags.times(topic_rate, 6.0, jitter=jitter, seed=seed)):
-            header_ns = round((note.header_ns - bags.EPOCH_NS) * factor + start_s * bags.NS)
-            notes.append(replace(note, header_ns=max(header_ns, 0)))
-    with tempfile.TemporaryDirectory() as folder:
-        bag, run = bags.write_rosbag2(bags.in_order(notes), Path(folder) / "wave_1"), Path(folder) / "run"
-        suggestion = command("import", bag, "--suggest")[1]
-        fps = tomllib.loads(suggestion)["clock"]["fps"]
-        assert fps >= 0.98 * min(topics.values()) / factor
-        mapping = bag_mappings.write_mapping(suggestion, Path(folder) / "robot.toml")
-        code, told, error = command("import", bag, "--mapping", mapping, "--out", run)
-        assert code == 0, error
-        with Recording(recordings(run)[0]) as recording:
-            stamps = recording.table().stamps
-        streams = {
-            stream["topic"]: stream for stream in json.loads((run / "import.json").read_text())["bags"][0]["streams"]
-        }
-        for feature, topic in (("observation.state", "/joint_states"), ("action", "/joint_command")):
-            if topic not in topics:
-                continue
-            known = np.unique([note.header_ns for note in notes if note.topic == topic and note.header_ns > 0])
-            used = np.unique(stamps[feature])
-            assert set(used) <= set(known)
-            inside = known[(known >= used[0]) & (known <= used[-1])]
-            assert streams[topic]["unused"] == str(len(inside) - len(used))
-            if len(inside) - len(used) > 0.05 * len(inside):
-                assert f"{topic}: {100 * (1 - len(used) / len(inside)):.3g} % of its messages are in no row" in told
-                assert f'# "{topic}" comes' in suggestion
 
 
 @pytest.mark.slow

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
-from PIL import Image
 
 from support.bags import NS, Note, Notes, changed, in_order, jpeg, with_body
 
@@ -76,34 +73,19 @@ def _garbage(number: int, note: Note) -> Note:
     return replace(note, data=b"\x00\x01\x00\x00abc") if number in (20, 21) else note
 
 
-def _short(number: int, note: Note) -> Note:
-    return with_body(note, name=note.body["name"][:-1], position=note.body["position"][:-1]) if number == 33 else note
-
-
 FAULTS: dict[str, Fault] = {
     "a clock half a second behind": Fault(kind="clock_offset", hurt=_each(STATE, lambda k, n: _later(n, -0.5))),
-    "a camera stamped in the future": Fault(kind="clock_offset", hurt=_each(SIDE, lambda k, n: _later(n, 0.15))),
     "a clock of another epoch": Fault(
         kind="clock_offset", hurt=_each(ACTION, lambda k, n: _later(n, -1e6)), is_refused=True
     ),
     "a clock that jumps ahead": Fault(
         kind="clock_drift", hurt=_each(STATE, lambda k, n: _later(n, 0.4) if k > 60 else n), is_refused=True
     ),
-    "a clock that jumps back": Fault(
-        kind="clock_drift", hurt=_each(SIDE, lambda k, n: _later(n, -0.15) if k > 30 else n)
-    ),
-    "a clock that jumps back a little": Fault(
-        kind="clock_drift", hurt=_each(SIDE, lambda k, n: _later(n, -0.08) if k > 37 else n)
-    ),
     "images that are stamped after their recording": Fault(
         kind="clock_offset", hurt=_each(SIDE, lambda k, n: _later(n, 0.08))
     ),
     "a clock that drifts": Fault(kind="clock_drift", hurt=_each(STATE, lambda k, n: _later(n, 0.0008 * k))),
     "headers without time": Fault(kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0))),
-    "some headers without time": Fault(
-        kind="unstamped", hurt=_each(STATE, lambda k, n: replace(n, header_ns=0) if k % 10 == 3 else n)
-    ),
-    "single messages lost": Fault(kind="drops", hurt=_each(STATE, lambda k, n: None if k % 10 == 5 else n)),
     "images lost": Fault(kind="drops", hurt=_each(FRONT, lambda k, n: None if k in (20, 21, 40) else n)),
     "a pause within the allowed age": Fault(kind="gap", hurt=_each(ACTION, lambda k, n: None if 40 <= k < 47 else n)),
     "a long pause": Fault(kind="gap", hurt=_each(FRONT, lambda k, n: None if 20 <= k < 35 else n), is_refused=True),
@@ -112,22 +94,10 @@ FAULTS: dict[str, Fault] = {
     "duplicated messages": Fault(kind="duplicates", hurt=_repeated),
     "messages in the wrong order": Fault(kind="order", hurt=_swapped_times),
     "messages that cannot be decoded": Fault(kind="malformed", hurt=_each(STATE, _garbage)),
-    "a message that lacks a joint": Fault(kind="malformed", hurt=_each(STATE, _short)),
     "images cut off": Fault(kind="malformed", hurt=_each(FRONT, _cut_image)),
     "a camera that changes its size": Fault(kind="", hurt=_each(FRONT, _resized), is_refused=True),
     "cameras of half the rate": Fault(kind="repeats", hurt=_halved),
-    "another kind of image": Fault(
-        kind="",
-        hurt=_each(FRONT, lambda k, n: with_body(n, format="png", data=_png()) if k == 30 else n),
-        is_refused=True,
-    ),
 }
-
-
-def _png() -> NDArray[np.uint8]:
-    buffer = io.BytesIO()
-    Image.fromarray(np.zeros((48, 64, 3), np.uint8)).save(buffer, format="PNG")
-    return np.frombuffer(buffer.getvalue(), np.uint8)
 
 
 def hurt(notes: Notes, name: str) -> Notes:

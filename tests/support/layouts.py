@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.rosbag2 import StoragePlugin
 
 from support import bags
 from support.bags import EPOCH_NS, NS, Note, Notes, motion
@@ -213,10 +212,6 @@ def _foxglove(notes: Notes, path: Path) -> Path:
     return path / "bag.mcap"
 
 
-def _sqlite(notes: Notes, path: Path) -> Path:
-    return bags.write_rosbag2(notes, path / "bag", storage=StoragePlugin.SQLITE3)
-
-
 LAYOUTS: dict[str, Layout] = {
     "UR": Layout(
         topics=(
@@ -255,12 +250,6 @@ LAYOUTS: dict[str, Layout] = {
         state=(joint_part("/joint_states", SIX),),
         cameras=2,
     ),
-    "two publishers": Layout(
-        topics=(*_two_publishers(), joints("/lead_arm/joint_states", UR, shift=0.1),
-                camera("/camera/image_raw/compressed")),
-        state=(joint_part("/joint_states", UR), joint_part("/joint_states", ("robotiq_85_left_knuckle_joint",))),
-        action=(joint_part("/lead_arm/joint_states", UR),),
-    ),
     "Foxglove's own messages": Layout(
         topics=(*_two_publishers(), joints("/teleop/joint_states", UR, shift=0.1), camera("/camera/front")),
         state=(joint_part("/joint_states", UR), joint_part("/joint_states", ("robotiq_85_left_knuckle_joint",))),
@@ -282,25 +271,6 @@ LAYOUTS: dict[str, Layout] = {
             for side in ("left", "right")
         ),
         cameras=2,
-    ),
-    "topics of numbers": Layout(
-        topics=(
-            multi_array("/robot_state/joint_positions", 7), multi_array("/robot_state/cartesian_position", 6),
-            scalar("/robot_state/gripper_position"), multi_array("/action/joint_velocity", 7, shift=2.0),
-            multi_array("/action/joint_position", 7, shift=0.1), scalar("/action/gripper_position", shift=0.1),
-            raw_camera("/cameras/wrist/image_raw"),
-        ),
-        state=(
-            Part(topic="/robot_state/joint_positions", names=[f"data_{k}" for k in range(7)], numbers=field_of("data")),
-            Part(topic="/robot_state/gripper_position", names=("robot_state_gripper_position",),
-                 numbers=lambda body: [body["data"]]),
-        ),
-        action=(
-            Part(topic="/action/joint_position", names=[f"data_{k}" for k in range(7)], numbers=field_of("data")),
-            Part(topic="/action/gripper_position", names=("action_gripper_position",),
-                 numbers=lambda body: [body["data"]]),
-        ),
-        write=_sqlite,
     ),
 }  # fmt: skip
 """Name -> layout."""

@@ -34,10 +34,6 @@ from demorec.mcap.scan import ScannedMessage
 from demorec.runs.find import BAG_SUFFIXES, NOT_UTF8, ROS1_MAGIC, ROSBAG2, SQLITE_MAGIC, find, import_word, name_of
 
 NS = 1_000_000_000
-EPOCH_S = 1e8
-"""Difference between two clocks that implies another epoch: three years. No clock is that wrong, so one of the two
-counts from another epoch.
-"""
 _SUFFIXES = (".mcap", *BAG_SUFFIXES)
 """Suffixes of bag files in a folder; other files are ignored."""
 _MAX_METADATA_BYTES = 16 << 20
@@ -267,30 +263,24 @@ class TopicSummary:
     Attributes:
         type: Type of the messages, as the bag names it.
         count: Number of messages.
-        first_ns, last_ns: Earliest and latest log time above 0.
-        num_at_0: Number of messages with log time 0.
+        first_ns, last_ns: Earliest and latest log time.
     """
 
     type: str
     count: int = 0
     first_ns: int = MAX_TIME_NS
     last_ns: int = 0
-    num_at_0: int = 0
 
     @property
     def rate_hz(self) -> float:
         """Mean rate by log times; 0 for fewer than two messages."""
-        num_steps = self.count - self.num_at_0 - 1
         span_s = (self.last_ns - self.first_ns) / NS
-        return num_steps / span_s if num_steps > 0 and span_s > 0 else 0.0
+        return (self.count - 1) / span_s if span_s > 0 else 0.0
 
     def add(self, time_ns: int) -> None:
         """Count a message with this log time."""
         self.count += 1
-        if time_ns == 0:
-            self.num_at_0 += 1
-        else:
-            self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
+        self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
 
 
 def summarize_bag(path: Path) -> dict[str, Any]:
@@ -308,11 +298,6 @@ def summarize_bag(path: Path) -> dict[str, Any]:
         topic.add(message.log_ns)
     last_ns = max((topic.last_ns for topic in topics.values()), default=0)
     first_ns = min([last_ns, *(topic.first_ns for topic in topics.values())])
-    at_0 = {name: topic.num_at_0 for name, topic in sorted(topics.items()) if topic.num_at_0}
-    if first_ns > EPOCH_S * NS:
-        problems += [f"{name}: messages without a log time, left out of the length: {n}" for name, n in at_0.items()]
-    elif at_0:  # simulated time begins at 0
-        first_ns = 0
     return {
         "kind": "bag",
         "path": str(path),

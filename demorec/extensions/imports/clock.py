@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.extensions.imports.bag import EPOCH_S
+from demorec.extensions.imports.bag import NS
 from demorec.extensions.imports.mapping import Clock, Sampling
 from demorec.extensions.imports.streams import Stream
 
-NS = 1_000_000_000
 MISSING = 2**62
 """Age of missing data."""
 SKEW_S = 0.1
@@ -95,16 +94,11 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
     stamped = stream.header_ns > 0
     is_header = by_header and bool(len(stamped)) and bool(np.mean(stamped) > 0.5)
     times = stream.header_ns if is_header else stream.log_ns
-    is_known = stamped if is_header else ~without_log_time(stream.log_ns)
-    if is_known.all() and bool(np.all(times[1:] > times[:-1])):
-        order: Int = np.arange(len(times))
-        ordered = times
-    else:
-        usable = np.flatnonzero(is_known)
-        order = usable[np.argsort(times[usable], kind="stable")]
-        ordered = times[order]
-        is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
-        ordered, order = ordered[is_first], order[is_first]
+    usable = np.flatnonzero(stamped) if is_header else np.arange(len(times))
+    order: Int = usable[np.argsort(times[usable], kind="stable")]
+    ordered = times[order]
+    is_first = np.diff(ordered, prepend=ordered[:1] - 1) > 0
+    ordered, order = ordered[is_first], order[is_first]
     steps = np.diff(ordered)
     period = int(np.median(steps)) if len(steps) else 0
     # Most steps of a sensor take about a period, even with losses; those of commands on change vary freely.
@@ -124,12 +118,6 @@ def timeline(stream: Stream, clock: Clock) -> Timeline:
         sample=stream.part.sample or clock.sample,
         max_age_ns=MISSING - 1 if age_s >= 1e9 else round(age_s * NS),
     )
-
-
-def without_log_time(log_ns: Int) -> NDArray[np.bool_]:
-    """(N,) whether each message was recorded without a time: 0, if others are not in simulated time from 0."""
-    is_dated = bool(len(log_ns)) and float(np.median(log_ns)) > EPOCH_S * NS
-    return np.asarray((log_ns == 0) & is_dated)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from demorec.extensions.imports.bag import EPOCH_S
-from demorec.extensions.imports.clock import NS, SKEW_S, Int, Numbers, Timeline, without_log_time
+from demorec.extensions.imports.bag import NS
+from demorec.extensions.imports.clock import SKEW_S, Int, Timeline
 from demorec.extensions.imports.rows import RATE, EpisodeRows, Timelines
 from demorec.extensions.imports.streams import NO_STAMP
 
+_EPOCH_S = 1e8
+"""Difference between two clocks that implies another epoch: three years, since no clock is that wrong."""
 _YEAR_S = 365.25 * 86_400
 _GAP = 5.0
 """Minimum periods without a message for a gap; shorter ones are lost messages."""
@@ -29,8 +31,6 @@ _SLOW = 1.15
 """Minimum ratio of a stream's period to the rows' period for a slow stream."""
 _EARLY_S = 0.05
 """Maximum time by which a header may be later than its log time: clocks set by NTP differ by less."""
-_MAX_ENCODER_NOISE = 1e-3
-"""Maximum range of a resting joint: radians or metres, or the same ratio of larger values in degrees or counts."""
 NOTE = "note"
 """Kind of an observation that is not a problem."""
 
@@ -53,10 +53,11 @@ class ImportFinding:
 def bag_findings(bag: Timelines) -> tuple[ImportFinding, ...]:
     """Findings about a bag's messages, each once."""
     lines = list(bag.lines.values())
-    skews = _comparable_skews(lines)
-    found = [finding for line in lines for finding in _stream_findings(line, skews[line])]
+    found = [finding for line in lines for finding in _stream_findings(line)]
+    if not _have_another_epoch(lines):
+        found += [finding for line in lines for finding in _skew_findings(line)]
     found += [ImportFinding(kind="cut_off", stream="", text=problem) for problem in bag.streams.problems]
-    found += [*_extent_findings(lines), *_clock_findings(bag, lines), *_still_findings(lines)]
+    found += [*_extent_findings(lines), *_clock_findings(bag, lines)]
     once: dict[tuple[str, str], ImportFinding] = {}
     for finding in found:  # features that share a topic also share its findings
         once.setdefault((finding.kind, finding.text), finding)
@@ -67,14 +68,12 @@ def _of(line: Timeline, kind: str, text: str) -> ImportFinding:
     return ImportFinding(kind=kind, stream=line.stream.label, text=f"{line.stream.topic}: {text}")
 
 
-def _stream_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
-    """Findings about a stream; (K,) its skews relative to the others."""
+def _stream_findings(line: Timeline) -> Iterator[ImportFinding]:
+    """Findings about a stream alone."""
     stream = line.stream
     if stream.num_malformed:
         text = f"{stream.num_malformed} messages cannot be used, the first since {stream.first_problem}"
         yield _of(line, "malformed", text)
-    if not line.is_header and (untimed := int(without_log_time(stream.log_ns).sum())):
-        yield _of(line, "unstamped", f"{untimed} of {len(stream)} messages have no log time and are left out")
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
     if unstamped and not line.is_log_asked:
         yield _of(line, "unstamped", f"{unstamped} of {len(stream)} headers have no time")
@@ -85,7 +84,6 @@ def _stream_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
         yield _of(line, "duplicates", f"{repeated} messages have the time of another one")
     if line.is_regular:
         yield from _loss_findings(line)
-    yield from _skew_findings(line, skew)
     if stream.heads and not stream.heads[0].is_keyframe:
         first = int(np.argmax(stream.are_keyframes))
         yield _of(line, "keyframe", f"its first {first} images cannot be decoded, since no keyframe is before them")
@@ -115,8 +113,9 @@ def lost_in(line: Timeline) -> Int:
     return np.where(steps > least, np.round(steps / line.period_ns).astype(np.int64) - 1, 0)
 
 
-def _skew_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
+def _skew_findings(line: Timeline) -> Iterator[ImportFinding]:
     """Findings about the difference between log times and header times."""
+    skew = line.skews_ns
     if len(skew) < 8:
         return
     median = float(np.median(skew)) / NS
@@ -130,29 +129,10 @@ def _skew_findings(line: Timeline, skew: Numbers) -> Iterator[ImportFinding]:
         yield _of(line, "clock_drift", f"its clock moves by {np.ptp(smooth):.3f} s against the times of recording")
 
 
-def _comparable_skews(lines: Sequence[Timeline]) -> dict[Timeline, Numbers]:
-    """(K,) skews of each stream: log time minus header time, nanoseconds.
-
-    If all headers have another epoch than the log times (simulated time), the absolute difference implies nothing about
-    a stream: the result is then relative to the stream with most messages.
-    """
-    skews: dict[Timeline, Numbers] = {line: line.skews_ns.astype(np.float64) for line in lines}
-    known = _of_another_epoch(lines)
-    if not known:
-        return skews
-    usual = max(known, key=lambda line: len(line.skews_ns))
-    stamps = usual.stream.header_ns[usual.stream.header_ns > 0]
-    order = np.argsort(stamps, kind="stable")
-    for line in known:
-        own = line.stream.header_ns[line.stream.header_ns > 0]
-        skews[line] = line.skews_ns - np.interp(own, stamps[order], usual.skews_ns[order])
-    return skews
-
-
-def _of_another_epoch(lines: Sequence[Timeline]) -> list[Timeline]:
-    """Return the streams with header times if all of these have another epoch than the log times."""
+def _have_another_epoch(lines: Sequence[Timeline]) -> bool:
+    """Whether all header times have another epoch than the log times: simulated time."""
     known = [line for line in lines if len(line.skews_ns)]
-    return known if all(abs(np.median(line.skews_ns)) >= EPOCH_S * NS for line in known) else []
+    return bool(known) and all(abs(np.median(line.skews_ns)) >= _EPOCH_S * NS for line in known)
 
 
 def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
@@ -173,7 +153,7 @@ def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Impor
     for topic, texts in bag.streams.texts.items():
         if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
             yield ImportFinding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
-    if _of_another_epoch(lines):
+    if _have_another_epoch(lines):
         text = (
             f"all headers are {abs(usual) / _YEAR_S:.1f} years {'behind' if usual > 0 else 'ahead of'} the times of "
             "recording, and rows follow them: simulated time, or a clock that was never set"
@@ -182,7 +162,7 @@ def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Impor
 
 
 def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
-    """Streams that begin later or end earlier than most, and joints that end before others of their topic."""
+    """Streams that begin later or end earlier than most."""
     regular = [line for line in lines if line.is_regular]
     begin = float(np.median([line.times_ns[0] for line in regular] or [0]))
     end = float(np.median([line.times_ns[-1] for line in regular] or [0]))
@@ -190,32 +170,8 @@ def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
         late, early = (line.times_ns[0] - begin) / NS, (end - line.times_ns[-1]) / NS
         if late > _SHORTER_S:
             yield _of(line, "late_start", f"begins {late:.2f} s late")
-        joints = line.stream.reader.joints if line.stream.reader else ()
-        topic = (line.stream.topic, line.is_header)
-        last = max(int(one.times_ns[-1]) for one in regular if (one.stream.topic, one.is_header) == topic)
-        before_ns = last - int(line.times_ns[-1])
-        if joints and before_ns > _GAP * line.period_ns:
-            names = f"{joints[0]!r}" + (f" and {len(joints) - 1} more joints" if len(joints) > 1 else "")
-            yield _of(line, "early_end", f"{names} stop {before_ns / NS:.2f} s before other joints of the topic")
-        elif early > _SHORTER_S:
+        if early > _SHORTER_S:
             yield _of(line, "early_end", f"ends {early:.2f} s early")
-
-
-def _still_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
-    """A robot without any motion in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
-    measured = [line for line in lines if line.stream.names and len(line.times_ns) > 1]
-    if measured and not any(_moves(line) for line in measured):
-        text = f"nothing moves: no number of {', '.join(line.stream.label for line in measured)} changes in this bag"
-        yield ImportFinding(kind="still", stream="", text=text)
-
-
-def _moves(line: Timeline) -> bool:
-    values = line.stream.values.astype(np.float64)
-    values = values[np.isfinite(values).all(axis=1)]
-    if len(values) < 2:
-        return False
-    noise = _MAX_ENCODER_NOISE * np.maximum(np.abs(values).max(axis=0), 1.0)
-    return bool((np.ptp(values, axis=0) > noise).any())
 
 
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:

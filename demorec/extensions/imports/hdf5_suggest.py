@@ -12,8 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from demorec.core.errors import without_path
 from demorec.episode.features import EE_POSE, STATE
 from demorec.episode.roles import HDF5_PARTS
@@ -21,21 +19,19 @@ from demorec.extensions.imports.hdf5_arrays import is_camera
 from demorec.extensions.imports.hdf5_file import ForeignFile, Hdf5Error, StoredArray
 from demorec.extensions.imports.hdf5_import import episode_places, found_attribute, stated_rate
 from demorec.extensions.imports.mapping import Episodes
-from demorec.extensions.imports.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
+from demorec.extensions.imports.words import quoted, task_in_name, unique_name
 from demorec.runs.find import expect
 
-_ROBOMIMIC = "data"
 _ARTICULATION = re.compile(r"states/articulation/[^/]+/joint_position")
 """Absolute joint positions of Isaac Lab; its observation joint_pos is relative to the default pose."""
-_ISAAC_QUATERNION = re.compile(r"(^|_)(quat|orientation)$")
-_ISAAC_POSE = re.compile(r"(^|/)root_pose$")
-_W_FIRST = ("qw", "qx", "qy", "qz")
+_MAX_SHOWN = 4
+"""Maximum entries of a file that an error lists."""
 _ALOHA_FPS = 50
 """ALOHA's recorders take a row every `DT = 0.02` seconds, which their files do not record."""
-_ALOHA_JOINTS = ("waist", "shoulder", "elbow", "forearm_roll", "wrist_angle", "wrist_rotate", "gripper")
 _TASKS = ("instruction", "ep_meta.lang", "problem_info.language_instruction", "language_instruction")
 _NO_STATE = "# No dataset is known to be the robot's state: take one of those above."
-_ROBOTS = ("env_args.env_kwargs.robot", "env_args.env_kwargs.robots", "env_args.env_kwargs.robots.0")
+_STATES = ("state", "states", "observation", "observations", "obs", "qpos")
+"""Names of the state in groups at the root."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,36 +39,27 @@ class _Layout:
     """Location of a file's episodes and names of their datasets.
 
     Attributes:
-        group: Value of `episodes.group`.
+        group: Value of `episodes.group`; "" if the file is one episode.
         actions: Names of datasets that belong to the action.
         folder: Prefix of observations; "" if every other dataset is one.
-        states: Names of datasets that are the state, if their feature does not follow from the name's end.
-        is_aloha: Whether the file is one episode of ALOHA's recorder.
     """
 
     group: str
     actions: tuple[str, ...]
     folder: str
-    states: tuple[str, ...] = ()
-    is_aloha: bool = False
 
 
-_ALOHA = _Layout(group="", actions=("action", "base_action"), folder="observations/", is_aloha=True)
-_LAYOUT_OF_ROBOMIMIC = _Layout(group=_ROBOMIMIC, actions=("actions",), folder="obs/")
-_GROUPS_AT_ROOT = _Layout(
-    group="/",
-    actions=("action", "actions"),
-    folder="",
-    states=("state", "states", "observation", "observations", "obs", "qpos"),
-)
+_ALOHA = _Layout(group="", actions=("action", "base_action"), folder="observations/")
+_ROBOMIMIC = _Layout(group="data", actions=("actions",), folder="obs/")
+_GROUPS_AT_ROOT = _Layout(group="/", actions=("action", "actions"), folder="")
 
 
 def _layout_of(file: ForeignFile) -> _Layout | None:
     """Find the layout of a file; None for an unknown one."""
     if file.has("action") and file.is_group("observations"):
         return _ALOHA
-    if file.is_group(_ROBOMIMIC):
-        return _LAYOUT_OF_ROBOMIMIC
+    if file.is_group(_ROBOMIMIC.group):
+        return _ROBOMIMIC
     groups = [name for name, kind in file.children("").items() if kind == "group"]
     has_actions = [any(file.has(f"{group}/{name}") for name in _GROUPS_AT_ROOT.actions) for group in groups]
     return _GROUPS_AT_ROOT if groups and all(has_actions) else None
@@ -157,7 +144,7 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
     with ForeignFile(path) as file:
         layout = _layout_of(file)
         if layout is None:
-            held = ", ".join(list(file.children(""))[:SHOWN]) or "nothing"
+            held = ", ".join(list(file.children(""))[:_MAX_SHOWN]) or "nothing"
             raise Hdf5Error(
                 "The layout is not robomimic's or Isaac Lab's (data/demo_0/actions), ALOHA's (action, "
                 "observations/qpos), nor one with a group with actions for each episode; the file holds "
@@ -167,7 +154,11 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
         contents = _Contents(file, places[0])
         lines = [f"# A mapping for {path.name}, suggested from its content; docs/import.md explains every key.", "#"]
         lines += [*_listed(contents, len(places)), ""]
-        lines += ["[robot]", f"name = {quoted(_robot(contents, layout))}", *_model(contents), ""]
+        arguments = "env_args.env_kwargs"
+        robot = contents.text(f"{arguments}.robot") or contents.text(f"{arguments}.robots.0") or "robot"
+        is_urdf = "<robot" in contents.text("model_file")[:1000]  # robosuite's models are MuJoCo's
+        model = 'urdf_attribute = "model_file"' if is_urdf else '# urdf = "robot.urdf"'
+        lines += ["[robot]", f"name = {quoted(robot)}", model, ""]
         lines += ["[task]", *_task(contents, path), ""]
         lines += ["[clock]", *_clock(contents, layout), ""]
         lines += ["[episodes]", *_episodes(contents, places, layout)]
@@ -178,35 +169,17 @@ def suggested_hdf5_mapping(path: Path, tell: Callable[[str], None]) -> list[str]
 
 
 def _listed(contents: _Contents, count: int) -> Iterator[str]:
-    """Yield lines for every dataset of the first episode with its shape and first numbers."""
+    """Yield a line for every dataset of the first episode with its type and shape."""
     where = f"{contents.place}, the first of {count} episodes" if contents.place else "the file, which is an episode"
     yield f"# Content of {where}:"
     for name, array in contents.arrays.items():
         length = " of variable length" if array.is_ragged else ""
         yield f"#   {name}  {array.dtype.name} {'x'.join(map(str, array.shape))}{length}"
-        if contents.is_vector(name) and array.shape[0]:
-            try:
-                yield f"#     {first_numbers(np.ravel(array.read(0, 1)))}"
-            except Hdf5Error as error:
-                yield f"#     {without_path(error, contents.file.path)}"
-    for reason in contents.unusable:
-        yield f"#   {reason}"
+    yield from (f"#   {reason}" for reason in contents.unusable)
 
 
 def _is_observed(name: str, layout: _Layout) -> bool:
     return name not in layout.actions and name.startswith(layout.folder)
-
-
-def _robot(contents: _Contents, layout: _Layout) -> str:
-    for name in _ROBOTS:
-        if text := contents.text(name):
-            return text
-    return "aloha" if layout.is_aloha else "robot"
-
-
-def _model(contents: _Contents) -> list[str]:
-    is_urdf = "<robot" in contents.text("model_file")[:1000]  # robosuite's models are MuJoCo's
-    return ['urdf_attribute = "model_file"'] if is_urdf else ['# urdf = "robot.urdf"']
 
 
 def _task(contents: _Contents, path: Path) -> list[str]:
@@ -223,13 +196,13 @@ def _clock(contents: _Contents, layout: _Layout) -> list[str]:
     rate = stated_rate(contents.file, contents.place)
     if rate is not None:
         return [f"# fps = {rate:g}  # from the file"]
-    if layout.is_aloha:
+    if layout is _ALOHA:
         return [f"fps = {_ALOHA_FPS}  # of ALOHA's recorders (DT = 0.02); the file does not record it"]
     return ["# fps = 20  # rows a second, which the file does not record: look it up"]
 
 
 def _episodes(contents: _Contents, places: Sequence[str], layout: _Layout) -> Iterator[str]:
-    if layout.is_aloha:
+    if layout is _ALOHA:
         yield "# The file is one episode."
         return
     yield f"group = {quoted(layout.group)}"
@@ -244,15 +217,16 @@ def _episodes(contents: _Contents, places: Sequence[str], layout: _Layout) -> It
 
 def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
     vectors = [name for name in contents.arrays if contents.is_vector(name)]
-    absolute = [name for name in vectors if _ARTICULATION.fullmatch(name)]
+    absolute, known = [name for name in vectors if _ARTICULATION.fullmatch(name)], list(HDF5_PARTS.values())
     observed: dict[str, list[str]] = {STATE: absolute} if absolute else {}
     if absolute:
         yield from ("", "# Isaac Lab: obs/joint_pos is relative to the default pose, so the state is the simulator's;")
         yield "# its quaternions are w, x, y, z."
-    for name in (name for name in vectors if _is_observed(name, layout)):
-        last = name.removeprefix(layout.folder)
-        known = (feature for end, feature in HDF5_PARTS.items() if last == end or last.endswith(f"_{end}"))
-        feature = STATE if last in layout.states else next(known, f"observation.{_word(last)}")
+    for name in sorted((name for name in vectors if _is_observed(name, layout)), key=_number_of_part):
+        last, number = name.removeprefix(layout.folder), _number_of_part(name)
+        feature = known[number] if number < len(known) else f"observation.{_word(last)}"
+        if layout is _GROUPS_AT_ROOT and last in _STATES:
+            feature = STATE
         if absolute and feature == STATE:
             feature = f"observation.{_word(last)}"
         observed.setdefault(feature, []).append(name)
@@ -260,41 +234,24 @@ def _features(contents: _Contents, layout: _Layout) -> Iterator[str]:
         observed[STATE] = observed.pop(EE_POSE)
     if STATE not in observed:
         yield from ("", _NO_STATE)
+    observed["action"] = [name for name in layout.actions if name in vectors]
     for feature in sorted(observed, key=lambda name: name != STATE):
-        yield from _parts(feature, sorted(observed[feature], key=_order), contents, is_isaac=bool(absolute))
-    yield from _parts("action", [name for name in layout.actions if name in vectors], contents)
-    if "states" in vectors and not _is_observed("states", layout):
-        yield from (f"# {line}" if line else "" for line in _parts("observation.simulator", ["states"], contents))
+        key = feature if "." not in feature else quoted(feature)
+        for name in observed[feature]:
+            yield from ("", f"[[features.{key}]]", f"dataset = {quoted(name)}")
 
 
-def _order(name: str) -> tuple[str, int]:
-    """Sort key for the parts of a feature: robot by robot, the arm before its gripper, positions before
-    orientations.
-    """
+def _number_of_part(name: str) -> int:
+    """Place of a dataset among the known parts of features: joints before grippers, positions before orientations."""
     last = name.rpartition("/")[2]
-    ends = [index for index, end in enumerate(HDF5_PARTS) if last == end or last.endswith(f"_{end}")]
-    robot = last.removesuffix(list(HDF5_PARTS)[ends[0]]) if ends else last
-    return robot, ends[0] if ends else 0
+    found = (number for number, end in enumerate(HDF5_PARTS) if last == end or last.endswith(f"_{end}"))
+    return next(found, len(HDF5_PARTS))
 
 
 def _word(name: str) -> str:
     """Convert to the name of a feature or camera: letters, digits and _, beginning with a letter."""
     word = "".join(letter if letter.isascii() and letter.isalnum() else "_" for letter in name).strip("_")
     return word if word[:1].isalpha() else f"x_{word}"
-
-
-def _parts(feature: str, names: Sequence[str], contents: _Contents, *, is_isaac: bool = False) -> Iterator[str]:
-    key = feature if "." not in feature else quoted(feature)
-    for name in names:
-        yield from ("", f"[[features.{key}]]", f"dataset = {quoted(name)}")
-        count = int(np.prod(contents.arrays[name].shape[1:]))
-        if is_isaac and count == 4 and _ISAAC_QUATERNION.search(name):
-            yield f"names = [{', '.join(map(quoted, _W_FIRST))}]"
-        elif is_isaac and count == 7 and _ISAAC_POSE.search(name):
-            yield f"names = [{', '.join(map(quoted, ('x', 'y', 'z', *_W_FIRST)))}]"
-        if name in ("observations/qpos", "action") and contents.arrays[name].shape[1:] == (2 * len(_ALOHA_JOINTS),):
-            joints = [f"{side}_{joint}" for side in ("left", "right") for joint in _ALOHA_JOINTS]
-            yield f"# names = [{', '.join(map(quoted, joints))}]  # of ALOHA's two arms"
 
 
 def _cameras(contents: _Contents, layout: _Layout) -> Iterator[str]:

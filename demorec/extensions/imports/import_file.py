@@ -12,8 +12,9 @@ import numpy as np
 from demorec.core.errors import ConfigError, describe_error, resource_error
 from demorec.core.files import read_text_limited, replace_text
 from demorec.core.plain import from_json, to_json
+from demorec.extensions.imports.bag import NS
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.clock import NS, Timeline
+from demorec.extensions.imports.clock import Timeline
 from demorec.extensions.imports.findings import NOTE, ImportFinding, lost_in
 from demorec.extensions.imports.rows import EpisodeRows
 from demorec.runs.run_file import IMPORT_NAME

@@ -17,9 +17,8 @@ from demorec.core.errors import ConfigError
 from demorec.core.plain import listed
 from demorec.episode.info import Camera, EpisodeInfo, Feature, SourceFile
 from demorec.episode.validity import find_problems
-from demorec.extensions.imports.bag import Bag, Files
+from demorec.extensions.imports.bag import NS, Bag, Files
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.clock import NS
 from demorec.extensions.imports.description import imported_feature, imported_info
 from demorec.extensions.imports.fields import FieldError
 from demorec.extensions.imports.findings import ImportFinding, bag_findings, row_findings

@@ -12,10 +12,10 @@ import numpy as np
 
 from demorec.episode.episode import Table
 from demorec.episode.info import DEPTH_UNITS, Kept
+from demorec.extensions.imports.bag import NS
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.clock import (
     MISSING,
-    NS,
     ChosenSamples,
     Int,
     Numbers,

@@ -1,40 +1,38 @@
 """Suggest a mapping from a bag's content: it lists every topic with its type and maps those of usual types and names.
 
 Recognised are joint positions (JointState and similar types, JointTrajectory, number arrays with joint names in the
-topic), a gripper's opening, and poses. A topic with a word such as leader or command is the action.
+topic), a gripper's opening, and poses of the robot. A topic with a word such as leader or command is the action.
 """
 
 from __future__ import annotations
 
-import json
 import math
 import re
 from array import array
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
 from demorec.episode.info import DEPTH_UNITS
-from demorec.extensions.imports.bag import Bag, TopicSummary, bags_in, open_bag
+from demorec.extensions.imports.bag import NS, Bag, TopicSummary, bags_in, open_bag
 from demorec.extensions.imports.bag_files import BagError
-from demorec.extensions.imports.clock import NS, SKEW_S
 from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
 from demorec.extensions.imports.fields import FieldError, follow, parse_path, reader_of, stamp_of
 from demorec.extensions.imports.image_messages import ImageHead, NoColorError, image_head
 from demorec.extensions.imports.mapping import MAX_FPS, Clock, Source
-from demorec.extensions.imports.words import SHOWN, first_numbers, quoted, task_in_name, unique_name
+from demorec.extensions.imports.words import quoted, task_in_name, unique_name
 from demorec.mcap.cdr import Values
 from demorec.mcap.scan import ScannedMessage
 
 _USUAL_FPS = 30
 """Suggested rate of a bag without a stream of known rate."""
-_MIN_GRID_RATIO = 0.995
-"""Minimum rate of rows, relative to that of a stream of which they hold nearly every message."""
 _MAX_DECODED = 64
 """Maximum messages of a topic that are decoded."""
+_MAX_PROBLEMS = 5
+"""Maximum problems of a bag that are listed."""
 _JOINT_FIELDS = ("position", "positions", "joints.position", "points[0].positions", "data")
 _POSE_FIELDS = ("pose", "pose.pose")
 _LEADER = re.compile(r"leader|master|gello|teleop|(?<![a-z])lead(?![a-z])")
@@ -49,7 +47,7 @@ _CAMERA_WORD = re.compile(r"[^a-z0-9]+")
 _STOP_WORDS = {"camera", "cam", "color", "image", "raw", "rect", "compressed", "rgb", "cameras", "images", "video"}
 _DEPTH_WORDS = {"depth", "aligned", "to", "compresseddepth", "registered"}
 _LOG = 'stamp = "log"  # its headers have no time'
-_TIMES = ("header", "ts", "timestamp", "stamp")
+Kind = Literal["joints", "gripper", "pose"]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -60,7 +58,7 @@ class _Part:
         topic, field: Source of the numbers.
         names: Names of the elements.
         joints: Names in the messages; empty if they have none.
-        kind: joints, gripper or pose.
+        kind: Kind of the numbers.
         is_action: Whether the topic commands the robot, or belongs to a leader arm.
     """
 
@@ -68,18 +66,13 @@ class _Part:
     field: str
     names: tuple[str, ...]
     joints: tuple[str, ...]
-    kind: str
+    kind: Kind
     is_action: bool
 
     @property
     def words(self) -> list[str]:
         """Words in its topic."""
         return [word for word in re.split(r"[^A-Za-z0-9]+", self.topic) if word]
-
-    @property
-    def is_robot_pose(self) -> bool:
-        """Whether a pose is the robot's own and not an object's or a tag's."""
-        return self.kind == "pose" and _ROBOT_POSE.search(self.topic.lower()) is not None
 
     def is_same(self, other: _Part) -> bool:
         """Whether both are probably the same joints published twice; left and right, 1 and 2 are two robots."""
@@ -90,38 +83,38 @@ class _Part:
         return not self.joints or not other.joints or not {*self.joints}.isdisjoint(other.joints)
 
 
-def _parts_of(topic: str, type_name: str, values: Values) -> list[_Part]:
-    """Joints, a gripper or a pose in a message; empty if nothing is recognised."""
-    if "format" in values or "encoding" in values:
-        return []
-    lower = topic.lower()
-    is_action = bool(_LEADER.search(lower) or _COMMAND.search(lower) or _COMMAND.search(type_name.lower()))
-    for field_name in (*_JOINT_FIELDS, *_POSE_FIELDS):
+def _part_of(topic: str, type_name: str, values: Values) -> _Part | None:
+    """Joints, a gripper or a pose in a message; None if nothing is recognised."""
+    place = topic.lower()
+    is_action = bool(_LEADER.search(place) or _COMMAND.search(place) or _COMMAND.search(type_name.lower()))
+    for name in (*_JOINT_FIELDS, *_POSE_FIELDS):
         try:
-            found = follow(values, parse_path(field_name))
-            reader = reader_of(Source(topic=topic, field=field_name), values)
+            found = follow(values, parse_path(name))
+            reader = reader_of(Source(topic=topic, field=name), values)
         except ValueError:
             continue
-        part = _Part(
-            topic=topic, field=field_name, names=reader.names, joints=reader.joints, kind="", is_action=is_action
-        )
-        if isinstance(found, dict):
-            if field_name in _POSE_FIELDS and {*found} == {"position", "orientation"}:
-                return [replace(part, kind="pose")]
-        elif isinstance(found, float) or (isinstance(found, np.ndarray) and found.dtype.kind == "f"):
-            place = f"{lower} {type_name.lower()} {'' if field_name == 'data' else field_name}"
-            is_of_joints = isinstance(found, np.ndarray) and _JOINTS.search(place) and not _NO_JOINTS.search(lower)
-            if _are_gripper(reader.joints) or (not reader.joints and _GRIPPER.search(lower)):
-                is_named = isinstance(found, np.ndarray)
-                names = reader.names if is_named else ("_".join(part.words) or "data",)
-                return [replace(part, kind="gripper", names=names)]
-            if reader.joints or is_of_joints:
-                return [replace(part, kind="joints")]
-    return []
+        kind = _kind_of(found, name, place, type_name.lower(), reader.joints)
+        if kind == "pose" and not is_action and not _ROBOT_POSE.search(place):
+            return None  # of an object or a tag
+        if kind:
+            part = _Part(
+                topic=topic, field=name, names=reader.names, joints=reader.joints, kind=kind, is_action=is_action
+            )
+            return replace(part, names=("_".join(part.words) or "data",)) if isinstance(found, float) else part
+    return None
 
 
-def _are_gripper(joints: Sequence[str]) -> bool:
-    return bool(joints) and all(_GRIPPER.search(joint.lower()) for joint in joints)
+def _kind_of(found: Any, name: str, topic: str, type_name: str, joints: Sequence[str]) -> Kind | None:
+    """Kind of the numbers in a field of a message; None if they are not recognised."""
+    if isinstance(found, dict):
+        return "pose" if name in _POSE_FIELDS and {*found} == {"position", "orientation"} else None
+    if not isinstance(found, float) and not (isinstance(found, np.ndarray) and found.dtype.kind == "f"):
+        return None
+    if all(_GRIPPER.search(joint.lower()) for joint in joints) if joints else _GRIPPER.search(topic):
+        return "gripper"
+    words = f"{topic} {type_name} {'' if name == 'data' else name}"
+    is_array_of_joints = isinstance(found, np.ndarray) and _JOINTS.search(words) and not _NO_JOINTS.search(topic)
+    return "joints" if joints or is_array_of_joints else None
 
 
 def _chosen(parts: Sequence[_Part]) -> list[_Part]:
@@ -129,11 +122,10 @@ def _chosen(parts: Sequence[_Part]) -> list[_Part]:
 
     A gripper alone is not an arm: the arm's topic was not recognised.
     """
-    poses = [part for part in parts if part.kind == "pose"]
-    named = [part for part in poses if part.is_action or part.is_robot_pose]
-    arms = [part for part in parts if part.kind == "joints"] or named or (poses if len(poses) == 1 else [])
+    of_kind = {kind: [part for part in parts if part.kind == kind] for kind in get_args(Kind)}
+    arms = of_kind["joints"] or of_kind["pose"]
+    found = [*arms, *of_kind["gripper"]] if arms else []
     chosen: list[_Part] = []
-    found = [*arms, *(part for part in parts if part.kind == "gripper")] if arms else []
     # A leader comes before a command, and named joints before others.
     for part in sorted(found, key=lambda one: (one.kind == "gripper", not _LEADER.search(one.topic), not one.joints)):
         if not any(part.is_same(other) for other in chosen):
@@ -150,10 +142,7 @@ class _Topic(TopicSummary):
         head: Head of its first image; None if its messages are not images.
         parts: Numbers in it that may belong to a feature, one for each set of joints in its messages.
         stamps_ns: Header times of the decoded messages.
-        has_stamp: Whether headers have a time.
-        skew_ns: Log time minus header time of the first message.
         problem: Reason why no message can be read; "" otherwise.
-        stamp: Times that rows use, "header" or "log".
     """
 
     name: str
@@ -161,20 +150,12 @@ class _Topic(TopicSummary):
     head: ImageHead | None = None
     parts: list[_Part] = field(default_factory=list)
     stamps_ns: array[int] = field(default_factory=lambda: array("q"))
-    has_stamp: bool = True
-    skew_ns: int = 0
     problem: str = ""
-    stamp: str = "header"
-
-    @property
-    def is_text(self) -> bool:
-        """Whether its messages are texts."""
-        return self.first is not None and self.head is None and isinstance(self.first.get("data"), str)
 
     @property
     def row_rate_hz(self) -> float:
-        """Rate by the times that rows use; simulated time runs slower or faster than log time."""
-        if self.stamp == "log" or not self.has_stamp or len(self.stamps_ns) < 3:
+        """Rate by header times, which rows use; simulated time runs slower or faster than log time."""
+        if len(self.stamps_ns) < 3:
             return self.rate_hz
         steps = np.diff(np.unique(self.stamps_ns))
         usual = steps[np.abs(steps - np.median(steps)) <= 0.5 * np.median(steps)]  # without pauses
@@ -190,9 +171,7 @@ class _Topic(TopicSummary):
         except (ValueError, RecursionError, OverflowError, TypeError):
             return
         stamp = stamp_of(values)
-        self.has_stamp = bool(stamp or self.stamps_ns)  # simulated time begins with 0, which looks like a missing time
         if stamp and 0 < stamp < 2**63:
-            self.skew_ns = self.skew_ns or message.log_ns - stamp
             self.stamps_ns.append(stamp)
         if self.first is None:
             self.first = values
@@ -202,11 +181,10 @@ class _Topic(TopicSummary):
                 self.problem = str(error)
             except FieldError:
                 pass  # not an image
-        if self.head is None and not self.problem:
-            known = {joint for part in self.parts for joint in part.joints}
-            for part in _parts_of(self.name, self.type, values):
-                if not self.parts or (part.joints and known.isdisjoint(part.joints)):
-                    self.parts.append(part)
+        if self.head is None and not self.problem and (part := _part_of(self.name, self.type, values)):
+            known = {joint for other in self.parts for joint in other.joints}
+            if not self.parts or (part.joints and known.isdisjoint(part.joints)):
+                self.parts.append(part)
 
 
 def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
@@ -238,7 +216,7 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
         )
         tell(warning)
         lines += [f"# ATTENTION: {warning}", "#"]
-    lines += [f"# {problem}" for problem in problems[:5]]
+    lines += [f"# {problem}" for problem in problems[:_MAX_PROBLEMS]]
     lines += _listed(topics)
     robot = re.sub(r"[^A-Za-z0-9_]+", "_", bag.name).strip("_") or "robot"
     models = (name for name in topics if name.endswith("robot_description"))
@@ -246,19 +224,18 @@ def suggested_mapping(path: Path, tell: Callable[[str], None]) -> list[str]:
     lines += ["", "[robot]", f"name = {quoted(robot)}"]
     lines += [f"urdf_topic = {quoted(model)}" if model else '# urdf = "robot.urdf"']
     lines += ["", "[task]", *_task(topics, bag)]
-    is_mixed = _set_stamps(topics, {*cameras.values(), *(part.topic for part in (*state, *action))})
-    lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action], is_mixed=is_mixed)]
-    lines += [*_subtasks(topics), *_sources("observation.state", state, topics), *_sources("action", action, topics)]
+    lines += ["", "[clock]", *_clock(topics, cameras, [*state, *action])]
+    lines += [*_sources("observation.state", state, topics), *_sources("action", action, topics)]
     if not action:
         lines += ["", "# No recognised topic is the command of this state, so the next state is the action."]
         lines += ["[[features.action]]", 'next = "observation.state"']
-    poses = [part for part in parts if part.is_robot_pose and not part.is_action and part not in state]
+    poses = [part for part in parts if part.kind == "pose" and not part.is_action and part not in state]
     lines += _sources("observation.ee_pose", poses if state and len(poses) == 1 else [], topics)
     for camera, name in cameras.items():
         lines += ["", f"[cameras.{camera}]", f"topic = {quoted(name)}"]
         info = name.removesuffix("/compressed").removesuffix("/compressedDepth").rpartition("/")[0] + "/camera_info"
         lines += [f"info_topic = {quoted(info)}"] if info in topics else []
-        lines += [] if topics[name].has_stamp else [_LOG]
+        lines += [] if topics[name].stamps_ns else [_LOG]
     return lines
 
 
@@ -276,29 +253,14 @@ def _topics(bag: Bag, problems: list[str]) -> dict[str, _Topic]:
 
 
 def _listed(topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """Yield lines for every topic with its type, rate, count and first values."""
+    """Yield lines for every topic with its type, rate, count and fields."""
     yield "# Content:"
     for name, topic in sorted(topics.items()):
         rate = f"{topic.rate_hz:.1f} Hz, " if topic.rate_hz else ""
-        stamp = "" if topic.has_stamp else ", no times in its headers"
+        stamp = "" if topic.stamps_ns else ", no times in its headers"
         yield f"#   {name}  {topic.type}, {rate}{topic.count} messages{stamp}"
-        fields = [f"{key}: {_short(value)}" for key, value in (topic.first or {}).items() if key not in _TIMES]
-        shown = "; ".join(fields)[:160] or ("no fields" if topic.first else "none of its messages can be read")
-        yield f"#     {topic.problem or shown}"
-
-
-def _short(value: Any) -> str:
-    if isinstance(value, np.ndarray):
-        return first_numbers(value)
-    if isinstance(value, bytes):
-        return f"{len(value)} bytes"
-    if isinstance(value, list):
-        return f"[{', '.join(_short(item) for item in value[:SHOWN])}{', ...' if len(value) > SHOWN else ''}]"
-    if isinstance(value, Mapping):
-        return "{" + ", ".join(f"{key}: {_short(item)}" for key, item in list(value.items())[:SHOWN]) + "}"
-    if isinstance(value, str):
-        return json.dumps(value[:40])
-    return f"{value:.6g}" if isinstance(value, float) else str(value)
+        fields = ", ".join(topic.first or ())[:160]
+        yield f"#     {topic.problem or fields or 'none of its messages can be read'}"
 
 
 def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
@@ -318,56 +280,26 @@ def _cameras(topics: Mapping[str, _Topic]) -> dict[str, str]:
 
 
 def _task(topics: Mapping[str, _Topic], bag: Bag) -> list[str]:
-    if found := _task_topics(topics):
-        return [f"topic = {quoted(found[0])}"]
+    for name, topic in sorted(topics.items()):
+        if _TASK.search(name.lower()) and topic.first and isinstance(topic.first.get("data"), str):
+            return [f"topic = {quoted(name)}"]
     text = f"# text = {quoted('what the robot was asked to do')}  # the same for all bags"
     if name := task_in_name(bag.name):
         return [f"file_name = true  # the name of each bag is its task, here {quoted(name)}; or write:", text]
     return ["# Neither a topic nor a file name describes the task. Write it here:", text]
 
 
-def _task_topics(topics: Mapping[str, _Topic]) -> list[str]:
-    return [name for name, topic in sorted(topics.items()) if _TASK.search(name.lower()) and topic.is_text]
-
-
-def _subtasks(topics: Mapping[str, _Topic]) -> Iterator[str]:
-    """Texts that may describe the robot's current subtask."""
-    others = {*_task_topics(topics)[:1], *(name for name in topics if name.endswith("robot_description"))}
-    for name in (name for name in sorted(topics) if name not in others and topics[name].is_text):
-        yield from ("", "# [subtasks]", f"# topic = {quoted(name)}  # if its texts describe the robot's actions")
-
-
-def _set_stamps(topics: Mapping[str, _Topic], mapped: Collection[str]) -> bool:
-    """Choose header or log times for all topics; return whether log times replace some headers."""
-    skews = [topics[name].skew_ns for name in mapped if topics[name].has_stamp]
-    # One clock for all if header times are far from log times and some topics have only the latter.
-    is_mixed = 0 < len(skews) < len(mapped) and abs(float(np.median(skews))) > SKEW_S * NS
-    for topic in topics.values():
-        topic.stamp = "log" if is_mixed or not skews else "header"
-    return is_mixed
-
-
-def _clock(
-    topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[_Part], *, is_mixed: bool
-) -> Iterator[str]:
+def _clock(topics: Mapping[str, _Topic], cameras: Mapping[str, str], parts: Sequence[_Part]) -> Iterator[str]:
+    """Rate and rows: those of the slowest camera, or a grid as fast as the slowest source."""
     rates = {name: topics[name].row_rate_hz for name in cameras.values() if topics[name].rate_hz}
     colour = [name for name in rates if (head := topics[name].head) and head.encoding not in DEPTH_UNITS]
     slowest = min(colour or rates, key=lambda name: rates[name], default="")
+    if not slowest:
+        rates = {part.topic: rate for part in parts if (rate := topics[part.topic].row_rate_hz)}
+    rate = rates[slowest] if slowest else min(rates.values(), default=_USUAL_FPS)
+    yield f"fps = {min(max(1, round(rate)), MAX_FPS)}"
     if slowest:
-        yield f"fps = {max(1, round(rates[slowest]))}"
         yield f'rows = "camera"  # a row for each image of the slowest, {quoted(slowest)}; or "grid", or a topic'
-    else:  # rows are on a grid, which loses no message if it is as fast
-        part_rates = {part.topic: hz for part in parts if (hz := topics[part.topic].row_rate_hz)}
-        rate = min(part_rates.values(), default=_USUAL_FPS)
-        fps = max(1, round(rate))
-        fps = min(fps + (fps < _MIN_GRID_RATIO * rate), MAX_FPS)
-        yield f"fps = {fps}"
-        for name, hz in part_rates.items():
-            if fps < _MIN_GRID_RATIO * hz:
-                unused = f"{100 * (1 - fps / hz):.3g} % of its messages are in no row"
-                yield f"# {quoted(name)} comes {hz:.1f} times a second: {unused}"
-    if is_mixed:
-        yield 'stamp = "log"  # not all headers have a time, and those that do are of another clock'
     yield 'when_old = "error"  # or "drop_episode"'
 
 
@@ -387,5 +319,5 @@ def _sources(feature: str, parts: Sequence[_Part], topics: Mapping[str, _Topic])
             yield f"prefix = {quoted('_'.join(own or [str(number)]) + '_')}"
         if topic.row_rate_hz and (age_s := 2 / topic.row_rate_hz) > Clock(fps=1).max_age_s:
             yield f"max_age_s = {math.ceil(age_s * 10) / 10:.1f}  # its messages are that far apart"
-        if not topic.has_stamp:
+        if not topic.stamps_ns:
             yield _LOG

@@ -4,12 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Container
-from typing import Any
-
-from numpy.typing import NDArray
-
-SHOWN = 4
-"""Maximum numbers or fields of a value shown in a comment."""
 
 _NUMBER = re.compile(r"[_\-. \d]*\d$")
 """Number of an episode or a day. Names are foreign: nested repetition would take exponential time."""
@@ -32,12 +26,6 @@ def unique_name(name: str, taken: Container[str]) -> str:
     while name in taken:
         name += "_2"
     return name
-
-
-def first_numbers(numbers: NDArray[Any]) -> str:
-    """Format the first few of (N,), for a comment."""
-    more = ", ..." if len(numbers) > SHOWN else ""
-    return f"[{', '.join(f'{number:.4g}' for number in numbers[:SHOWN].tolist())}{more}]"
 
 
 def quoted(text: str) -> str:
