@@ -104,7 +104,7 @@ def correct(policy: Path, wanted: int, first_scene_seed: int, args: argparse.Nam
     if dataset.exists():
         return dataset
     config = GenerateConfig(task=args.task, split="train", seed=first_scene_seed, cameras=())
-    rules = TakeOver(stray_metres=args.stray_metres, noise=args.noise, hand_back=args.hand_back)
+    rules = TakeOver(stray_metres=args.stray_metres, noise=args.noise)
     settings = replace(settings_for(policy, config, action=args.action), takeover=rules)
     out.parent.mkdir(parents=True, exist_ok=True)
     tried, corrected = 0, list[int]()
@@ -224,18 +224,16 @@ def main() -> None:
     parser.add_argument("--batch-size", type=int, default=128)
     parser.add_argument("--learning-rate", type=float, default=5e-4)
     parser.add_argument("--stray-metres", type=float, default=TakeOver.stray_metres)
-    parser.add_argument("--hand-back", action="store_true")
     parser.add_argument("--no-noise", dest="noise", action="store_false")
     parser.add_argument("--out", type=Path, default=Path("outputs/corrections"))
     args = parser.parse_args()
     torch.set_num_threads(1)
     args.device = "cpu"
     args.variant = Variant(about="", action=args.action, execute=args.execute)
-    handed = "back" if args.hand_back else "finished"
     args.hidden = (*([_ABSOLUTE] if args.relative else []), *([] if args.velocities else [_VELOCITIES]))
     args.label = f"{args.action}_{args.execute}_{args.steps}{'_relative' if args.relative else ''}"
     args.label += "" if args.velocities else "_no_velocities"
-    args.rules = f"{args.stray_metres:g}_{handed}{'' if args.noise else '_clean'}"
+    args.rules = f"{args.stray_metres:g}{'' if args.noise else '_clean'}"
     args.out.mkdir(parents=True, exist_ok=True)
     rows: dict[tuple[str, int, int], list[Stage]] = defaultdict(list)
     started = time.process_time()

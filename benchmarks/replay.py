@@ -19,7 +19,7 @@ from pathlib import Path
 
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
-from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.extensions.remake.options import RerenderOptions
 from demorec.extensions.remake.rerender import rerender
@@ -69,7 +69,7 @@ def main() -> None:
             timed("check", start)
             assert report.verdict == "good", report
             start = time.process_time()
-            [(replayed, _)] = replay_all([open_file(path)], ReplayOptions())
+            [replayed] = replay_all([open_file(path)])
             timed("replay", start)
             identical += replayed.is_identical
             with Recording(path) as recording:

@@ -89,7 +89,6 @@ COMMANDS = {
     **ON_A_PATH,
     "check": "check PATH --deep --no-images",
     "replay": "replay PATH --out NEW",
-    "evaluate": "evaluate --compare PATH PATH",
 }
 """Every command that reads third-party files."""
 

@@ -92,9 +92,7 @@ def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> No
 
 
 @pytest.mark.long
-def test_evaluate_records_every_rollout_continues_and_refuses_another(
-    trained: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_evaluate_records_every_rollout_continues_and_refuses_another(trained: Path) -> None:
     policy = trained / "train"
     assert trained_action(find_checkpoint(policy)) == "joint_increment"
     settings = settings_for(policy, GenerateConfig(split="eval", cameras=()), episode_length=9)
@@ -117,9 +115,6 @@ def test_evaluate_records_every_rollout_continues_and_refuses_another(
             assert recording.outcome is not None
             assert not recording.outcome.success
     assert load_evaluation(trained / "b").rate.trials == 3
-
-    assert exit_code("evaluate", "--compare", trained / "a", trained / "b") == 0
-    assert "0/3 = 0.0 %" in capsys.readouterr().out
 
     other = settings_for(policy, GenerateConfig(split="eval", cameras=(), seed=5), episode_length=9)
     with pytest.raises(ConfigError, match="config seed is 0 there and 5 here"):

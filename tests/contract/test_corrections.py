@@ -25,7 +25,7 @@ from demorec.extensions.policies.evaluation import Evaluation, Settings
 from demorec.extensions.policies.gym_env import DemorecEnv, Situation
 from demorec.extensions.policies.rollouts import make_rollout
 from demorec.extensions.policies.turns import Turns, Watch, read_takeover
-from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.generate.options import RunOptions
 from demorec.generate.run import generate
@@ -103,9 +103,8 @@ def test_a_stuck_policy_is_corrected_and_the_episode_replays(rollout: tuple[Atte
     assert event.message == "the expert takes over: the policy is stuck"
     taken = read_takeover(path)
     assert taken is not None
-    assert (taken.reasons, taken.num_frames) == (("the policy is stuck",), len(phases) - handover)
-    options = ReplayOptions()
-    report, _ = next(iter(replay_all([open_file(path)], options)))
+    assert (taken.reason, taken.num_frames) == ("the policy is stuck", len(phases) - handover)
+    (report,) = replay_all([open_file(path)])
     assert report.is_identical, report
 
 
@@ -239,42 +238,25 @@ def test_a_policy_that_acts_like_the_expert_is_left_alone(expert_poses: Array) -
     assert {frame.phase for frame in frames} == {POLICY_PHASE}
 
 
-@pytest.mark.parametrize("hand_back", [False, True])
-def test_a_deviating_policy_is_corrected(expert_poses: Array, hand_back: bool) -> None:
-    """It leaves the expert's path at frame 20 by 1 cm a frame: beyond 5 cm from frame 26, for 6 frames at frame 31."""
-    rules = TakeOver(stray_metres=0.05, hand_back=hand_back)
-    turns, frames = act_in_turns(Wanderer(expert_poses, astray_from=20, drift=0.01), rules)
-    assert turns.success
-    phases = [frame.phase for frame in frames]
-    assert phases.index("halt") in range(29, 34)
-    events = [event for frame in frames for event in frame.events if event.name in ("take_over", "hand_back")]
-    assert events[0].message == "the expert takes over: the policy strays"
-    assert (POLICY_PHASE in phases[phases.index("halt") :]) == hand_back
-    assert [event.name for event in events[:2]] == ["take_over", "hand_back"][: 1 + hand_back]
-    before = frames[phases.index("halt") - 1]
-    assert np.array_equal(before.action.joint_target, before.command.joint_target)  # the policy's output
+def test_a_deviating_policy_is_corrected_and_the_episode_replays(expert_poses: Array, tmp_path: Path) -> None:
+    """It leaves the expert's path at frame 20 by 1 cm a frame: beyond 5 cm from frame 26, for 6 frames at frame 31.
 
-
-def test_a_policy_is_notified_when_handed_back_to_and_the_episode_replays(expert_poses: Array, tmp_path: Path) -> None:
-    """With noise on the expert's commands: labels and commands differ in the expert's frames only."""
-    rules = TakeOver(hand_back=True)
-    attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), rules, action="ee")
+    With noise on the expert's commands: labels and commands differ in the expert's frames only.
+    """
+    attempt, path = roll_out(tmp_path, Wanderer(expert_poses, astray_from=20, drift=0.01), TakeOver(), action="ee")
     assert attempt.success
     with Recording(path) as recording:
         trajectory = recording.trajectory()
         assert recording.info.simulated.behaviour["action_noise"] > 0.0
-    by_policy = np.array([phase == POLICY_PHASE for phase in trajectory.phase])
-    turns = np.flatnonzero(np.diff(by_policy)) + 1
-    assert len(turns) >= 2  # policy, expert, policy
-    assert by_policy[0]
+    handover = trajectory.phase.index("halt")
+    assert handover in range(29, 34)
+    assert set(trajectory.phase[:handover]) == {POLICY_PHASE}
+    assert POLICY_PHASE not in trajectory.phase[handover:]
+    taken = read_takeover(path)
+    assert taken is not None
+    assert taken.reason == "the policy strays"
     differs = (trajectory.action_joint_target != trajectory.command_joint_target).any(axis=1)
-    assert not differs[by_policy].any()
-    options = ReplayOptions()
-    report, _ = next(iter(replay_all([open_file(path)], options)))
+    assert not differs[:handover].any()
+    assert differs[handover:].any()
+    (report,) = replay_all([open_file(path)])
     assert report.is_identical, report
-    export(path, tmp_path / "dataset", intervention=True)
-    assert data_table(tmp_path / "dataset").column("intervention").to_pylist() == [
-        phase not in (POLICY_PHASE, "halt") for phase in trajectory.phase
-    ]
-    checked = check_subject(Subject(path=path, kind="recording"), CheckOptions())
-    assert [result.check for result in checked.results if result.verdict == "broken"] == []

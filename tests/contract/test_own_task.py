@@ -10,7 +10,7 @@ import pytest
 from support.check import checked, simulate
 
 from demorec.core.tables import ROBOTS
-from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.mcap import Recording
 from demorec.tasks.success import at_least, at_most, gripper_open_check, placement_checks
@@ -43,7 +43,6 @@ def test_the_documented_script_pushes_on_every_robot(tmp_path: Path, monkeypatch
         assert 0.09 < math.dist(start[:2], end[:2]) < 0.16
         assert trajectory.object_poses["red_cube"][:, 2].max() < start[2] + 0.005  # pushed, not carried
         assert math.dist(end[:2], scene.goals[0].onto_from_goal.position[:2]) < 0.02
-        options = ReplayOptions(allowed=("my_pushing_tasks",))
-        ((report, _),) = replay_all([open_file(path)], options)
+        (report,) = replay_all([open_file(path)], ("my_pushing_tasks",))
         assert report.is_identical
         assert checked(path).verdict == "good"

@@ -18,7 +18,7 @@ from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode.episode import Event
 from demorec.episode.simulated import with_simulation
-from demorec.extensions.remake.demonstration import ReplayOptions, open_file
+from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import ReplayReport, replay_all
 from demorec.mcap import EpisodeWriter, Recording
 
@@ -28,9 +28,9 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return simulate(tmp_path_factory.mktemp("replay") / "recorded.mcap", seed=11)
 
 
-def _replay(path: Path, **options: object) -> ReplayReport:
-    chosen = ReplayOptions(**options)  # type: ignore[arg-type]
-    return next(iter(replay_all([open_file(path)], chosen)))[0]
+def _replay(path: Path) -> ReplayReport:
+    (report,) = replay_all([open_file(path)])
+    return report
 
 
 @pytest.mark.parametrize("fps", [pytest.param(10, marks=pytest.mark.slow), 60])
@@ -46,7 +46,6 @@ def test_a_state_that_was_changed_is_found(recorded: Path, tmp_path: Path) -> No
     report = _replay(spoilt.write(tmp_path / "s.mcap"))
     assert report.first_difference == (30, "the pose of red_cube")
     assert report.object_error == pytest.approx(0.25, abs=1e-6)
-    assert report.object_error_step == 30
 
 
 def test_another_final_state_is_found(recorded: Path, tmp_path: Path) -> None:
@@ -133,9 +132,7 @@ def test_a_recording_of_the_replay(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_command(recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("replay", recorded) == 0
-    said = capsys.readouterr().out
-    assert "identical, succeeds" in said
-    assert "Compared: joint positions, gripper opening, joint velocities, joint efforts, contact force, EE pose" in said
+    assert "identical, succeeds" in capsys.readouterr().out
     assert exit_code("replay", recorded, "--json") == 0
     assert json.loads(capsys.readouterr().out)[0]["is_identical"] is True
     assert exit_code("replay", recorded, "--episodes", "5:9") == 2
@@ -163,10 +160,7 @@ def test_datasets_of_every_kind_of_action(action: str, quiet_run: Path, tmp_path
     export_lerobot([quiet_run], tmp_path / "ds", ExportOptions(verify=False, action=action))  # type: ignore[arg-type]
     from demorec.extensions.remake.replay_command import demonstrations
 
-    found = [
-        report
-        for report, _ in replay_all(demonstrations([tmp_path / "ds"], ReplayOptions(), episodes=""), ReplayOptions())
-    ]
+    found = list(replay_all(demonstrations([tmp_path / "ds"], (), episodes="")))
     assert [report.success for report in found] == [True, True]
     assert all(report.unreachable == 0 for report in found)
     # Inverse kinematics may bend the elbow differently; the joints themselves match except for rounding and drift.
@@ -187,7 +181,7 @@ def test_the_total_counts_the_differences_of_a_dataset(tmp_path: Path, capsys: p
     run = simulate_run(tmp_path / "run", 1, seed=5)
     export_lerobot([run], tmp_path / "d", ExportOptions(verify=False))
     assert exit_code("replay", tmp_path / "d") == 0
-    episode, total, _ = capsys.readouterr().out.splitlines()
+    episode, total = capsys.readouterr().out.splitlines()
     (gripper,) = re.findall(r"gripper (\S+) mm", episode)
     assert float(gripper) > 0
     assert total.endswith(f"gripper {gripper} mm.")  # but not for objects, whose poses a dataset does not have
@@ -215,13 +209,12 @@ def test_a_robot_without_a_gripper_is_one_sentence(tmp_path: Path, capsys: pytes
 
 def test_nan_is_not_sent(recorded: Path) -> None:
     """An action of a damaged dataset: the arm stays in place, and the step is counted."""
-    options = ReplayOptions()
     whole = open_file(recorded)
     sent = [frame.command for frame in whole.recorded]
     actions = np.array([[*command.joint_target, command.gripper_target] for command in sent])
     actions[3, 2] = np.nan
     damaged = replace(whole, actions=actions, action_kind="joint", recorded=())
-    report = next(iter(replay_all([damaged], options)))[0]
+    (report,) = replay_all([damaged])
     assert report.unreachable == 1
     assert np.isfinite(report.joint_error)
 

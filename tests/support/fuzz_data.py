@@ -188,18 +188,15 @@ class FuzzedData:
         root = self.folder / "policy"
         shutil.rmtree(root, ignore_errors=True)
         root.mkdir()
-        if chance.random() < 0.3:
-            for name in ("a", "b"):
-                (root / name).mkdir()
-                (root / name / "evaluation.json").write_text(json.dumps(to_plain(_EVALUATION)))
-            what = f"evaluation.json: {_change(root / 'a' / 'evaluation.json', chance)}"
-            return what, ["evaluate", "--compare", str(root / "a"), str(root / "b")]
         (root / "config.json").write_text(json.dumps(_POLICY))
         (root / "train_config.json").write_text(json.dumps({"dataset": {"root": str(self.folder / "nowhere")}}))
         (root / "policy_preprocessor.json").write_text(json.dumps(_STEPS))
-        file = chance.choice(sorted(root.glob("*.json")))
+        out = self.folder / "out"
+        out.mkdir(exist_ok=True)
+        (out / "evaluation.json").write_text(json.dumps(to_plain(_EVALUATION)))
+        file = chance.choice([*sorted(root.glob("*.json")), out / "evaluation.json"])
         what = f"policy {file.name}: {_change(file, chance)}"
-        return what, ["evaluate", "--policy", str(root), "--out", str(self.folder / "out"), "--num-episodes", "1"]
+        return what, ["evaluate", "--policy", str(root), "--action", "joint", "--out", str(out), "--num-episodes", "1"]
 
 
 _POLICY: dict[str, Any] = {

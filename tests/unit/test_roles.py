@@ -109,7 +109,6 @@ def test_info_shows_features_without_a_role_first_and_named_ones(tmp_path: Path,
         "view {d} --save {new}.rrd",
         "report {d} --out {new}.html",
         "import lerobot {d} --out {new}",
-        "replay {d} --robot panda",
     ],
 )
 @pytest.mark.parametrize("flag", ["--state", "--action", "--gripper"])
@@ -128,8 +127,6 @@ def test_other_ways_to_name_a_role_wrongly(tmp_path: Path, capsys: Capture) -> N
     root = write_convention(tmp_path / "d", UNKNOWN)
     assert exit_code("info", root, "--state", "measured", "--action", "measured") == 2
     assert "--action names 'measured', which --state already names" in capsys.readouterr().err
-    assert exit_code("replay", root, *NAMED) == 2
-    assert "add --robot" in capsys.readouterr().err
     assert exit_code("import", "bag.mcap", "--out", tmp_path / "run", *NAMED) == 2
     assert "only for datasets" in capsys.readouterr().err
     assert exit_code("import", "lerobot", root, "--out", tmp_path / "run", *NAMED, "--gripper", "3") == 2

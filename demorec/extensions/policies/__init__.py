@@ -21,10 +21,6 @@ class TakeOver:
     """Take over once the hand's direction differs this much from the expert's; 0: never."""
     noise: bool = True
     """Add the exploration noise of demonstrations to the expert's commands; labels stay clean."""
-    hand_back: bool = False
-    """Return control to the policy once the expert has stopped the arm and reached a state from which a script can
-    begin.
-    """
 
     def validate(self) -> None:
         """Raise OptionError for impossible values."""

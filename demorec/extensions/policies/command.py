@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
@@ -18,7 +18,6 @@ from demorec.extensions.policies import TakeOver
 
 if TYPE_CHECKING:
     from demorec.extensions.policies.evaluation import Evaluation
-    from demorec.extensions.policies.statistics import RateComparison
 
 
 Split = Literal["all", "train", "eval"]
@@ -137,46 +136,24 @@ class Evaluate(RolloutFlags):
     Examples:
       demorec evaluate --policy outputs/train --task pick_place --num-episodes 100
       demorec evaluate --policy outputs/train --split all --seed 1 --out all
-      demorec evaluate --compare evaluations/clean evaluations/noisy
-      demorec view evaluations/clean/failed            (watch the failures)
+      demorec view evaluations/pick_place/failed       (watch the failures)
     """
 
     split: Split = "eval"
     """eval: scenes and seeds that --split train excludes; all or train: as generate-dataset makes them."""
-    compare: tuple[Path, Path] | None = None
-    """Compare two finished evaluations instead: FOLDER FOLDER."""
     json: bool = False
     """Print the result as JSON."""
 
     def run(self) -> int:
-        """Evaluate or compare, and report."""
-        if self.compare is not None:
-            return self._compare(*self.compare)
+        """Evaluate and report."""
         if self.policy is None:
-            raise ConfigError("Nothing to evaluate: give --policy FOLDER, or --compare FOLDER FOLDER.")
+            raise ConfigError("Nothing to evaluate: give --policy FOLDER.")
         out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
         evaluation = self.carry_out(self.policy, out, title="evaluating")
         if self.json:
             say_json(_plain(evaluation))
         else:
             say(*_evaluation_lines(evaluation, out))
-        return 0
-
-    def _compare(self, first: Path, second: Path) -> int:
-        from demorec.extensions.policies.evaluation import load_evaluation
-        from demorec.extensions.policies.statistics import compare
-
-        a, b = load_evaluation(first), load_evaluation(second)
-        scenes_a, scenes_b = a.settings.config, b.settings.config
-        for name in _SCENES:
-            there, here = getattr(scenes_a, name), getattr(scenes_b, name)
-            if there != here:
-                raise ConfigError(f"The two evaluations did not use the same scenes: {name} is {there} and {here}.")
-        comparison = compare(a.successes, b.successes)
-        if self.json:
-            say_json(asdict(comparison))
-        else:
-            say(*_compared(comparison, first, second))
         return 0
 
 
@@ -206,29 +183,18 @@ def _plain(evaluation: Evaluation) -> dict[str, Any]:
     return plain
 
 
-def _compared(comparison: RateComparison, first: Path, second: Path) -> list[str]:
-    low, high = (100 * bound for bound in comparison.interval)
-    alone = f"{comparison.only_first} scenes by the first, {comparison.only_second} by the second"
-    return [
-        f"first         {comparison.first}   {first}",
-        f"second        {comparison.second}   {second}",
-        f"difference    {100 * comparison.difference:+.1f} points [{low:+.1f}, {high:+.1f}] (Newcombe 95 %)",
-        f"one alone     {alone} (McNemar, exact: p = {comparison.p_value:.3g})",
-    ]
-
-
 @dataclass(frozen=True, kw_only=True)
 class Correct(RolloutFlags):
     """Let a policy act until it strays, then let the scripted expert finish: demonstrations that the policy lacks.
 
     The expert takes over when the policy strays from the expert's trajectory, gets stuck or runs out of time. It
-    stops the arm, brings a held object to its goal or releases it, and finishes the task or hands
-    back control. Every episode is one recording, in which the phase "policy" marks the policy's frames; it can be
-    replayed like any other. Run the same command again to continue where it stopped.
+    stops the arm, brings a held object to its goal or releases it, and finishes the task. Every episode is one
+    recording, in which the phase "policy" marks the policy's frames; it can be replayed like any other. Run the same
+    command again to continue where it stopped.
 
     Examples:
       demorec correct --policy outputs/train --num-episodes 100 --seed 1 --out fix1
-      demorec correct --policy outputs/train --stray-metres 0.1 --hand-back
+      demorec correct --policy outputs/train --stray-metres 0.1
       demorec export lerobot fix1 --out data/fix1 --intervention --corrected-only
     """
 
@@ -258,7 +224,7 @@ def _correction_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
     yield f"policy        {evaluation.settings.policy_type} {evaluation.settings.policy_digest}"
     yield f"scenes        {config.task}, split {config.split}, seed {config.seed}"
     yield f"by itself     {sum(taken is None for taken in found)} of {len(found)} episodes"
-    yield from _counts("taken over", (reason for taken in found if taken is not None for reason in taken.reasons))
+    yield from _counts("taken over", (taken.reason for taken in found if taken is not None))
     yield f"success       {evaluation.rate} (Wilson 95 %) in the end"
     yield f"expert acted  {frames} of {total} frames"
     yield f"recordings    {out / 'episodes'}, {out / 'failed'}"

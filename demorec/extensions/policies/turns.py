@@ -5,14 +5,14 @@ policy lacks (DAgger, Ross et al. 2011, https://arxiv.org/abs/1011.0686). The po
 all others are the expert's.
 
 The expert has a script but no action for every state. Its trajectory is therefore simulated beforehand in a separate
-world from the same state, and the policy's commands are compared with the part of that trajectory that it has reached.
+world, and the policy's commands are compared with the part of that trajectory that it has reached.
 """
 
 from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,7 +20,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from demorec.core.geometry import Array, angle_between
-from demorec.episode.episode import HALT_PHASE, POLICY_PHASE, Action, Event, Frame, Observation
+from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation
 from demorec.episode.scene import Goal
 from demorec.extensions.policies import TakeOver
 from demorec.extensions.policies.gym_env import SUCCESS_FRAMES, DemorecEnv, Situation
@@ -29,14 +29,11 @@ from demorec.loop import PreparedEpisode, Session
 from demorec.loop.session import ActionNoise
 from demorec.mcap import open_simulated
 from demorec.sim.world import World
-from demorec.tasks.recovery import TAKE_OVER
 from demorec.tasks.script import Behaviour, ExpertFailure, Step
 from demorec.tasks.skills import Expert
 from demorec.tasks.success import goal_pose
 
-TAKE_OVER_EVENT, HAND_BACK_EVENT, _MESSAGE = "take_over", "hand_back", "the expert takes over: "
-_RECOVERY = (HALT_PHASE, TAKE_OVER, "recover", "perceive")
-"""Phases before the expert has returned to states that demonstrations have."""
+TAKE_OVER_EVENT, _MESSAGE = "take_over", "the expert takes over: "
 PHASES = ("reach", "lift", "transport", "place")
 """reach: nothing was grasped; lift: grasped, but not lifted; transport: lifted, but not near its goal; place: near its
 goal, but the conditions did not hold at the end.
@@ -72,7 +69,7 @@ class Turns:
         env: Environment after a reset.
         policy: Policy, which acts first.
         observation: Observation of the reset.
-        seed: Seed of the policy for each of its turns.
+        seed: Seed of the policy.
         rules: Conditions of a takeover; None: never, so that the policy acts until its time is over.
         rehearsal_world: World of `Watch`.
 
@@ -93,56 +90,42 @@ class Turns:
     ) -> None:
         self.success, self.num_retries = False, 0
         self._trouble = "", ""
-        self._env, self._policy, self._observation, self._seed = env, policy, observation, seed
-        self._hands_back = rules is not None and rules.hand_back
+        self._env, self._policy, self._observation = env, policy, observation
         self._behaviour = correcting_behaviour(env.episode, noise=rules is not None and rules.noise)
-        self._noise_rng = env.episode.rng("noise")
         self._watch = None
         if rules is not None:
             self._watch = Watch(rules, env.episode, max_frames=env.max_episode_steps, world=rehearsal_world)
-        self._commands: list[Action] = []
         self._is_out_of_time = False
         self._stages = [0] * len(env.info.simulated.scene.goals)
+        policy.reset(seed)
 
     def frames(self) -> Iterator[Frame]:
         """Yield each frame after its command was executed."""
         reason = yield from self._policy_acts()
-        while reason and (yield from self._expert_acts(reason)):
-            reason = yield from self._policy_acts(Event(name=HAND_BACK_EVENT, message="the policy acts again"))
+        if reason:
+            yield from self._expert_acts(reason)
 
-    def _policy_acts(self, *events: Event) -> Generator[Frame, None, str]:
+    def _policy_acts(self) -> Generator[Frame, None, str]:
         """Return the reason for a takeover; "" at the end of the rollout."""
         env = self._env
-        self._policy.reset(self._seed)
-        if self._watch is not None:
-            self._watch.begin(self._commands)
-        while True:
+        while not self.success and (self._watch is not None or not self._is_out_of_time):
             command = env.command_for(self._policy.act(self._observation, env.info.instruction))
             reason = "" if self._watch is None else self._watch.reason(env.situation, command)
             if reason:
                 return reason
-            yield self._step(Step(action=command, phase=POLICY_PHASE, events=events))
-            events = ()
-            if self.success or (self._watch is None and self._is_out_of_time):
-                return ""
+            yield self._step(Step(action=command, phase=POLICY_PHASE))
+        return ""
 
-    def _expert_acts(self, reason: str) -> Generator[Frame, None, bool]:
-        """Return whether the policy acts again."""
-        world, retries = self._env.world, self.num_retries
+    def _expert_acts(self, reason: str) -> Iterator[Frame]:
+        world, rng = self._env.world, self._env.episode.rng("noise")
         expert = Expert(world, self._behaviour)
         expert.note(TAKE_OVER_EVENT, f"{_MESSAGE}{reason}")
-        noise = ActionNoise(world, sigma=self._behaviour.action_noise, rng=self._noise_rng, fps=world.fps)
+        noise = ActionNoise(world, sigma=self._behaviour.action_noise, rng=rng, fps=world.fps)
         for step in self._steps(expert):
-            command = noise.command(step)
-            is_back = step.phase not in _RECOVERY
-            if self._hands_back and is_back and self._watch and not self._watch.is_over(self._env.situation):
-                self._trouble = "", ""
-                return True
-            yield self._step(replace(step, command=command, is_deliberate_miss=False))
-            self.num_retries = retries + expert.num_retries
+            yield self._step(replace(step, command=noise.command(step), is_deliberate_miss=False))
+            self.num_retries = expert.num_retries
             if self.success:
-                return False
-        return False
+                return
 
     def _steps(self, expert: Expert) -> Iterator[Step]:
         """Yield steps until the task is done or given up, then a few that hold."""
@@ -161,7 +144,6 @@ class Turns:
         self._stages = [max(stage, self._reached(goal, stage)) for goal, stage in zip(goals, self._stages, strict=True)]
         frame = self._env.situation.last_frame
         assert frame is not None  # because there was a step
-        self._commands.append(frame.command)
         return frame
 
     def _reached(self, goal: Goal, stage: int) -> int:
@@ -200,29 +182,20 @@ class Watch:
         self, rules: TakeOver, episode: PreparedEpisode, *, max_frames: int, world: World | None = None
     ) -> None:
         fps = episode.info.fps
-        self._rules, self._episode, self._world, self._limit = rules, episode, world, max_frames
+        self._rules, self._limit = rules, max_frames
         self._past: deque[Array] = deque(maxlen=max(2, round(rules.stuck_seconds * fps)))
         self._max_astray = max(1, round(_STRAY_SECONDS * fps))
         self._astray = 0
-        self._rehearsal: _Rehearsal | None = None
-
-    def begin(self, commands: Sequence[Action]) -> None:
-        """Start monitoring when the policy begins to act, or acts again, after these commands of the episode."""
-        self._past.clear()
-        self._astray = 0
-        if self._world is not None and (self._rules.stray_metres or self._rules.stray_radians):
-            self._rehearsal = _Rehearsal(self._world, self._episode, commands)
-
-    def is_over(self, situation: Situation) -> bool:
-        """Whether the policy's time is over."""
-        return situation.frame_index >= self._limit
+        self._rehearsal = None
+        if world is not None and (rules.stray_metres or rules.stray_radians):
+            self._rehearsal = _Rehearsal(world, episode)
 
     def reason(self, situation: Situation, command: Action) -> str:
         """Reason why the expert takes over instead of this command; "" while the policy continues. Call once
         per frame.
         """
         self._past.append(_place(situation.observation))
-        if self.is_over(situation):
+        if situation.frame_index >= self._limit:
             return "the policy has had its time"
         if self._rules.stuck_seconds > 0 and len(self._past) == self._past.maxlen:
             spread = np.ptp(np.array(self._past), axis=0)
@@ -240,17 +213,15 @@ class Watch:
 
 
 class _Rehearsal:
-    """The expert's trajectory, simulated in a world of the episode's robot, after these commands of the episode."""
+    """The expert's trajectory, simulated in a world of the episode's robot."""
 
-    def __init__(self, world: World, episode: PreparedEpisode, commands: Sequence[Action]) -> None:
+    def __init__(self, world: World, episode: PreparedEpisode) -> None:
         session = Session(world, episode.info.simulated.scene, episode.task)
         session.reset()
-        for command in commands:
-            session.step(command)
         seen, actions = [session.observation], [world.hold()]
         expert = Expert(world, correcting_behaviour(episode, noise=False))
         try:
-            for step in episode.task.resume(expert) if commands else episode.task.script(expert):
+            for step in episode.task.script(expert):
                 seen.append(session.observation)
                 actions.append(step.action)
                 session.step(step.action)
@@ -294,14 +265,14 @@ def _place(observation: Observation) -> Array:
 
 
 class TakenOver(NamedTuple):
-    """Corrections in a recording: the reason of each takeover, and the number of the expert's frames."""
+    """The correction in a recording: the reason of the takeover, and the number of the expert's frames."""
 
-    reasons: tuple[str, ...]
+    reason: str
     num_frames: int
 
 
 def read_takeover(path: Path) -> TakenOver | None:
-    """Read the corrections of a rollout's recording; None if the policy acted to the end.
+    """Read the correction in a rollout's recording; None if the policy acted to the end.
 
     Raises:
         RecordingError: It cannot be read.
@@ -310,8 +281,5 @@ def read_takeover(path: Path) -> TakenOver | None:
         messages = [event.message for _, event in recording.events() if event.name == TAKE_OVER_EVENT]
         if not messages:
             return None
-        phases = recording.phases
-    return TakenOver(
-        reasons=tuple(message.removeprefix(_MESSAGE) for message in messages),
-        num_frames=sum(phase != POLICY_PHASE for phase in phases),
-    )
+        num_frames = sum(phase != POLICY_PHASE for phase in recording.phases)
+    return TakenOver(reason=messages[0].removeprefix(_MESSAGE), num_frames=num_frames)

@@ -17,22 +17,22 @@ from typing import Literal
 
 from demorec.check.dataset import CheckedDataset, DescribedEpisode, episode_differences, export_options
 from demorec.check.report import Proof
-from demorec.core.config import EpisodePlan, GenerateConfig, VideoConfig, cpu_type, deciding_versions
+from demorec.core.config import EpisodePlan, GenerateConfig, cpu_type, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, ExportError, NotAllowedError, RecordingError, resource_error
 from demorec.core.own_versions import version_differences
 from demorec.core.plain import digest
 from demorec.core.processes import in_turn
-from demorec.core.tables import RENDERERS
 from demorec.datasets.lerobot.options import ExportOptions
+from demorec.episode.episode import Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
 from demorec.extensions.remake.byte_comparison import Contents, RemakeDifference, content_differences
-from demorec.extensions.remake.demonstration import ReplayOptions, open_demonstration
-from demorec.extensions.remake.drive import replay
-from demorec.extensions.remake.rerender import config_as, recorded_view, view_painter
+from demorec.extensions.remake.demonstration import open_demonstration
+from demorec.extensions.remake.drive import record_replay
+from demorec.extensions.remake.rerender import config_as
 from demorec.generate.worker import record_episode
 from demorec.loop import SimulatorCache
-from demorec.mcap import EpisodeWriter, Recording, open_simulated
+from demorec.mcap import Recording, open_simulated
 from demorec.robots.assets import allow_models
 
 
@@ -163,24 +163,21 @@ def _generate_again(info: EpisodeInfo, path: Path, simulators: SimulatorCache, a
 
 def _send_again(recording: Recording, path: Path, simulators: SimulatorCache, allowed: Sequence[str]) -> None:
     allow_models(allowed)
-    options = ReplayOptions(allowed=tuple(allowed))
-    demonstration = open_demonstration(recording)
+    recorded = recording.outcome
     info = with_simulation(recording.info, config_digest=digest(recording.info.simulated.config))
-    RENDERERS.check_name(str(info.simulated.config.get("renderer", "raster")))
-    world, renderer = simulators.acquire(info)
-    painter = None if renderer is None else view_painter(renderer, recorded_view(info), info.simulated.config)
-    with EpisodeWriter(path, info, video=config_as(info.simulated.config.get("video", {}), VideoConfig)) as writer:
-        _, outcome = replay(demonstration, world, options, painter=painter, sink=writer.write)
-        if recording.outcome is not None:  # a replay cannot reproduce the reason of a failure or the number of retries
-            recorded = recording.outcome
-            outcome = replace(
-                outcome,
-                failure_phase=recorded.failure_phase,
-                failure_reason=recorded.failure_reason,
-                num_retries=recorded.num_retries,
-                success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
-            )
-        writer.finish(outcome)
+
+    def labelled(outcome: Outcome) -> Outcome:
+        if recorded is None:
+            return outcome
+        return replace(  # a replay cannot reproduce the reason of a failure or the number of retries
+            outcome,
+            failure_phase=recorded.failure_phase,
+            failure_reason=recorded.failure_reason,
+            num_retries=recorded.num_retries,
+            success=all(check.passed for check in outcome.checks) and not recorded.failure_reason,
+        )
+
+    record_replay(open_demonstration(recording), info, path, simulators, allowed, labelled=labelled)
 
 
 def deep_checks(paths: Sequence[Path], *, workers: int = 1, allowed: Sequence[str] = ()) -> Iterator[DeepReport]:

@@ -1,7 +1,6 @@
 """Recordings, and episodes of datasets, opened for replay.
 
-Datasets have float32 actions of any kind; their scenes come from the sidecar. Data of a real arm are opened in
-`real_arm`.
+Datasets have float32 actions of any kind; their scenes come from the sidecar.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, get_args
+from typing import get_args
 
 import numpy as np
 
@@ -18,41 +17,11 @@ from demorec.core.geometry import Array
 from demorec.episode.episode import Frame, Observation, Outcome, gave_up
 from demorec.episode.features import ACTION, STATE, ActionKind, action_names
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.roles import NO_NAMES, NamedRoles
 from demorec.mcap import Recording, open_simulated
 from demorec.mcap.frames import frames_of
-from demorec.robots.motors import Motors
-from demorec.robots.robot import RobotSpec
 from demorec.sim.sensors import SENSORS
 
-if TYPE_CHECKING:
-    from demorec.check.dataset import CheckedDataset
-
 JOINTS, OPENING, POSE_OF = "joint positions", "gripper opening", "the pose of "
-
-
-@dataclass(frozen=True, kw_only=True)
-class ReplayOptions:
-    """Options of a replay.
-
-    Attributes:
-        allowed: The user's own modules that may be imported for the demonstrations.
-        robot: Simulated arm for a real arm's actions; None: the robot of each recorded scene.
-        motors: Servos of states and actions in datasets, if the user names them.
-        named: Roles that the user names, for features of a real arm.
-    """
-
-    allowed: tuple[str, ...] = ()
-    robot: RobotSpec | None = None
-    motors: Motors | None = None
-    named: NamedRoles = NO_NAMES
-
-    def validate(self) -> None:
-        """Raise ConfigError for impossible combinations."""
-        if self.motors is not None and self.robot is None:
-            raise ConfigError("--motor-units is for the dataset of a real arm: add --robot so101.")
-        if self.named and self.robot is None:
-            raise ConfigError("--state, --action and --gripper are for the data of a real arm: add --robot.")
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -72,7 +41,6 @@ class Demonstration:
         source: File of the recording; None for an episode of a dataset.
         digest: Digest of its content.
         gave_up: Whether the recording gives the reason of its failure (`gave_up`).
-        is_measured: Whether the states are a real arm's, which no simulation reproduces bit-exactly.
     """
 
     name: str
@@ -86,17 +54,6 @@ class Demonstration:
     source: Path | None = None
     digest: str = ""
     gave_up: bool = False
-    is_measured: bool = False
-
-    @property
-    def success(self) -> bool | None:
-        """Recorded success; None if unknown."""
-        return None if self.outcome is None else self.outcome.success
-
-    @property
-    def objects(self) -> tuple[str, ...]:
-        """Names of objects with recorded poses."""
-        return tuple(name.removeprefix(POSE_OF) for name in self.compared if name.startswith(POSE_OF))
 
 
 def open_demonstration(recording: Recording) -> Demonstration:
@@ -147,30 +104,22 @@ def open_file(path: Path) -> Demonstration:
         return open_demonstration(recording)
 
 
-def open_dataset(path: Path, wanted: Callable[[int], bool], options: ReplayOptions) -> CheckedDataset:
-    """Open a dataset whose wanted episodes are all readable; ExportError otherwise."""
+def dataset_demonstrations(path: Path, wanted: Callable[[int], bool]) -> Iterator[Demonstration]:
+    """Yield the wanted episodes of an exported dataset, with the scenes from its sidecar.
+
+    Raises:
+        ExportError: A wanted episode is not readable.
+        ConfigError: The dataset has no sidecar of demorec, or unknown actions.
+    """
     from demorec.check.dataset import CheckedDataset  # loads pyarrow
 
-    dataset = CheckedDataset(path, motors=options.motors, named=options.named)
+    dataset = CheckedDataset(path)
     if missing := dataset.missing:
         raise ExportError(missing)
     if bad := [problem for number, problem in dataset.unreadable.items() if wanted(number)]:
         raise ExportError(f"{bad[0]}, in {path}")
-    return dataset
-
-
-def dataset_demonstrations(dataset: CheckedDataset, wanted: Callable[[int], bool]) -> Iterator[Demonstration]:
-    """Yield the wanted episodes of an exported dataset, with the scenes from its sidecar.
-
-    Raises:
-        ConfigError: The dataset has no sidecar of demorec, or unknown actions.
-    """
-    path = dataset.root
     if not dataset.records:
-        raise ConfigError(
-            f"The dataset does not record its scenes (no demorec/episodes): --robot replays a real arm's actions: "
-            f"{path}"
-        )
+        raise ConfigError(f"The dataset does not record its scenes (no demorec/episodes): {path}")
     dataset.check_simulated()
     names = dataset.info.features[ACTION].names if ACTION in dataset.info.features else None
     for each in dataset.described():
@@ -182,7 +131,7 @@ def dataset_demonstrations(dataset: CheckedDataset, wanted: Callable[[int], bool
             raise ConfigError(f"The dataset's actions were not written by demorec and cannot be replayed: {path}")
         state, arm = each.rows[STATE].astype(np.float64), len(robot.arm_joints)
         yield Demonstration(
-            name=episode_name(path, each.number),
+            name=f"{path.name}_episode_{each.number:06d}",
             info=replace(each.info, fps=dataset.info.fps),
             actions=each.rows[ACTION].astype(np.float64),
             action_kind=kind,
@@ -191,8 +140,3 @@ def dataset_demonstrations(dataset: CheckedDataset, wanted: Callable[[int], bool
             tolerance=1e-6,
             digest=str(each.kept["content_digest"]),
         )
-
-
-def episode_name(dataset: Path, number: int) -> str:
-    """Name of a dataset's episode as a demonstration."""
-    return f"{dataset.name}_episode_{number:06d}"

@@ -4,9 +4,9 @@ recorded one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -16,10 +16,11 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.files import make_folder
 from demorec.core.geometry import Array
-from demorec.core.tables import TASKS
+from demorec.core.tables import RENDERERS, TASKS
 from demorec.episode.episode import Frame, Observation, Outcome, SuccessCheck
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
-from demorec.extensions.remake.demonstration import JOINTS, OPENING, POSE_OF, Demonstration, ReplayOptions, seen_in
+from demorec.extensions.remake.demonstration import JOINTS, OPENING, POSE_OF, Demonstration, seen_in
 from demorec.extensions.remake.rerender import config_as, finished_outcome, recorded_view, view_behaviour, view_painter
 from demorec.loop import Session, SimulatorCache, Step
 from demorec.loop.actions import ActionDecoder
@@ -37,46 +38,38 @@ class ReplayReport:
         name: Name of the demonstration.
         num_steps: Number of commands sent.
         is_bitwise: Whether full float64 states were compared and must be bit-exact.
-        compared: Names of the compared quantities.
-        is_identical: All of this, the final state's digest and the conditions of a recording's outcome are bit-exact
+        is_identical: All states, the final state's digest and the conditions of a recording's outcome are bit-exact
         (float32 datasets: equal up to rounding).
         first_difference: First step with a different state, and the quantity; None if all are equal.
-        joint_error, joint_error_step: Largest difference of an arm joint, rad, and its step.
+        joint_error: Largest difference of an arm joint, rad.
         gripper_error: Largest difference of the opening, m.
-        object_error, object_error_step, object_error_name: Largest distance of an object from its recorded place, m.
+        object_error: Largest distance of an object from its recorded place, m; None if no object was recorded.
         recorded_success, success: Success of the recording and of the replay; None if unknown or not judged.
         is_outcome_as_recorded: Both are equal, or one is unknown. A failure with a recorded reason (the expert gave up)
         remains one even if the conditions hold.
         failed_checks: Conditions that do not hold in the replay.
         unreachable: Number of steps with a pose out of reach (the arm held its last target).
-        tracking: Arm joint (rad) or "gripper" (m) -> median and largest difference from a real arm's measurements;
-        empty for simulated episodes.
     """
 
     name: str
     num_steps: int
     is_bitwise: bool
-    compared: tuple[str, ...]
     is_identical: bool
     first_difference: tuple[int, str] | None
     joint_error: float
-    joint_error_step: int
     gripper_error: float
-    object_error: float
-    object_error_step: int
-    object_error_name: str
+    object_error: float | None
     recorded_success: bool | None
     success: bool | None
     is_outcome_as_recorded: bool
     failed_checks: tuple[str, ...] = ()
     unreachable: int = 0
-    tracking: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
 
 def replay(
     demonstration: Demonstration,
     world: World,
-    options: ReplayOptions,
+    allowed: Sequence[str] = (),
     *,
     painter: Painter | None = None,
     sink: Callable[[Frame], None] | None = None,
@@ -86,23 +79,22 @@ def replay(
     Args:
         demonstration: Demonstration to replay.
         world: World of its robot and rate; it is reset.
-        options: Options of the replay.
+        allowed: The user's own modules that may be imported for its task.
         painter: Draws the frames' images; None for none.
         sink: Called with every frame of the replay before its command is sent.
 
     Returns:
         The report, and the outcome of the replay.
     """
-    d = demonstration
-    task = None if d.is_measured else TASKS.load(d.info.simulated.task, options.allowed)()
-    session = Session(world, d.info.simulated.scene, task, painter=painter)
-    agent = DemonstrationAgent(d)
+    simulated = demonstration.info.simulated
+    session = Session(world, simulated.scene, TASKS.load(simulated.task, allowed)(), painter=painter)
+    agent = DemonstrationAgent(demonstration)
     seen: list[Observation] = []
     for frame in session.run(agent):
         seen.append(frame.observation)
         if sink is not None:
             sink(frame)
-    return _report(d, seen, session.outcome, unreachable=agent.num_unreachable), session.outcome
+    return _report(demonstration, seen, session.outcome, unreachable=agent.num_unreachable), session.outcome
 
 
 class DemonstrationAgent:
@@ -155,38 +147,25 @@ def _report(d: Demonstration, seen: Sequence[Observation], outcome: Outcome, *, 
             first = len(seen), "the final state"
         elif d.outcome.checks != outcome.checks:
             first = len(seen), _other_condition(outcome.checks, d.outcome.checks)
-    arm = np.abs(off[JOINTS][:, : len(d.info.simulated.robot.arm_joints)]).max(axis=1)
-    distances = np.array([np.linalg.norm(off[f"{POSE_OF}{name}"][:, :3], axis=1) for name in d.objects])
-    number, step = divmod(int(distances.argmax()), distances.shape[1]) if len(distances) else (0, 0)
-    distance = float(distances[number, step]) if len(distances) else 0.0
+    distances = [np.linalg.norm(way[:, :3], axis=1).max() for name, way in off.items() if name.startswith(POSE_OF)]
     failed = tuple(check.name for check in outcome.checks if not check.passed)
     success = not failed if outcome.checks else None
+    recorded = None if d.outcome is None else d.outcome.success
     return ReplayReport(
         name=d.name,
         num_steps=len(seen),
         is_bitwise=d.action_kind is None,
-        compared=tuple(off),
         is_identical=first is None,
         first_difference=first,
-        joint_error=float(arm.max()),
-        joint_error_step=int(arm.argmax()),
+        joint_error=float(np.abs(off[JOINTS][:, : len(d.info.simulated.robot.arm_joints)]).max()),
         gripper_error=float(np.abs(off[OPENING]).max()),
-        object_error=distance,
-        object_error_step=step,
-        object_error_name="" if distance == 0.0 else d.objects[number],
-        recorded_success=d.success,
+        object_error=float(max(distances)) if distances else None,
+        recorded_success=recorded,
         success=success,
-        is_outcome_as_recorded=None in (success, d.success) or success == d.success or (d.gave_up and not d.success),
+        is_outcome_as_recorded=None in (success, recorded) or success == recorded or (d.gave_up and not recorded),
         failed_checks=failed,
         unreachable=unreachable,
-        tracking=_tracking(d, off) if d.is_measured else {},
     )
-
-
-def _tracking(d: Demonstration, off: Mapping[str, Array]) -> dict[str, tuple[float, float]]:
-    columns = np.abs(np.column_stack([off[JOINTS], off[OPENING]])).T
-    names = (*d.info.simulated.robot.arm_joints, "gripper")
-    return {name: (float(np.median(column)), float(column.max())) for name, column in zip(names, columns, strict=True)}
 
 
 def _other_condition(now: Sequence[SuccessCheck], recorded: Sequence[SuccessCheck]) -> str:
@@ -207,69 +186,80 @@ def is_as_recorded(report: ReplayReport, *, tolerance: float = 0.0) -> bool:
 
     Args:
         report: Report of the replay.
-        tolerance: Maximum difference (m, rad) of equal states; for a real arm's data, 0 means unlimited.
+        tolerance: Maximum difference (m, rad) of equal states.
     """
-    if report.tracking and tolerance:
-        return max(report.joint_error, report.gripper_error) <= tolerance
     if not report.is_bitwise:
         return report.is_outcome_as_recorded
-    errors = report.joint_error, report.gripper_error, report.object_error
+    errors = report.joint_error, report.gripper_error, report.object_error or 0.0
     return report.is_outcome_as_recorded and (report.is_identical or 0.0 < max(errors) <= tolerance)
 
 
 def replay_all(
-    demonstrations: Iterable[Demonstration], options: ReplayOptions, *, out: Path | None = None, overwrite: bool = False
-) -> Iterator[tuple[ReplayReport, tuple[Path, Path] | None]]:
+    demonstrations: Iterable[Demonstration],
+    allowed: Sequence[str] = (),
+    *,
+    out: Path | None = None,
+    overwrite: bool = False,
+) -> Iterator[ReplayReport]:
     """Replay in sequence, in one world as long as robot and rate stay the same.
 
     Args:
         demonstrations: Demonstrations to replay.
-        options: Options of the replay.
+        allowed: The user's own modules that may be imported for them.
         out: Folder for recordings of the replays, under the same names and with images of the recorded cameras; one
             that the same call has already made stays. None records nothing.
         overwrite: Whether recordings there may be replaced.
 
-    Yields:
-        The report, and (recording, recording of its replay) if one was made.
-
     Raises:
-        NotAllowedError: A demonstration's task is in a module that `options` do not allow.
+        NotAllowedError: A demonstration's task is in a module that is not allowed.
         ConfigError: A new recording would replace its own source, or a file with that name exists already.
     """
-    allow_models(options.allowed)
+    allow_models(allowed)
     with closing(SimulatorCache()) as simulators:
         for d in demonstrations:
-            if not d.is_measured:
-                TASKS.check_name(d.info.simulated.task, options.allowed)  # before anything is created
-            if out is None:
-                yield _replay_blind(d, simulators, options), None
-                continue
-            path = out / (d.name if d.source is not None else f"{d.name}.mcap")
-            report = _record_replay(d, simulators, options, path, overwrite=overwrite)
-            yield report, None if d.source is None else (d.source, path)
+            TASKS.check_name(d.info.simulated.task, allowed)  # before anything is created
+            if out is not None:
+                path = out / (d.name if d.source is not None else f"{d.name}.mcap")
+                if d.source is not None and path.resolve() == d.source.resolve():
+                    raise ConfigError(f"The replay would replace its own source: choose another --out: {path.parent}")
+                make_folder(path.parent)
+                behaviour = view_behaviour(d.info, recorded_view(d.info))
+                info = with_simulation(replace(d.info, origin=f"replay of {d.digest[:16]}"), behaviour=behaviour)
+                if overwrite or finished_outcome(path, info) is None:
+                    yield record_replay(d, info, path, simulators, allowed, overwrite=overwrite)
+                    continue
+            blind = with_simulation(d.info, scene=replace(d.info.simulated.scene, cameras=()), config={})
+            world, _ = simulators.acquire(blind)
+            yield replay(d, world, allowed)[0]
 
 
-def _record_replay(
-    d: Demonstration, simulators: SimulatorCache, options: ReplayOptions, path: Path, *, overwrite: bool
+def record_replay(
+    demonstration: Demonstration,
+    info: EpisodeInfo,
+    path: Path,
+    simulators: SimulatorCache,
+    allowed: Sequence[str],
+    *,
+    overwrite: bool = False,
+    labelled: Callable[[Outcome], Outcome] = lambda outcome: outcome,
 ) -> ReplayReport:
-    if d.source is not None and path.resolve() == d.source.resolve():
-        raise ConfigError(f"The replay would replace its own source: choose another --out: {path.parent}")
-    make_folder(path.parent)
-    view = recorded_view(d.info)
-    behaviour = view_behaviour(d.info, view)
-    info = with_simulation(replace(d.info, origin=f"replay of {d.digest[:16]}"), behaviour=behaviour)
-    if not overwrite and finished_outcome(path, info) is not None:
-        return _replay_blind(d, simulators, options)
-    video = config_as(d.info.simulated.config.get("video", {}), VideoConfig)
+    """Replay into a new recording, with images of the recorded cameras.
+
+    Args:
+        demonstration: Demonstration to replay.
+        info: Description of the new recording.
+        path: File to create.
+        simulators: Provides world and renderer.
+        allowed: The user's own modules that may be imported for it.
+        overwrite: Whether `path` may be replaced.
+        labelled: Outcome of the replay -> the recorded one.
+    """
+    config = info.simulated.config
+    RENDERERS.check_name(str(config.get("renderer", "raster")))
     world, renderer = simulators.acquire(info)
-    painter = view_painter(renderer, view, d.info.simulated.config) if renderer else None
+    painter = None if renderer is None else view_painter(renderer, recorded_view(info), config)
+    video = config_as(config.get("video", {}), VideoConfig)
     with EpisodeWriter(path, info, video=video, overwrite=overwrite) as writer:
-        report, outcome = replay(d, world, options, painter=painter, sink=writer.write)
-        writer.finish(outcome)
+        report, outcome = replay(demonstration, world, allowed, painter=painter, sink=writer.write)
+        writer.finish(labelled(outcome))
     return report
-
-
-def _replay_blind(d: Demonstration, simulators: SimulatorCache, options: ReplayOptions) -> ReplayReport:
-    """Replay without images."""
-    world, _ = simulators.acquire(with_simulation(d.info, scene=replace(d.info.simulated.scene, cameras=()), config={}))
-    return replay(d, world, options)[0]
