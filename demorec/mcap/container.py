@@ -19,7 +19,6 @@ from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Foote
 from demorec.core.errors import RecordingError, ResourceError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular
 from demorec.mcap.scan import (
-    MESSAGE_HEAD,
     NO_SCHEMA,
     RECORD_HEAD,
     Block,
@@ -176,15 +175,11 @@ class Container:
             return bytes(read_record(content, Attachment).data)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
-        """Yield (topic, time in ns, bytes) of the messages of some topics in the order of the file."""
-        wanted = {channel: topic for topic, channel in self._ids(topics).items()}
-        with damage_as_recording_error(self.path):
-            for content in self._unpacked(self._chunks_of(wanted)):
-                for opcode, start, end in records_in(content):
-                    if opcode == Opcode.MESSAGE:
-                        channel, _, time_ns, _ = MESSAGE_HEAD.unpack_from(content, start)
-                        if channel in wanted:
-                            yield wanted[channel], time_ns, content[start + MESSAGE_HEAD.size : end]
+        """Yield (topic, time in ns, bytes) of the messages of some topics; those of one topic in order."""
+        for blocks in self.blocks_by_chunk(topics):
+            for topic, block in blocks.items():
+                for time_ns, data in zip(block.time_ns.tolist(), block.messages(), strict=True):
+                    yield topic, time_ns, data
 
     def blocks_by_chunk(self, topics: Collection[str], *, num_bytes: int = 0) -> Iterator[dict[str, Block]]:
         """Yield topic -> its messages in one or a few chunks at a time, up to `num_bytes` unpacked.

@@ -53,11 +53,6 @@ def encode_millimetres(millimetres: NDArray[np.uint16]) -> bytes:
     return _RVL_HEAD.pack(0, 0.0, 0.0, width, height) + words[:count].astype("<u4").tobytes()
 
 
-def decode_depth(data: bytes, size: tuple[int, int]) -> NDArray[np.float32]:
-    """Decode `encode_depth`, to half a millimetre; ValueError unless it is an RVL image of that (height, width)."""
-    return np.asarray(decode_millimetres(data, size) / np.float32(1000), dtype=np.float32)
-
-
 def decode_millimetres(data: bytes, size: tuple[int, int]) -> NDArray[np.uint16]:
     """Decode `encode_millimetres`; ValueError unless it is an RVL image of that (height, width)."""
     from demorec.mcap import kernels
@@ -126,11 +121,6 @@ def encode_labels(segmentation: NDArray[np.int32]) -> bytes:
     return buffer.getvalue()
 
 
-def decode_labels(data: bytes, size: tuple[int, int]) -> NDArray[np.int32]:
-    """Decode `encode_labels`; ValueError unless the bytes are such a file of that (height, width)."""
-    return LabelDecoder(size).decode(data)
-
-
 class LabelDecoder:
     """Decoder of the segmentation images, all of size (height, width), of one camera.
 
@@ -146,7 +136,7 @@ class LabelDecoder:
         self._decoder.options = {"err_detect": "crccheck+explode", "max_pixels": str(most)}
 
     def decode(self, data: bytes) -> NDArray[np.int32]:
-        """Decode one image; see `decode_labels`."""
+        """Decode `encode_labels`; ValueError unless the bytes are such a file of that size."""
         packet = av.Packet(data)
         packet.is_keyframe = True  # otherwise FFmpeg treats it as a difference to the previous image
         try:

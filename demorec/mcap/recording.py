@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import json
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
 from itertools import islice, repeat
@@ -14,28 +15,32 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import RecordingError
+from demorec.core.errors import RecordingError, without_path
+from demorec.core.files import Closing
 from demorec.core.plain import to_json
 from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointSample, Table, Trajectory
-from demorec.episode.info import NOT_SIMULATED
+from demorec.episode.info import DEPTH_UNITS, NOT_SIMULATED, EpisodeInfo
 from demorec.episode.protocol import Box, SceneMotion
-from demorec.episode.simulated import simulated_table
-from demorec.mcap import channels, messages
-from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.episode_file import EpisodeFile
-from demorec.mcap.episode_layout import TimedMessages
+from demorec.episode.simulated import description_of, has_failed, simulated_table
+from demorec.episode.validity import find_problems
+from demorec.mcap import channels, messages, metadata
+from demorec.mcap.columns import TimedMessages, read_columns
+from demorec.mcap.container import Container, damage_as_recording_error
 from demorec.mcap.frames import frames_of, pandas_table, pose_of, summary_line
-from demorec.mcap.lossless import LabelDecoder, from_labels
+from demorec.mcap.images import PixelCounter, PixelStatistics, read_pixel_statistics
+from demorec.mcap.lossless import LabelDecoder, decode_distances, from_labels
+from demorec.mcap.metadata import CameraStreams
 from demorec.mcap.scan import Block
+from demorec.mcap.streams import frame_streams, frame_times, frame_topic
 from demorec.mcap.transforms import measured_motion
-from demorec.mcap.video import Rgb, is_keyframe
+from demorec.mcap.video import Rgb, VideoPacket, VideoSettings, decode, is_keyframe
 from demorec.robots.urdf import check_primitives
 
 if TYPE_CHECKING:
     import pandas as pd
 
 
-class Recording(EpisodeFile):
+class Recording(Closing):
     """Context manager over one recording, and the sequence of its frames; one chunk is in memory at a time.
 
     `for frame in recording` yields numbers and images together; `recording[120]` and `recording[-1]` select a frame;
@@ -46,12 +51,208 @@ class Recording(EpisodeFile):
         path: Path of the file.
         info: Description of the episode.
         outcome: Outcome of the episode; None if a crash cut it off.
+        streams: Streams with one message per frame.
         num_frames: Number of frames.
         is_recovered: Whether a crash cut it off.
 
     Raises:
         RecordingError: Not a recording, cut off, damaged, or of another format version; raised by all methods.
     """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(path)
+        self._container = Container(self.path)
+        try:
+            self._read_metadata()
+        except BaseException as error:
+            self.close()
+            if isinstance(error, RecordingError):
+                raise RecordingError(f"{without_path(error, self.path)}: {self.path}") from error
+            raise
+
+    def close(self) -> None:
+        """Close the file; safe to call twice."""
+        self._container.close()
+
+    def _read_metadata(self) -> None:
+        """Read everything that is known without reading the numbers."""
+        found = self._container.metadata(metadata.EPISODE)
+        if found is None:
+            raise RecordingError("The MCAP file is not a demorec recording, since it lacks episode metadata")
+        self.info, cameras, urdf_sha256 = metadata.read_episode_metadata(found)
+        self._cameras = {camera.name: cameras[camera.name] for camera in self.info.cameras if camera.name in cameras}
+        self.streams = frame_streams(self.info)
+        self._read_end()
+        if self.num_frames and len(self._cameras) != len(self.info.cameras):
+            raise RecordingError("The recording has frames, but no camera of its scene was recorded")
+        if urdf_sha256:
+            self.info = self._with_urdf(urdf_sha256)
+
+    def _read_end(self) -> None:
+        outcome, recovered = self._container.metadata(metadata.OUTCOME), self._container.metadata(metadata.RECOVERED)
+        self.outcome = None if outcome is None else metadata.read_outcome_metadata(outcome)
+        self.num_frames = self._container.counts.get(frame_topic(self.info), 0)
+        self.is_recovered = recovered is not None
+        if recovered is not None:
+            metadata.check_seal(metadata.RECOVERED, recovered)
+        if self.outcome is None and not self.is_recovered:
+            raise RecordingError("The recording was never finished; recover its complete frames with demorec recover")
+        if self.outcome is not None and self.outcome.num_frames != self.num_frames:
+            raise RecordingError(
+                f"The recording has {self.num_frames} frames, but its outcome states {self.outcome.num_frames}"
+            )
+
+    def _with_urdf(self, sha256: str) -> EpisodeInfo:
+        urdf = ""
+        for _, text in self._read(channels.description_topic(), messages.read_string):
+            urdf = text  # the last one applies
+        if metadata.urdf_sha256(urdf) != sha256:
+            raise RecordingError("The URDF of the recording is not the one in its metadata")
+        described = replace(self.info, urdf=urdf)
+        if wrong := find_problems(described):
+            raise RecordingError(f"The URDF of the recording does not fit its metadata ({wrong[0]})")
+        return described
+
+    @property
+    def cameras(self) -> tuple[str, ...]:
+        """Names of the recorded colour cameras."""
+        return tuple(name for name, streams in self._cameras.items() if streams.video.codec not in DEPTH_UNITS)
+
+    @property
+    def depth_cameras(self) -> tuple[str, ...]:
+        """Names of the recorded cameras that measure distances, with or without colour."""
+        return tuple(name for name, streams in self._cameras.items() if streams.depth)
+
+    def _camera(self, name: str) -> CameraStreams:
+        if name not in self._cameras:
+            raise RecordingError(
+                f"The recording has no camera {name!r}; its cameras are {', '.join(self._cameras) or 'none'}: "
+                f"{self.path}"
+            )
+        return self._cameras[name]
+
+    def video_settings(self, camera: str) -> VideoSettings:
+        """Return the encoding settings of a camera's images."""
+        return self._camera(camera).video
+
+    def has_depth(self, camera: str) -> bool:
+        """Check whether distances were recorded for a camera, with or without colour."""
+        return self._camera(camera).depth
+
+    def has_segmentation(self, camera: str) -> bool:
+        """Check whether segmentation images were recorded for a camera."""
+        return self._camera(camera).segmentation
+
+    def _size(self, camera: str) -> tuple[int, int]:
+        settings = self.video_settings(camera)
+        return settings.height, settings.width
+
+    @property
+    def has_failed(self) -> bool:
+        """Whether the outcome is a failure, or a crash cut off a simulated episode."""
+        return has_failed(self.info, self.outcome)
+
+    @property
+    def success(self) -> bool | None:
+        """Success of its attempt; None if unknown."""
+        return False if self.has_failed else None if self.outcome is None else self.outcome.success
+
+    @property
+    def topics(self) -> dict[str, tuple[str, int]]:
+        """topic -> (type, number of messages), sorted by topic."""
+        container = self._container
+        return {
+            topic: (container.schemas[container.channels[topic].schema_id].name, container.counts[topic])
+            for topic in sorted(container.channels)
+        }
+
+    def _read[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """Yield (time_ns, value) of the messages of a topic, in order."""
+        with damage_as_recording_error(self.path):
+            for _, time_ns, data in self._container.messages((topic,)):
+                yield time_ns, read(data)
+
+    def packets(self, camera: str) -> Iterator[VideoPacket]:
+        """Yield the encoded images of a camera, in order; `frame_index` is the image number that frames refer to."""
+        codec = self.video_settings(camera).codec
+        images = self._read_images(self._image_topic(camera), messages.packet_reader(codec))
+        for number, (time_ns, data) in enumerate(images):
+            yield VideoPacket(frame_index=number, time_ns=time_ns, data=data, is_keyframe=is_keyframe(codec, data))
+
+    def _due_ns(self) -> NDArray[np.int64] | None:
+        """Compute (T,) due times of all images of a simulation; elsewhere the cameras decide."""
+        return None if self.info.simulation is None else frame_times(self.num_frames, self.info.fps)
+
+    def _read_images[V](self, topic: str, read: Callable[[bytes], V]) -> Iterator[tuple[int, V]]:
+        """Read as `_read`, for a topic of images; RecordingError unless they are at their due times."""
+        due_ns = self._due_ns()
+        due = None if due_ns is None else iter(due_ns)
+        for time_ns, image in self._read(topic, read):
+            if due is not None and time_ns != next(due, None):
+                raise self._wrong_times(topic)
+            yield time_ns, image
+        if due is not None and next(due, None) is not None:
+            raise self._wrong_times(topic)
+
+    def _wrong_times(self, topic: str) -> RecordingError:
+        return RecordingError(f"The recording's images on {topic} do not match the times of the frames: {self.path}")
+
+    def images(self, camera: str) -> Iterator[Rgb]:
+        """Yield the decoded images of a camera, (H, W, 3) uint8 RGB, in order; RecordingError for a depth camera."""
+        if self.video_settings(camera).codec in DEPTH_UNITS:
+            raise RecordingError(f"The camera {camera!r} measures distances, not colours: {self.path}")
+        return decode(self.video_settings(camera), self.packets(camera))
+
+    def distances(self, camera: str) -> Iterator[NDArray[np.uint16] | NDArray[np.float32]]:
+        """Yield distances in order, as recorded: (H, W) uint16 millimetres or float32 metres."""
+        codec, size = self._distance_codec(camera), self._size(camera)
+        topic, read = channels.video_topic(camera, codec), messages.packet_reader(codec)
+        images = self._read_images(topic, lambda data: decode_distances(codec, read(data), size))
+        return (distances for _, distances in images)
+
+    def depth(self, camera: str) -> Iterator[NDArray[np.float32]]:
+        """Yield distances in metres, (H, W) float32; in simulations in steps of a millimetre, 0 for the background."""
+        unit = np.float32(DEPTH_UNITS[self._distance_codec(camera)])
+        for values in self.distances(camera):
+            yield values.astype(np.float32) / unit
+
+    def _distance_codec(self, camera: str) -> str:
+        if not self.has_depth(camera):
+            raise RecordingError(f"The recording has no depth images of the camera {camera!r}: {self.path}")
+        codec = self.video_settings(camera).codec
+        return codec if codec in DEPTH_UNITS else "16UC1"
+
+    def numbered_image(self, camera: str, number: int) -> Rgb:
+        """Decode one image of a camera, (H, W, 3) uint8 RGB, by its number."""
+        return next(self._images(camera, [number]))
+
+    def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
+        """Yield some decoded images, in increasing order, each decoded from the preceding keyframe on.
+
+        They are read in one pass; only the packets since the last keyframe are in memory.
+        """
+        waiting, group = list(numbers), list[VideoPacket]()
+        for number, packet in enumerate(self.packets(camera)):
+            if not waiting:
+                return
+            if packet.is_keyframe:
+                group.clear()
+            group.append(packet)
+            if number == waiting[0]:
+                *_, image = decode(self.video_settings(camera), group)
+                while waiting and waiting[0] == number:
+                    yield image
+                    waiting.pop(0)
+
+    def pixel_statistics(self, camera: str) -> PixelStatistics:
+        """Return histograms of a camera's images: the recorded ones, or counted now."""
+        self.video_settings(camera)
+        for _, statistics in self._read(channels.camera_topic(camera, "histogram"), read_pixel_statistics):
+            return statistics
+        counter = PixelCounter()
+        for image in self.images(camera):
+            counter.add(image)
+        return counter.statistics()
 
     def table(self) -> Table:
         """Read the features of every frame, and which images the frames show."""
@@ -89,7 +290,7 @@ class Recording(EpisodeFile):
     def _numbers_and_events(self) -> tuple[Table | Trajectory, TimedMessages]:
         topics = {name: self._image_topic(name) for name in self._cameras}
         with damage_as_recording_error(self.path):
-            return self._layout.read(self._container, self.num_frames, topics)
+            return read_columns(self._container, self.info, self.streams, self._due_ns(), topics)
 
     @cached_property
     def subtasks(self) -> tuple[tuple[int, str], ...]:
@@ -150,7 +351,7 @@ class Recording(EpisodeFile):
         """Read camera -> all its encoded images in one pass; they are in memory together."""
         topics = {camera: self._image_topic(camera) for camera in cameras}
         (found,) = self._container.blocks_by_chunk(tuple(topics.values()), num_bytes=sys.maxsize)
-        images, due_ns = {}, self._layout.due_ns(self.num_frames)
+        images, due_ns = {}, self._due_ns()
         for camera, topic in topics.items():
             if due_ns is not None and not np.array_equal(found[topic].time_ns, due_ns):
                 raise self._wrong_times(topic)
@@ -274,8 +475,9 @@ class Recording(EpisodeFile):
         File layout and software versions are excluded: two recordings with the same digest contain the same episode,
         bit-exact.
         """
-        result, numbers = self._digest_of_description(), self._numbers
-        for name, data in _content(numbers):
+        result = hashlib.sha256(json.dumps(description_of(self.info), sort_keys=True).encode())
+        result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
+        for name, data in _content(self._numbers):
             result.update(name.encode() + data)
         for frame, text in self.subtasks:
             result.update(f"subtask {frame} {text}".encode())

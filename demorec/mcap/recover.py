@@ -7,7 +7,7 @@ is truncated or damaged; the frames present in all streams up to there are kept.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -16,14 +16,16 @@ from mcap.records import Metadata
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error, without_path
 from demorec.core.files import MCAP_MAGIC, make_folder, open_regular
-from demorec.episode.info import Origin
+from demorec.episode.episode import frame_time_ns
+from demorec.episode.info import EpisodeInfo, Origin
 from demorec.mcap import messages, metadata
+from demorec.mcap.channels import TF, camera_topic, video_topic
 from demorec.mcap.container import damage_as_recording_error
-from demorec.mcap.episode_layout import EpisodeLayout
 from demorec.mcap.part_file import PartFile
 from demorec.mcap.recording import Recording, open_recording
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.mcap.scan import CutOffError, ScannedMessage, scan
+from demorec.mcap.streams import frame_streams
 
 _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
@@ -156,7 +158,7 @@ def _survey(source: Path) -> _Survey:
     if metadata.EPISODE in found:
         episode, outcome = found[metadata.EPISODE], found.get(metadata.OUTCOME)
         info, cameras, _ = metadata.read_episode_metadata(episode)
-        num_frames, keeps = EpisodeLayout(info).whole_frames(counts, cameras)
+        num_frames, keeps = _whole_frames(info, counts, cameras)
         if outcome is not None and metadata.read_outcome_metadata(outcome).num_frames != num_frames:
             outcome = None
         reason = "" if outcome is not None else reason or "the end is missing"
@@ -165,3 +167,20 @@ def _survey(source: Path) -> _Survey:
     raise RecordingError(
         f"Nothing can be recovered, since the file has no complete frame ({reason or 'no episode metadata'})"
     )
+
+
+def _whole_frames(
+    info: EpisodeInfo, counts: Counter[str], cameras: Mapping[str, metadata.CameraStreams]
+) -> tuple[int, Callable[[ScannedMessage, int], bool]]:
+    """Find the number of frames present in all streams, images included, and which messages belong to them."""
+    topics = {stream.topic for stream in frame_streams(info) if not stream.is_dense}
+    if info.simulation is None:  # images precede their frames
+        num_frames = min(counts[topic] for topic in topics)
+        topics.add(TF)
+        return num_frames, lambda message, count: message.channel.topic not in topics or count <= num_frames
+    for camera, streams in cameras.items():
+        topics.add(video_topic(camera, streams.video.codec))
+        topics |= {camera_topic(camera, kind) for kind in ("depth", "segmentation") if getattr(streams, kind)}
+    num_frames = min(counts[topic] for topic in topics)
+    last_ns = frame_time_ns(max(num_frames - 1, 0), info.fps)
+    return num_frames, lambda message, count: message.log_ns <= last_ns

@@ -89,6 +89,11 @@ def frame_streams(info: EpisodeInfo) -> tuple[FrameStream, ...]:
     return (*map(_feature, info.features), _frames(info))
 
 
+def frame_topic(info: EpisodeInfo) -> str:
+    """Return the topic with exactly one message at each frame."""
+    return FRAMES if info.simulation is None else GRIPPER
+
+
 def frame_times(num_frames: int, fps: int) -> NDArray[np.int64]:
     """Compute (T,) `frame_time_ns` of every frame."""
     return (np.arange(num_frames, dtype=np.int64) * 2_000_000_000 + fps) // (2 * fps)

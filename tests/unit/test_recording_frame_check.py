@@ -18,8 +18,6 @@ from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter
 
-NAN = float("nan")
-
 
 def observed(frame: Frame, **changes: Any) -> Frame:
     return replace(frame, observation=replace(frame.observation, **changes))
@@ -30,13 +28,7 @@ def moved(frame: Frame, **changes: Any) -> Frame:
 
 
 def with_nan(values: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    spoilt = values.copy()
-    spoilt[-1] = NAN
-    return spoilt
-
-
-def pose_of_nan(pose: Pose) -> Pose:
-    return Pose(position=with_nan(pose.position), quat_xyzw=pose.quat_xyzw)
+    return np.append(values[:-1], np.nan)
 
 
 FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
@@ -48,7 +40,6 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: replace(f, joint_samples=(replace(f.joint_samples[0], joint_velocity=np.zeros(3)),)),
         "21 numbers for /joint_states, it must have 27",
     ),
-    "no objects": (lambda f: observed(f, object_poses={}), "poses of the objects none, the scene has cube"),
     "an unknown object": (
         lambda f: observed(f, object_poses={**f.observation.object_poses, "ball": Pose()}),
         "poses of the objects ball, cube, the scene has cube",
@@ -61,18 +52,6 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: observed(f, sensed={}),
         "numbers of the sensors none, the scene has wrench",
     ),
-    "a NaN in the wrench": (
-        lambda f: observed(f, sensed={**f.observation.sensed, "wrench": with_nan(f.observation.sensed["wrench"])}),
-        "a number for /wrench that is not finite",
-    ),
-    "a NaN in a pose": (
-        lambda f: observed(f, base_from_tcp=pose_of_nan(f.observation.base_from_tcp)),
-        "a number for /ee_pose that is not finite",
-    ),
-    "a NaN in an object's pose": (
-        lambda f: observed(f, object_poses={n: pose_of_nan(p) for n, p in f.observation.object_poses.items()}),
-        "a number for /object/cube/pose that is not finite",
-    ),
     "a NaN in a command": (
         lambda f: moved(f, joint_target=with_nan(f.command.joint_target)),
         "a number for /command that is not finite",
@@ -83,12 +62,6 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
             joint_samples=(replace(f.joint_samples[0], joint_effort=with_nan(f.joint_samples[0].joint_effort)),),
         ),
         "a number for /joint_states that is not finite",
-    ),
-    "a NaN in a camera's pose": (
-        lambda f: replace(
-            f, images={n: replace(i, world_from_camera=pose_of_nan(i.world_from_camera)) for n, i in f.images.items()}
-        ),
-        "a number for /camera/front/pose that is not finite",
     ),
 }
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.present import present
 from support.recording import frame_number, make_episode, write_episode
 
 from demorec.core.config import VideoConfig
@@ -97,28 +96,6 @@ def test_images(tmp_path: Path, video: VideoConfig) -> None:
                 assert errors[0] < errors[1]
             settings = recording.video_settings(camera)
             assert (settings.codec, settings.width, settings.height, settings.fps) == (video.codec, 64, 48, 30)
-
-
-def test_depth_and_segmentation(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=33, depth=True, segmentation=True)
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
-        assert recording.has_depth("front")
-        assert recording.has_segmentation("wrist")
-        for camera in recording.cameras:
-            for frame, depth in zip(frames, recording.depth(camera), strict=True):
-                original = frame.images[camera].depth
-                assert original is not None
-                assert depth.dtype == np.float32
-                assert np.array_equal(depth == 0, original == 0)
-                assert np.abs(depth - original).max() <= 0.000501
-            for frame, labels in zip(frames, recording.segmentation(camera), strict=True):
-                assert labels.dtype == np.int32
-                assert np.array_equal(labels, present(frame.images[camera].segmentation))
-        names = recording.segment_names()
-    assert names[-1] == "background"
-    assert (names[0], names[1], names[3]) == ("table", "target", "cube")  # fixed bodies, the robot, movable objects
-    assert names[2 + (1 << 24)] == "panda/panda_link1"
 
 
 def test_missing_depth_is_an_error(tmp_path: Path) -> None:

@@ -84,46 +84,6 @@ def test_a_size_that_differs_from_the_settings() -> None:
         list(decode(encoder.settings, [packet]))
 
 
-def test_packets_do_not_depend_on_the_instructions_of_the_cpu() -> None:
-    """x264 without vector instructions encodes the same bits as with all of this machine's."""
-    from fractions import Fraction
-
-    import av
-
-    encoder = make_encoder(video=VideoConfig(), width=224, height=224, fps=30)
-    times, rows, columns = np.mgrid[0:12, 0:224, 0:224].astype(np.float64)
-    waves = 128 + 100 * np.sin(rows / 9 + times / 3) * np.cos(columns / 13 - times / 5)
-    images = np.stack([waves, np.roll(waves, 40, axis=2), 255 - waves], axis=-1).astype(np.uint8)
-    packets = [bytes(p) for image in images for p in encoder.encode(image)]
-    packets += [bytes(p) for p in encoder.finish()]
-
-    def plain(parameters: str) -> list[bytes]:
-        context = av.CodecContext.create(encoder.settings.encoder, "w")
-        assert isinstance(context, av.VideoCodecContext)
-        context.width, context.height, context.pix_fmt = 224, 224, "yuv420p"
-        context.time_base, context.framerate, context.gop_size = Fraction(1, 30), Fraction(30, 1), encoder.settings.gop
-        context.color_range, context.color_primaries, context.color_trc, context.colorspace = 1, 1, 13, 6
-        context.thread_count = 1
-        settings = encoder.settings
-        context.options = {
-            "g": str(settings.gop),
-            "crf": str(settings.crf),
-            "preset": settings.preset,
-            **settings.options,
-            "x264-params": parameters,
-        }
-        found = []
-        for index, image in enumerate(images):
-            frame = av.VideoFrame.from_ndarray(image, format="rgb24")
-            frame.pts, frame.time_base = index, context.time_base
-            found += [bytes(p) for p in context.encode(frame)]
-        return found + [bytes(p) for p in context.encode(None)]
-
-    assert plain("cpu-independent=1:asm=0") == packets
-    assert plain("asm=0") != plain(""), "these images prove nothing"
-    assert len(packets) == len(images)
-
-
 @pytest.mark.parametrize(("codec", "decoder"), [("h264", "h264"), ("av1", "libdav1d")])
 def test_a_stream_specifies_its_colour_space(codec: Codec, decoder: str) -> None:
     """Its luma and chroma give the image back by the matrix and range in its metadata."""

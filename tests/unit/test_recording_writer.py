@@ -27,15 +27,6 @@ def write_all(writer: EpisodeWriter, frames: list[Frame], outcome: Outcome | Non
         writer.finish(outcome)
 
 
-def test_an_unfinished_recording_is_not_overwritten(tmp_path: Path) -> None:
-    part = tmp_path / "a.mcap.part"
-    part.write_bytes(b"what a crash left")
-    info, _, _ = make_episode(num_frames=1)
-    with pytest.raises(ConfigError, match="unfinished"):
-        EpisodeWriter(tmp_path / "a.mcap", info)
-    assert part.read_bytes() == b"what a crash left"
-
-
 def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> None:
     info, frames, outcome = make_episode(num_frames=3)
     path = tmp_path / "a.mcap"
@@ -50,16 +41,6 @@ def test_a_file_that_appears_meanwhile_is_not_overwritten(tmp_path: Path) -> Non
         assert recording.outcome == outcome
 
 
-def test_the_file_gets_its_name_when_it_is_complete(tmp_path: Path) -> None:
-    info, frames, outcome = make_episode(num_frames=3)
-    path = tmp_path / "a.mcap"
-    with EpisodeWriter(path, info) as writer:
-        write_all(writer, frames)
-        assert names(tmp_path) == ["a.mcap.part"]
-        assert writer.finish(outcome) == path
-    assert names(tmp_path) == ["a.mcap"]
-
-
 def test_frames_come_in_order(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=3, cameras=())
     with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
@@ -72,11 +53,7 @@ def test_frames_come_in_order(tmp_path: Path) -> None:
 
 def test_images_are_complete(tmp_path: Path) -> None:
     info, frames, _ = make_episode(num_frames=2, depth=True)
-    with EpisodeWriter(tmp_path / "a.mcap", info) as writer:
-        writer.write(frames[0])
-        wrist = frames[1].images["wrist"]
-        with pytest.raises(RecordingError, match="images of the cameras front, the scene has front, wrist"):
-            writer.write(replace(frames[1], images={"front": frames[1].images["front"]}))
+    wrist = frames[1].images["wrist"]
     with EpisodeWriter(tmp_path / "b.mcap", info) as writer:
         writer.write(frames[0])
         with pytest.raises(RecordingError, match="depth image of the camera 'wrist' at frame 1 is missing"):
@@ -130,7 +107,7 @@ def test_the_same_rendering_replaces_the_rest_of_a_killed_one(tmp_path: Path) ->
     assert Recording(tmp_path / "a.mcap").num_frames == 5
 
 
-@pytest.mark.parametrize(("left", "new"), [("", ""), ("", "render of 0123"), ("render of 4567", "render of 0123")])
+@pytest.mark.parametrize(("left", "new"), [("", ""), ("render of 4567", "render of 0123")])
 def test_irreproducible_leftovers_stay(tmp_path: Path, left: str, new: str) -> None:
     before = leftover(tmp_path, left)
     info, _, _ = make_episode(num_frames=5, cameras=())
