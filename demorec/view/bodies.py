@@ -5,31 +5,32 @@ from __future__ import annotations
 import functools
 import logging
 from collections.abc import Mapping
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
-import trimesh
 from numpy.typing import NDArray
 
 from demorec.core.errors import DemorecError, as_reason
 from demorec.core.files import read_text_limited
 from demorec.core.geometry import Array
-from demorec.episode.scene import Body, Rgba, Scene, Shape, Texture
+from demorec.episode.scene import Body, Scene, Shape, Texture
 from demorec.mcap.transforms import MovingJoints
 from demorec.render.procedural import texture_pixels
+from demorec.render.raster.mesh import RasterMesh
 from demorec.robots.assets import asset_path, known_model, surface_file
 from demorec.robots.urdf import MAX_BYTES, Urdf
 from demorec.view.episode import Playback
-from demorec.view.meshes import SurfaceMesh, joined, mesh_file, of_trimesh, skeleton_meshes, sphere_mesh, urdf_meshes
+from demorec.view.meshes import WHITE, as_mesh3d, joined, mesh_file, placed, primitive, urdf_meshes
 from demorec.view.paths import Paths, log_pose, send_poses
 from demorec.view.style import GOAL
 
 log = logging.getLogger(__name__)
 
-_OWN_COLOR: Rgba = (1.0, 1.0, 1.0, 1.0)
+_ROD_RADIUS = 0.015
+"""Radius, metres, of the rods in place of missing meshes."""
 _SAME_SIZE = 0.1
 """Maximum difference between a model's extents and those of the recorded scene, relative to the largest extent."""
 
@@ -58,35 +59,27 @@ def log_bodies(recording: rr.RecordingStream, episode: Playback, scene: Scene) -
 
 
 def _visible(body: Body, episode: Playback) -> rr.Mesh3D:
-    if body.shape.kind == "box" and body.texture is not None:
-        return _textured_box(np.array(body.shape.size), body.texture)
-    color = body.mean_color
-    if body.shape.kind not in ("mesh", "urdf"):
-        return _as_mesh3d(_primitive_mesh(body.shape).placed(rgba=color))
-    mesh = _installed_mesh(body.shape)
+    shape, color = body.shape, body.mean_color
+    if shape.kind == "box" and body.texture is not None:
+        return _textured_box(np.array(shape.size), body.texture)
+    if shape.kind not in ("mesh", "urdf"):
+        return as_mesh3d(placed(primitive(shape.kind, shape.size), rgba=color))
+    mesh = _installed_mesh(shape)
     if mesh is not None:
-        if color != _OWN_COLOR:  # replaces the model's own colours, as in the simulator
-            mesh = replace(mesh, colors=np.full_like(mesh.colors, 255))
-        return _as_mesh3d(mesh.placed(rgba=color))
+        if color != WHITE:  # replaces the model's own colours, as in the simulator
+            mesh = replace(mesh, colors=np.ones_like(mesh.colors))
+        return as_mesh3d(placed(mesh, rgba=color))
     if description := episode.data.description(body.name):  # already in the body's colours
-        return _as_mesh3d(joined(list(urdf_meshes(description, None).values())))
-    return _as_mesh3d(_unit_mesh("box").placed(None, body.shape.extents, color))
-
-
-def _primitive_mesh(shape: Shape) -> SurfaceMesh:
-    if shape.kind == "capsule":
-        capsule = trimesh.creation.capsule(radius=shape.size[0], height=shape.size[1], count=[32, 32])
-        capsule.apply_translation((0.0, 0.0, -capsule.bounds.mean(axis=0)[2]))
-        return of_trimesh(capsule)
-    return _unit_mesh(shape.kind).placed(None, shape.extents)
+        return as_mesh3d(joined(list(urdf_meshes(description, None).values())))
+    return as_mesh3d(placed(primitive("box", shape.extents), rgba=color))
 
 
 @functools.lru_cache(maxsize=64)
-def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
+def _installed_mesh(shape: Shape) -> RasterMesh | None:
     """Load the model file of a mesh or urdf in the body's frame; None, with a warning, if it is unusable."""
     try:
         mesh = _model_mesh(shape)
-        if np.abs(np.ptp(mesh.vertices, axis=0) - shape.extents).max() > _SAME_SIZE * max(shape.extents):
+        if np.abs(np.ptp(mesh.points, axis=0) - shape.extents).max() > _SAME_SIZE * max(shape.extents):
             raise ValueError(f"{shape.file} has another size")
     except (DemorecError, OSError, ValueError) as error:
         log.warning("An object is drawn as the recording describes it, since %s.", as_reason(error))
@@ -94,24 +87,14 @@ def _installed_mesh(shape: Shape) -> SurfaceMesh | None:
     return mesh
 
 
-def _model_mesh(shape: Shape) -> SurfaceMesh:
+def _model_mesh(shape: Shape) -> RasterMesh:
     if shape.kind == "mesh":
-        return mesh_file(surface_file(shape)).placed(shape.body_from_mesh, shape.scale)
+        return placed(mesh_file(surface_file(shape)), shape.body_from_mesh, shape.scale)
     path = asset_path(shape.file)
     text = path.read_text()
     poses = Urdf.parse(text, scale=shape.scale).link_poses({})
     links = urdf_meshes(text, path.parent, shape.scale)
-    return joined([mesh.placed(poses[link]) for link, mesh in links.items()])
-
-
-@functools.cache
-def _unit_mesh(kind: str) -> SurfaceMesh:
-    """Make a box, sphere or cylinder of extents 1; scaling it for each body is faster than shading it again."""
-    if kind == "box":
-        return of_trimesh(trimesh.creation.box(extents=(1.0, 1.0, 1.0)))
-    if kind == "sphere":
-        return sphere_mesh(0.5)
-    return of_trimesh(trimesh.creation.cylinder(radius=0.5, height=1.0, sections=48))
+    return joined([placed(mesh, poses[link]) for link, mesh in links.items()])
 
 
 def _textured_box(size: Array, texture: Texture) -> rr.Mesh3D:
@@ -144,16 +127,17 @@ def log_robot(recording: rr.RecordingStream, episode: Playback) -> None:
     Joints with unknown positions stay at 0; a robot without a description is not shown.
 
     Raises:
-        RecordingError: A mesh of the robot's model cannot be read.
+        DemorecError: A simulated robot's model is neither installed nor recorded.
     """
     info, positions = episode.info, episode.motion.joint_position
     description = info.urdf or episode.data.description()
     if episode.scene is not None:
-        urdf, meshes = robot_model(info.simulated.robot.urdf, episode.scene.robot.scale, description)
+        model = robot_model(info.simulated.robot.urdf, episode.scene.robot.scale, description)
     elif description:
-        urdf, meshes = _external_model(description)
+        model = robot_model("", 1.0, description)
     else:
         return
+    urdf = model.urdf
     entities = {urdf.root: f"{Paths.robot}/{urdf.root}"}
     for joint in urdf.depth_first():
         entities[joint.child] = f"{entities[joint.parent]}/{joint.child}"
@@ -164,68 +148,66 @@ def log_robot(recording: rr.RecordingStream, episode: Playback) -> None:
     poses = joints.values(np.array([*positions.values()]).reshape(len(positions), episode.num_frames).T)
     for number, (_, child) in enumerate(joints.moving):
         send_poses(recording, entities[child], episode.time_ns, poses[:, number])
-    for link, mesh in meshes.items():
-        recording.log(entities[link], _as_mesh3d(mesh), static=True)
+    for link, mesh in model.meshes.items():
+        recording.log(entities[link], mesh, static=True)
+    if not model.is_complete:
+        for parent in {joint.parent for joint in urdf.joints} - model.meshes.keys():
+            ends = [joint.parent_from_joint.position for joint in urdf.joints if joint.parent == parent]
+            rods = rr.LineStrips3D([[np.zeros(3), end] for end in ends], radii=_ROD_RADIUS)
+            recording.log(entities[parent], rods, static=True)
 
 
-def _as_mesh3d(mesh: SurfaceMesh) -> rr.Mesh3D:
-    return rr.Mesh3D(
-        vertex_positions=mesh.vertices,
-        vertex_normals=mesh.normals,
-        triangle_indices=mesh.triangles,
-        vertex_colors=mesh.colors,
-    )
+class _Model(NamedTuple):
+    """Joint tree and meshes of the links, of which some may be missing."""
 
-
-Model = tuple[Urdf, Mapping[str, SurfaceMesh]]
-"""Joint tree and meshes of the links."""
-
-
-def _external_model(text: str) -> Model:
-    """Load a robot that was not simulated, from the text's original file if that is known and has the same joints.
-
-    A link without a mesh is drawn as rods to its child joints.
-    """
-    urdf, path = Urdf.parse(text), known_model(text)
-    if path is not None:
-        with suppress(DemorecError, OSError, ValueError):  # changed or gone: the recording has its own description
-            return urdf, _original(path, 1.0, urdf)[1]
-    failures: list[DemorecError] = []
-    meshes = urdf_meshes(text, None, failures=failures)
-    if not failures:
-        return urdf, meshes
-    why = as_reason(failures[0])
-    log.warning("The robot is drawn as rods between its joints where its meshes are not found, since %s.", why)
-    return urdf, {**skeleton_meshes(urdf), **meshes}
+    urdf: Urdf
+    meshes: Mapping[str, rr.Mesh3D]
+    is_complete: bool = True
 
 
 @functools.lru_cache(maxsize=4)
-def robot_model(urdf: str, scale: float, description: str) -> Model:
-    """Load a simulated robot from the installed model, else from the recorded description.
+def robot_model(name: str, scale: float, description: str) -> _Model:
+    """Load a robot from the model that it was recorded with, else from the recorded description.
 
-    The installed model is used if it is complete and its joints are where the recording has them.
+    The model is used if it is complete and its joints are where the recording has them.
+
+    Args:
+        name: Name of a simulated robot's model, or "": the file that the description was made from, if it is known.
+        scale: Uniform scale of that model.
+        description: Recorded URDF, or "".
 
     Raises:
-        SceneError, MissingDependencyError, RecordingError: The model is not installed and the recording does not
-            describe it.
+        DemorecError: The model is not installed, and the recording does not describe it.
     """
     recorded = Urdf.parse(description) if description else None
     try:
-        return _original(asset_path(urdf), scale, recorded)
+        path = asset_path(name) if name else known_model(description)
+        if path is not None:
+            return _original(path, scale, recorded)
     except (DemorecError, OSError, ValueError) as error:
         if recorded is None:
             raise
-        log.warning("The robot is drawn as the boxes of the recording, since %s.", as_reason(error))
-    return recorded, urdf_meshes(description, None)
+        log.warning("The robot is drawn as the recording describes it, since %s.", as_reason(error))
+    assert recorded is not None
+    failures: list[DemorecError] = []
+    meshes = urdf_meshes(description, None, failures=failures)
+    if failures:
+        why = as_reason(failures[0])
+        log.warning("The robot is drawn as rods between its joints where its meshes are not found, since %s.", why)
+    return _Model(recorded, _drawable(meshes), not failures)
 
 
-def _original(path: Path, scale: float, recorded: Urdf | None) -> Model:
+def _original(path: Path, scale: float, recorded: Urdf | None) -> _Model:
     """Load the model that a description was made from; ValueError if its joints differ from the recorded ones."""
     text = read_text_limited(path, MAX_BYTES)
     urdf = Urdf.parse(text, scale=scale)
     if recorded is not None and not _same_joints(urdf, recorded):
         raise ValueError(f"the model installed here has other joints ({path.name})")
-    return urdf, urdf_meshes(text, path.parent, scale)
+    return _Model(urdf, _drawable(urdf_meshes(text, path.parent, scale)))
+
+
+def _drawable(meshes: Mapping[str, RasterMesh]) -> dict[str, rr.Mesh3D]:
+    return {link: as_mesh3d(mesh) for link, mesh in meshes.items()}
 
 
 def _same_joints(a: Urdf, b: Urdf) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,11 +27,9 @@ Statements = tuple[tuple[int, str, str], ...]
 """(frame, kind, sentence), each valid until the next one of its kind."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Curves:
-    """Several numbers over time: (T,) ns since the episode's start, (T, n) values, n names."""
+class Curves(NamedTuple):
+    """Several numbers over time: (T, n) values at the frames, n names."""
 
-    time_ns: NDArray[np.int64]
     values: Array
     names: tuple[str, ...]
 
@@ -79,8 +78,9 @@ class Playback:
 
     @cached_property
     def time_ns(self) -> NDArray[np.int64]:
-        """(T,) timestamps of the frames, since the first one."""
-        return times_from_start(self.data)
+        """(T,) timestamps of the frames, ns since the first one."""
+        times = self.data.time_ns
+        return times - times[0] if len(times) else times
 
     @cached_property
     def videos(self) -> tuple[str, ...]:
@@ -136,12 +136,6 @@ class Playback:
         return "success" if outcome.success else f"failure: {outcome.failure_reason or 'no reason given'}"
 
 
-def times_from_start(episode: Episode) -> NDArray[np.int64]:
-    """Compute (T,) ns since the first frame."""
-    times = episode.time_ns
-    return times - times[0] if len(times) else times
-
-
 def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[np.int64]:
     """Compute (P,) display times of a camera's images: at the first frame that shows each, or the next one after it.
 
@@ -156,12 +150,9 @@ def shown_at(table: Table, camera: str, time_ns: NDArray[np.int64]) -> NDArray[n
 
 def feature_curves(episode: Episode, roles: Roles) -> dict[str, Curves]:
     """List the elements of each feature, in the order of roles."""
-    features, time_ns = episode.table().features, times_from_start(episode)
+    features = episode.table().features
     ordered = sorted(episode.info.features, key=lambda feature: ROLES.index(roles.of[feature.name]))
-    return {
-        feature.name: Curves(time_ns=time_ns, values=features[feature.name].astype(np.float64), names=feature.names)
-        for feature in ordered
-    }
+    return {feature.name: Curves(features[feature.name].astype(np.float64), feature.names) for feature in ordered}
 
 
 def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool = True) -> dict[str, Curves]:
@@ -170,23 +161,23 @@ def simulated_curves(episode: Episode, motion: SceneMotion, *, has_targets: bool
     They are "position" and "velocity" of the arm's joints, "gripper" (m), "ee" (m) and those of its sensors, split by
     unit ("wrench (N)"); "gripper target" and, if its actions are joint targets, "target" are the commands.
     """
-    info, time_ns = episode.info, times_from_start(episode)
+    info = episode.info
     features = {name: values.astype(np.float64) for name, values in episode.table().features.items()}
     joints = info.simulated.robot.arm_joints
     count = len(joints)
-    shown: list[tuple[str, Array, tuple[str, ...]]] = [("position", features[STATE][:, :count], joints)]
+    shown = {"position": Curves(features[STATE][:, :count], joints)}
     if VELOCITY in features:
-        shown.append(("velocity", features[VELOCITY][:, :count], joints))
+        shown["velocity"] = Curves(features[VELOCITY][:, :count], joints)
     if has_targets:
-        shown.append(("target", features[ACTION][:, :count], joints))
+        shown["target"] = Curves(features[ACTION][:, :count], joints)
     for feature in on_request(info):
         for unit in dict.fromkeys(feature.units) if feature.name in features else ():
             columns = [number for number, other in enumerate(feature.units) if other == unit]
             title = f"{feature.name.removeprefix('observation.')} ({unit})"
             names = tuple(feature.names[number] for number in columns)
-            shown.append((title, features[feature.name][:, columns], names))
-    shown.append(("gripper", features[STATE][:, count : count + 1], ("opening",)))
-    shown.append(("gripper target", features[ACTION][:, -1:], ("target",)))
+            shown[title] = Curves(features[feature.name][:, columns], names)
+    shown["gripper"] = Curves(features[STATE][:, count : count + 1], ("opening",))
+    shown["gripper target"] = Curves(features[ACTION][:, -1:], ("target",))
     tcp = features[EE_POSE] if motion.base_from_tcp is None else motion.base_from_tcp
-    shown.append(("ee", tcp[:, :3], ("x", "y", "z")))
-    return {name: Curves(time_ns=time_ns, values=values, names=names) for name, values, names in shown}
+    shown["ee"] = Curves(tcp[:, :3], ("x", "y", "z"))
+    return shown

@@ -1,22 +1,18 @@
 """Episodes of exported datasets: numbers from the data files, the scene from demorec's own tables.
 
-A dataset without environment state has no object trajectories. It has every object's first and last pose, the gripper's
-pose and opening, and the gripper's target. So an object stays at its first pose until closing fingers stop around it,
-then moves with the hand, and takes its last pose when it is released for the last time. A push, a fall or a slip
-between the fingers is not in the data.
+A dataset without environment state has only the first and last pose of each object.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, describe_error, resource_error
 from demorec.core.geometry import Array, Pose
@@ -28,7 +24,6 @@ from demorec.episode.episode import Outcome, SuccessCheck
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, STATE_KINDS, state_names
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.protocol import SceneMotion
-from demorec.episode.scene import Scene
 from demorec.episode.validity import read_episode_info
 from demorec.robots.assets import asset_path
 from demorec.robots.kinematics import ArmKinematics
@@ -147,18 +142,13 @@ class _SimulatedEpisode(DatasetRecording):
             yield np.rint(metres * 1000).clip(0, 65535).astype(np.uint16)
 
     def motion(self) -> SceneMotion:
-        """Read the robot's motion; objects and cameras as in the dataset, or moved with the hand."""
+        """Read the motion of the robot and, if the dataset has it, of objects and cameras."""
         data = {name: values.astype(np.float64) for name, values in self.table().features.items()}
         state, count = data[STATE], len(self._spec.arm_joints)
         fingers = self._spec.gripper.joint_position(state[:, count])
         base_from_tcp = data[EE_POSE] if EE_POSE in data else self._tcp_poses(state)
         ends = {item["name"]: _pose_row(item["world_from_object_end"]) for item in self._row["objects"]}
-        if ENVIRONMENT_STATE in data:
-            poses = self._object_poses(data[ENVIRONMENT_STATE])
-        else:
-            opening, fps = state[:, count], int(self.dataset.info.fps)
-            scene = self.info.simulated.scene
-            poses = held_object_poses(scene, ends, base_from_tcp, opening, data[ACTION][:, -1], fps)
+        poses = self._object_poses(data[ENVIRONMENT_STATE]) if ENVIRONMENT_STATE in data else {}
         rows = self.dataset.sidecar_rows("camera_poses", self.place.episode_index)
         moving = [name for name in (rows[0] if rows else {}) if name not in ("episode_index", "frame_index")]
         return SceneMotion(
@@ -212,68 +202,3 @@ def _phases(row: dict[str, Any], num_frames: int) -> tuple[str, ...]:
             raise ValueError(f"a phase from frame {phase['from']} to {phase['to']} of {num_frames}")
         names[phase["from"] : phase["to"]] = [phase["name"]] * (phase["to"] - phase["from"])
     return tuple(names)
-
-
-_STOPPED_BEFORE_TARGET = 1e-3
-"""Minimum excess of the opening over its target, metres, that indicates a body between the fingers."""
-_STANDS_STILL = 0.015
-"""Maximum speed of the opening, m/s, of closing fingers stopped by a body."""
-_SNAPS_SHUT = 0.06
-"""Minimum speed of the opening, m/s, that indicates a lost body; at speeds in between, the body yields."""
-_WITHIN_REACH = 0.02
-"""Maximum distance of a held object's surface from the TCP, metres."""
-
-
-def held(opening: Array, target: Array, fps: int) -> NDArray[np.bool_]:
-    """Detect (T,) whether a body is between the fingers, from (T,) measured and target openings, metres."""
-    speed = fps * np.abs(np.diff(opening, prepend=opening[:1]))
-    result = np.zeros(len(opening), dtype=np.bool_)
-    is_held = False
-    for frame, is_stopped in enumerate(opening > target + _STOPPED_BEFORE_TARGET):
-        is_held = bool(is_stopped and speed[frame] < (_SNAPS_SHUT if is_held else _STANDS_STILL))
-        result[frame] = is_held
-    return result
-
-
-def held_object_poses(
-    scene: Scene, end_poses: Mapping[str, Array], base_from_tcp: Array, opening: Array, target: Array, fps: int
-) -> dict[str, Array]:
-    """Compute name -> (T, 7) world_from_object of every object with a known final pose.
-
-    Args:
-        scene: Scene at the start.
-        end_poses: Name -> (7,) world_from_object at the end.
-        base_from_tcp: (T, 7).
-        opening, target, fps: As in `held`.
-    """
-    base = scene.robot.world_from_base
-    present = {name: scene.body(name).world_from_body for name in end_poses}
-    poses: dict[str, Array] = {name: np.empty((len(base_from_tcp), 7)) for name in end_poses}
-    let_go: dict[str, int] = {}
-    name, tcp_from_object = "", Pose()
-    for frame, is_held in enumerate(held(opening, target, fps)):
-        tcp = base @ Pose(position=base_from_tcp[frame, :3], quat_xyzw=base_from_tcp[frame, 3:])
-        if is_held and not name:
-            name = _within_reach(scene, present, tcp)
-            if name:
-                tcp_from_object = tcp.inverse() @ present[name]
-        elif not is_held and name:
-            let_go[name], name = frame, ""
-        if name:
-            present[name] = tcp @ tcp_from_object
-        for other, pose in present.items():
-            poses[other][frame] = pose.vector()
-    for other, frame in let_go.items():
-        poses[other][frame:] = end_poses[other]
-    return poses
-
-
-def _within_reach(scene: Scene, present: Mapping[str, Pose], world_from_tcp: Pose) -> str:
-    """Find the object nearest to the TCP; "" if none is between the fingers."""
-
-    def distance(name: str) -> float:
-        centre = np.linalg.norm(present[name].position - world_from_tcp.position)
-        return float(centre) - max(scene.body(name).shape.extents) / 2
-
-    nearest = min(present, key=distance, default="")
-    return nearest if nearest and distance(nearest) < _WITHIN_REACH else ""

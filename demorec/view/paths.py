@@ -62,12 +62,12 @@ SECONDS = "time"
 FRAMES = "frame"
 
 
-def indexes(time_ns: NDArray[np.int64], frame_times: NDArray[np.int64] | None) -> list[rr.TimeColumn]:
-    """Build time columns of rows at `time_ns`, each the time of a frame; None for rows between frames."""
-    seconds = rr.TimeColumn(SECONDS, duration=time_ns.astype("timedelta64[ns]"))
-    if frame_times is None:
-        return [seconds]
-    return [seconds, rr.TimeColumn(FRAMES, sequence=np.searchsorted(frame_times, time_ns))]
+def indexes(time_ns: NDArray[np.int64], frame_times: NDArray[np.int64]) -> list[rr.TimeColumn]:
+    """Build time columns of rows at `time_ns`, each the time of a frame."""
+    return [
+        rr.TimeColumn(SECONDS, duration=time_ns.astype("timedelta64[ns]")),
+        rr.TimeColumn(FRAMES, sequence=np.searchsorted(frame_times, time_ns)),
+    ]
 
 
 def log_pose(recording: rr.RecordingStream, entity: str, pose: Array) -> None:

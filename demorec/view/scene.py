@@ -84,11 +84,9 @@ def _log_curves(recording: rr.RecordingStream, episode: Playback) -> None:
         colors = [_COLORS[name]] * count if name in _COLORS else series_colors(count)
         lines = rr.SeriesLines(names=names, colors=colors, widths=[_WIDTHS.get(name, 2.0)] * count)
         recording.log(entity, lines, static=True)
-        on_frame = np.isin(curves.time_ns, episode.time_ns)
-        for chosen, frame_times in ((on_frame, episode.time_ns), (~on_frame, None)):
-            if chosen.any():
-                columns = rr.Scalars.columns(scalars=curves.values[chosen])
-                recording.send_columns(entity, indexes(curves.time_ns[chosen], frame_times), columns)
+        if episode.num_frames:
+            columns = rr.Scalars.columns(scalars=curves.values)
+            recording.send_columns(entity, indexes(episode.time_ns, episode.time_ns), columns)
 
 
 def _log_phases(recording: rr.RecordingStream, episode: Playback) -> None:

@@ -4,23 +4,20 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-
-import numpy as np
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
 from demorec.episode.simulated import scene_of
 from demorec.mcap import Recording
-from demorec.mcap.channels import JOINT_STATES
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 from demorec.runs.run_file import EPISODES, FAILED
-from demorec.view.episode import EFFORT_CURVES, Curves, Playback, feature_curves, simulated_curves
+from demorec.view.episode import Playback, feature_curves, simulated_curves
 from demorec.view.from_dataset import open_dataset_episode
 
 
@@ -94,12 +91,7 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
     folder = path.resolve().parent
     with Recording(path) as recording:
         roles, motion = roles_of_recording(recording.info, named), recording.motion()
-        if scene_of(recording.info) is None:
-            curves = feature_curves(recording, roles)
-        else:
-            curves = simulated_curves(recording, motion)
-            if recording.topics[JOINT_STATES][1] > recording.num_frames:
-                curves |= _joint_curves(recording, curves)
+        is_simulated = scene_of(recording.info) is not None
         yield Playback(
             name=path.name.removesuffix(".mcap"),
             group=folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
@@ -108,18 +100,6 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
             data=recording,
             motion=motion,
             roles=roles,
-            curves=curves,
+            curves=simulated_curves(recording, motion) if is_simulated else feature_curves(recording, roles),
             statements=tuple((frame, "subtask", text) for frame, text in recording.subtasks),
         )
-
-
-def _joint_curves(recording: Recording, of_frames: Mapping[str, Curves]) -> dict[str, Curves]:
-    """Read the curves of the joints at the physics rate."""
-    samples = list(recording.joint_samples())
-    time_ns = np.array([sample.time_ns for sample in samples], dtype=np.int64)
-    found = {}
-    for name, quantity in (("position", "position"), ("velocity", "velocity"), (EFFORT_CURVES, "effort")):
-        names = of_frames[name].names
-        values = np.array([getattr(sample, f"joint_{quantity}") for sample in samples])
-        found[name] = Curves(time_ns=time_ns, values=values[:, : len(names)], names=names)
-    return found

@@ -3,23 +3,21 @@
 from __future__ import annotations
 
 import os
-import re
 import shutil
 import socket
 import subprocess
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 from urllib.parse import quote
 from urllib.request import urlopen
 
 from rerun.experimental import ViewerClient
 
-from demorec.core.errors import ConfigError, DemorecError, MissingDependencyError, RecordingError
+from demorec.core.errors import ConfigError, MissingDependencyError, RecordingError
 from demorec.core.files import cache_folder
 from demorec.core.processes import start_program
 from demorec.view.paths import SECONDS
@@ -27,9 +25,6 @@ from demorec.view.paths import SECONDS
 _START_SECONDS = 60.0
 _SETTLE_SECONDS = 30.0
 _END_SECONDS = 5.0
-_PANIC = re.compile(r"panicked at '(?P<message>.*)'$", re.MULTILINE)
-_NO_DRIVER = ("Failed to create render state", "Failed to get render context")
-"""First words of the viewer's panic if the Vulkan driver is missing, or OpenGL alone is not enough for it."""
 
 
 def _start_viewer(*arguments: str, **options: Any) -> subprocess.Popen[Any]:
@@ -99,71 +94,16 @@ def show(recordings: Sequence[Path]) -> None:
         raise RecordingError(f"Rerun's viewer ended with exit code {code}.")
 
 
-def why_it_ended(said: str) -> DemorecError:
-    """Build the error for a viewer that ended unexpectedly, from its standard error."""
-    panic = _PANIC.search(said)
-    message = panic["message"] if panic else ""
-    if message.startswith(_NO_DRIVER):
-        return RecordingError(
-            f"Rerun's viewer found no Vulkan driver to draw an image with ({message.rstrip('.')}): "
-            "apt-get install mesa-vulkan-drivers brings one that needs no graphics card."
-        )
-    return RecordingError(f"Rerun's viewer ended by itself: {message or said.strip()[-300:]}")
+class HeadlessViewer:
+    """A viewer without a screen that shows an .rrd file, from `headless_viewer`.
 
-
-class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
-    """Context manager over a viewer without a screen that shows an .rrd file.
-
-    Raises:
-        RecordingError: The graphics driver is missing, the viewer does not start or ends unexpectedly, or it cannot
-            load the file.
+    Attributes:
+        client: Rerun's client of the viewer.
     """
 
-    def __init__(self, recording: Path, *, width: int = 1600, height: int = 950) -> None:
-        self._port = _free_port()
-        # Not a pipe, which would fill up unread.
-        self._said = tempfile.TemporaryFile(mode="w+", errors="replace")  # noqa: SIM115 (closed by close)
-        self._process = _start_viewer(
-            "--headless", "--port", str(self._port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
-            str(recording), stdout=subprocess.DEVNULL, stderr=self._said,
-        )  # fmt: skip
-        try:
-            self.client = self._connect(recording)
-        except BaseException as error:
-            self.__exit__(type(error), error, error.__traceback__)
-            raise
-
-    def __exit__(
-        self, exc_type: type[BaseException] | None, exc: BaseException | None, traceback: TracebackType | None
-    ) -> None:
-        try:
-            if isinstance(exc, (OSError, RuntimeError, ValueError)):
-                # A panicking viewer disconnects before it has printed the reason.
-                with suppress(subprocess.TimeoutExpired):
-                    self._process.wait(_END_SECONDS)
-                    raise self._reason() from exc
-        finally:
-            self.close()
-
-    def close(self) -> None:
-        """End the viewer; safe to call twice."""
-        _end_process(self._process)
-        self._said.close()
-
-    def _reason(self) -> DemorecError:
-        self._said.seek(0)
-        return why_it_ended(self._said.read())
-
-    def _connect(self, recording: Path) -> ViewerClient:
-        for _ in _tries(0.2):
-            if self._process.poll() is not None:
-                raise self._reason()
-            with suppress(OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
-                client = ViewerClient.connect(f"rerun+http://127.0.0.1:{self._port}/proxy")
-                state = client.get_state()
-                if not state.loading and any(loaded.timelines for loaded in state.recordings):
-                    return client
-        raise RecordingError(f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {recording}")
+    def __init__(self, client: ViewerClient, process: subprocess.Popen[Any]) -> None:
+        self.client = client
+        self._process = process
 
     @property
     def end(self) -> float:
@@ -211,6 +151,49 @@ class HeadlessViewer(AbstractContextManager["HeadlessViewer"]):
         return [(view.name, report) for view in self.client.get_state().views for report in view.reports]
 
 
+@contextmanager
+def headless_viewer(recording: Path, *, width: int = 1600, height: int = 950) -> Iterator[HeadlessViewer]:
+    """Start a viewer of an .rrd file, with a window of this size in pixels, and end it with the block.
+
+    Raises:
+        RecordingError: The graphics driver is missing, the viewer does not start or ends unexpectedly, or it cannot
+            load the file.
+    """
+    port = _free_port()
+    with tempfile.TemporaryFile(mode="w+", errors="replace") as said:  # not a pipe, which would fill up unread
+        process = _start_viewer(
+            "--headless", "--port", str(port), "--window-size", f"{width}x{height}", "--hide-welcome-screen",
+            str(recording), stdout=subprocess.DEVNULL, stderr=said,
+        )  # fmt: skip
+        try:
+            yield HeadlessViewer(_connect(port, process, recording), process)
+        except (OSError, RuntimeError, ValueError) as error:
+            # A panicking viewer disconnects before it has printed the reason.
+            with suppress(subprocess.TimeoutExpired):
+                process.wait(_END_SECONDS)
+                said.seek(0)
+                reason = " ".join(said.read().rpartition("panicked at")[2].split())
+                raise RecordingError(
+                    "Rerun's viewer ended by itself; without a graphics card it needs a Vulkan driver (apt-get install "
+                    f"mesa-vulkan-drivers): {reason[:200]}"
+                ) from error
+            raise
+        finally:
+            _end_process(process)
+
+
+def _connect(port: int, process: subprocess.Popen[Any], recording: Path) -> ViewerClient:
+    for _ in _tries(0.2):
+        if process.poll() is not None:
+            raise ConnectionError
+        with suppress(OSError, RuntimeError, ValueError):  # TimeoutError is an OSError
+            client = ViewerClient.connect(f"rerun+http://127.0.0.1:{port}/proxy")
+            state = client.get_state()
+            if not state.loading and any(loaded.timelines for loaded in state.recordings):
+                return client
+    raise RecordingError(f"Rerun's viewer has not loaded the file within {_START_SECONDS:.0f} s: {recording}")
+
+
 def _tries(pause: float) -> Iterator[None]:
     """Yield repeatedly, with a pause in seconds in between, until the viewer's start has timed out."""
     deadline = time.monotonic() + _START_SECONDS
@@ -237,10 +220,10 @@ def screenshot(recording: Path, target: Path, *, seconds: float | None, width: i
 
     Raises:
         ConfigError: The time is outside it.
-        DemorecError: The viewer cannot work on this machine, or a view reports an error.
+        RecordingError: The viewer cannot work on this machine, or a view reports an error.
         OSError: The image cannot be written.
     """
-    with HeadlessViewer(recording, width=width, height=height) as viewer:
+    with headless_viewer(recording, width=width, height=height) as viewer:
         viewer.seek(moment(seconds, viewer.end))
         for view, report in viewer.reports():
             if report.severity == "error":

@@ -22,7 +22,6 @@ from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.view import bodies
 from demorec.view.bodies import robot_model
-from demorec.view.meshes import mesh_file
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 from demorec.view.viewer import viewer_environment
@@ -32,7 +31,7 @@ from demorec.view.viewer import viewer_environment
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     path = tmp_path_factory.mktemp("run") / "episodes" / "episode_000000.mcap"
     path.parent.mkdir()
-    return write_episode(path, num_frames=20, physics_rate_joints=True, depth=True, segmentation=True)
+    return write_episode(path, num_frames=20, depth=True, segmentation=True)
 
 
 @pytest.fixture(scope="module")
@@ -60,14 +59,13 @@ def _column(chunks: list[Any], component: str) -> list[Any]:
     return sorted(rows, key=lambda row: row[0])
 
 
-def test_every_joint_sample_is_plotted_at_its_time(saved: dict[str, list[Any]], recording: Path) -> None:
+def test_joints_are_plotted_at_every_frame(saved: dict[str, list[Any]], recording: Path) -> None:
     with Recording(recording) as source:
-        samples = list(source.joint_samples())
-        num_frames, joints = source.num_frames, len(source.info.simulated.robot.arm_joints)
-    assert len(samples) > 7 * (num_frames - 1)  # the physics' rate
+        times, count = source.time_ns - source.time_ns[0], len(source.info.simulated.robot.arm_joints)
+        positions = source.trajectory().joint_position[:, :count]
     rows = _column(saved["/plots/position"], "Scalars:scalars")
-    assert [time for time, _ in rows] == [sample.time_ns for sample in samples]
-    np.testing.assert_array_equal([value for _, value in rows], [s.joint_position[:joints] for s in samples])
+    assert [time for time, _ in rows] == times.tolist()
+    np.testing.assert_array_equal([value for _, value in rows], positions)
 
 
 @pytest.mark.parametrize("camera", ["front", "wrist"])
@@ -106,7 +104,7 @@ def test_the_recorded_description_replaces_a_model_with_other_joints(recording: 
         description = source.description()
     moved = description.replace('xyz="0 0 0.333"', 'xyz="0 0 0.444"')
     assert moved != description
-    other, _ = robot_model("franka_panda/panda.urdf", 1.0, moved)  # a different robot from the installed one
+    other = robot_model("franka_panda/panda.urdf", 1.0, moved).urdf  # a different robot from the installed one
     assert next(joint for joint in other.joints if joint.name == "panda_joint1").parent_from_joint.position[2] == 0.444
 
 
@@ -167,9 +165,8 @@ def test_models_are_drawn_in_their_place_and_colour(with_models: Path, tmp_path:
         np.testing.assert_allclose(vertices.max(axis=0), half, atol=0.001)
         np.testing.assert_allclose(vertices.min(axis=0), -half, atol=0.001)
     assert _mesh_of(drawn["/world/bodies/brick"])[1] == {0x3366FFFF}
-    (duck_color,) = _mesh_of(drawn["/world/bodies/duck"])[1]
-    red, green, blue = duck_color >> 24, duck_color >> 16 & 255, duck_color >> 8 & 255
-    assert min(red, green) > 180 > 60 > blue, "the duck is yellow"
+    channels = [(c >> 24, c >> 16 & 255, c >> 8 & 255) for c in _mesh_of(drawn["/world/bodies/duck"])[1]]
+    assert any(min(red, green) > 180 > 60 > blue for red, green, blue in channels), "the duck is yellow"
 
 
 @pytest.mark.parametrize("lost", ["all", "meshes"])
@@ -186,7 +183,7 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
     monkeypatch.setattr(assets, "data_folder", lambda: elsewhere)
     drawn = _drawn(with_models, tmp_path)
     said = caplog.text
-    assert "The robot is drawn as the boxes of the recording" in said
+    assert "The robot is drawn as the recording describes it" in said
     assert said.count("An object is drawn as the recording describes it") == 2
     assert all(message.endswith(".") and ". " not in message for message in caplog.messages)  # a sentence each
     links = {entity for entity in drawn if "/robot/" in entity and _has(drawn[entity], "Mesh3D:vertex_positions")}
@@ -202,23 +199,11 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
 def test_a_model_of_another_size_does_not_replace_the_recorded_one(
     with_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(bodies, "_model_mesh", lambda shape: bodies._unit_mesh("box"))
+    monkeypatch.setattr(bodies, "_model_mesh", lambda shape: bodies.primitive("box", (1.0, 1.0, 1.0)))
     drawn = _drawn(with_models, tmp_path)
     assert "duck.obj has another size" in caplog.text
     vertices, _ = _mesh_of(drawn["/world/bodies/duck"])
     np.testing.assert_allclose(np.ptp(vertices, axis=0), DUCK.shape.size, atol=0.01)
-
-
-def test_a_damaged_file_in_the_cache_is_replaced(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path))
-    source = assets.data_folder() / "cube.obj"
-    first = mesh_file.__wrapped__(source)
-    (cached,) = (tmp_path / "playback").iterdir()
-    whole = cached.read_bytes()
-    for damage in (b"", whole[:100], b"PK" + whole[:50:-1]):
-        cached.write_bytes(damage)
-        assert np.array_equal(mesh_file.__wrapped__(source).vertices, first.vertices)
-        assert cached.stat().st_size == len(whole)
 
 
 def test_the_viewer_finds_ffmpeg(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ from demorec.core.geometry import Array
 from demorec.datasets.lerobot.dataset_features import why_not_recorded
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.mcap import Recording
-from demorec.view.from_dataset import held, open_dataset_episode
+from demorec.view.from_dataset import open_dataset_episode
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 
@@ -37,16 +37,13 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_held_objects_move_with_the_hand(dataset: Path, recorded: Array) -> None:
+def test_a_dataset_without_poses_has_the_first_and_last_of_each_object(dataset: Path, recorded: Array) -> None:
     with open_dataset_episode(LeRobotFolder(dataset), 0) as episode:
-        assert episode.info.simulation is not None
-        drawn = episode.motion.object_poses["red_cube"]
-    assert np.ptp(recorded[:, 2]) > 0.1  # lifted
-    assert drawn.shape == recorded.shape
-    np.testing.assert_allclose(drawn[:, :3], recorded[:, :3], atol=2e-3)
-    np.testing.assert_array_equal(drawn[-1], recorded[-1])
-    turned = np.abs((drawn[:, 3:] * recorded[:, 3:]).sum(axis=1))
-    assert turned.min() > np.cos(np.deg2rad(3) / 2)
+        assert not episode.motion.object_poses
+        np.testing.assert_array_equal(episode.motion.end_poses["red_cube"], recorded[-1])
+        assert episode.scene is not None
+        start = episode.scene.body("red_cube").world_from_body.vector()
+    np.testing.assert_allclose(start, recorded[0], atol=2e-3)
 
 
 def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path, recorded: Array) -> None:
@@ -54,21 +51,6 @@ def test_recorded_object_poses_are_shown_where_a_dataset_has_them(tmp_path: Path
     with open_dataset_episode(LeRobotFolder(tmp_path / "cubes"), 0) as episode:
         assert episode.info.simulation is not None
         np.testing.assert_allclose(episode.motion.object_poses["red_cube"], recorded, atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("opening", "target", "expected"),
-    [
-        # Millimetres. Closed around 50 mm, then opened.
-        ([80, 75, 68, 60, 52, 50, 50, 50, 50, 60], [80] + [0] * 7 + [80] * 2, [0, 0, 0, 0, 0, 0, 1, 1, 0, 0]),
-        # Closed next to the object: the fingers reach their target unobstructed.
-        ([80, 50, 20, 0, 0, 0], [80] + [0] * 5, [0] * 6),
-        # A soft object counts as held, a lost one does not.
-        ([80, 60, 50, 50, 49, 48, 40, 30, 20, 10], [80] + [0] * 9, [0, 0, 0, 1, 1, 1, 0, 0, 0, 0]),
-    ],
-)
-def test_closing_fingers_that_stop_hold_an_object(opening: list[int], target: list[int], expected: list[int]) -> None:
-    assert held(np.array(opening) / 1000, np.array(target) / 1000, 30).astype(int).tolist() == expected
 
 
 def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from demorec.core.errors import SceneError
 from demorec.mcap.description import self_contained
 from demorec.robots.assets import mesh_path
 from demorec.robots.urdf import Urdf, mesh_names, read_dynamics, read_links
+from demorec.view.bodies import robot_model
 from demorec.view.meshes import urdf_meshes
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
@@ -22,6 +23,8 @@ from demorec.view.sources import find_episodes
 WHITE, ORANGE = (242, 242, 242, 255), (255, 128, 0, 255)
 BOX_CORNERS = 24
 """Vertices of a box with flat shading: three at each corner."""
+MESH_CORNERS = 12
+"""The same for a tetrahedron."""
 CORNERS = [(0, 0, 0), (0.1, 0, 0), (0, 0.2, 0), (0, 0, 0.3)]
 FACES = [(0, 2, 1), (0, 1, 3), (1, 2, 3), (0, 3, 2)]
 COLLADA = """<?xml version="1.0"?>
@@ -129,8 +132,8 @@ def test_it_is_drawn_in_its_materials(package: Path) -> None:
     text = (package / "urdf" / "vendor.urdf").read_text()
     links = urdf_meshes(text, package / "urdf")
     for link, color in (("base", WHITE), ("tip", ORANGE)):
-        assert (np.abs(links[link].colors.astype(int) - color) <= 1).all()
-        np.testing.assert_allclose(links[link].vertices.max(axis=0), (0.1, 0.2, 0.3), atol=1e-6)
+        assert (np.abs(255 * links[link].colors - color[:3]) <= 1).all()
+        np.testing.assert_allclose(links[link].points.max(axis=0), (0.1, 0.2, 0.3), atol=1e-6)
     boxes = {link.name: link.visuals[0] for link in read_links(self_contained(text, package / "urdf"))}
     assert boxes["base"].size == pytest.approx((0.1, 0.2, 0.3))
     assert boxes["base"].rgba == pytest.approx((0.95, 0.95, 0.95, 1.0))
@@ -145,6 +148,7 @@ def record(folder: Path, robot: Path | str) -> Path:
 
 def drawn(recording: Path, out: Path) -> dict[str, tuple[int, set[int]]]:
     """Link -> number of corners of its mesh in a file of `view --save`, and their colours."""
+    robot_model.cache_clear()
     save(find_episodes([recording])[0], out)
     found = {}
     for chunk in RrdReader(out).stream():
@@ -160,7 +164,7 @@ def test_a_recorded_arm_is_drawn_with_its_meshes_while_they_exist(package: Path,
     found = drawn(recording, tmp_path / "a.rrd")
     for link, color in (("base", WHITE), ("tip", ORANGE)):
         corners, (rgba,) = found[link]
-        assert corners == len(CORNERS)
+        assert corners == MESH_CORNERS
         assert np.abs(np.subtract([rgba >> shift & 255 for shift in (24, 16, 8, 0)], color)).max() <= 1
     package.rename(package.with_name("gone"))
     assert {link: n for link, (n, _) in drawn(recording, tmp_path / "b.rrd").items()} == {
@@ -186,7 +190,7 @@ def test_a_described_arm_is_drawn_with_its_meshes_where_ros_finds_them(
     assert "vendor_description" in caplog.text
     monkeypatch.setenv("ROS_PACKAGE_PATH", str(package.parent))
     found = drawn(recording, tmp_path / "b.rrd")
-    assert {link: n for link, (n, _) in found.items()} == {"base": len(CORNERS), "tip": len(CORNERS)}
+    assert {link: n for link, (n, _) in found.items()} == {"base": MESH_CORNERS, "tip": MESH_CORNERS}
 
 
 def test_joint_losses_are_read_and_invalid_urdfs_are_named(package: Path) -> None:

@@ -83,6 +83,15 @@ PALETTE_COLORS = 24
 """Maximum number of colours of a palette, which cover nearly all of the surface."""
 
 
+def face_texels(uv: Floats, image: Pixels) -> Floats:
+    """Look up (f, 4, 3) texels, 0..255, at the corners (f, 3, 2) and at the middle of each face."""
+    height, width = image.shape[:2]
+    spots = np.concatenate([uv, uv.mean(1, keepdims=True)], 1)
+    x = np.floor(spots[..., 0] % 1.0 * width).astype(np.int64) % width
+    y = np.floor((1.0 - spots[..., 1]) % 1.0 * height).astype(np.int64) % height
+    return np.asarray(image[y, x].astype(np.float64))
+
+
 def palette_colors(mesh: RasterMesh, image: Pixels) -> Floats | None:
     """Compute (f, 3) face colours 0..1 if each face is on one colour of the texture; else None.
 
@@ -91,11 +100,7 @@ def palette_colors(mesh: RasterMesh, image: Pixels) -> Floats | None:
     """
     if mesh.uv is None or mesh.num_faces == 0:
         return None
-    height, width = image.shape[:2]
-    spots = np.concatenate([mesh.uv, mesh.uv.mean(1, keepdims=True)], 1)  # (f, 4, 2)
-    x = np.floor(spots[..., 0] % 1.0 * width).astype(np.int64) % width
-    y = np.floor((1.0 - spots[..., 1]) % 1.0 * height).astype(np.int64) % height
-    found = image[y, x].astype(np.float64)
+    found = face_texels(mesh.uv, image)
     difference = np.abs(found - found[:, 3:]).max((1, 2))
     area = np.sqrt((face_normals(mesh.points, mesh.faces) ** 2).sum(1))
     if float((area * difference).sum() / area.sum()) > PALETTE_ERROR:
