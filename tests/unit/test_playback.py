@@ -22,6 +22,7 @@ from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.view import bodies
 from demorec.view.bodies import robot_model
+from demorec.view.meshes import primitive
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 from demorec.view.viewer import viewer_environment
@@ -199,7 +200,7 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
 def test_a_model_of_another_size_does_not_replace_the_recorded_one(
     with_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr(bodies, "_model_mesh", lambda shape: bodies.primitive("box", (1.0, 1.0, 1.0)))
+    monkeypatch.setattr(bodies, "_model_mesh", lambda shape: primitive("box", (1.0, 1.0, 1.0)))
     drawn = _drawn(with_models, tmp_path)
     assert "duck.obj has another size" in caplog.text
     vertices, _ = _mesh_of(drawn["/world/bodies/duck"])
