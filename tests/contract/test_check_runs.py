@@ -203,7 +203,7 @@ def test_an_unexpected_error_hides_nothing(good: Path, monkeypatch: pytest.Monke
     def broken(evidence: Evidence) -> None:
         raise IndexError("list index out of range")
 
-    monkeypatch.setattr("demorec.extensions.doctor.checks.number_consistency.arm_of", broken)
+    monkeypatch.setattr("demorec.extensions.doctor.checks.kinematics.arm_of", broken)
     results = {result.check: result for result in checked(good / "episodes" / "episode_000000.mcap").results}
     assert results["joint_limits"].verdict == "not measured"
     assert "cannot be computed" in results["joint_limits"].message

@@ -25,14 +25,12 @@ class EpisodeThumbnails:
     Attributes:
         thumbnails: (N, 16, 16) grey, 0 to 255.
         change: (N,) mean difference of each image's pixels from the previous one, of 255; 0 for the first.
-        detail: (N,) mean difference of adjacent pixels, of 255.
         colour: (3,) mean red, green and blue, 0 to 1.
         frames: (N,) frame of each image.
     """
 
     thumbnails: NDArray[np.uint8]
     change: NDArray[np.float32]
-    detail: NDArray[np.float32]
     colour: Array
     frames: NDArray[np.intp]
 
@@ -41,7 +39,6 @@ class EpisodeThumbnails:
         return EpisodeThumbnails(
             thumbnails=self.thumbnails[numbers],
             change=self.change[numbers],
-            detail=self.detail[numbers],
             colour=self.colour,
             frames=frames,
         )
@@ -82,7 +79,6 @@ class Shrinker:
         """Read all images of an episode; `frames` are the frames of the images, by default consecutive."""
         thumbnails: list[NDArray[np.uint8]] = []
         changes: list[float] = []
-        details: list[float] = []
         colours: list[Array] = []
         before: NDArray[np.int16] | None = None
         for number, image in enumerate(images):
@@ -90,7 +86,6 @@ class Shrinker:
             thumbnails.append(_brightness(small).copy())
             sampled = _sampled(image)
             changes.append(0.0 if before is None else _mean_size(sampled - before))
-            details.append(_mean_size(sampled[:, 1:] - sampled[:, :-1]))
             before = sampled
             if number % 8 == 0:
                 tiny = self._colours.reformat(image, SIDE, SIDE, "rgb24", interpolation="AREA")
@@ -99,7 +94,6 @@ class Shrinker:
         return EpisodeThumbnails(
             thumbnails=np.stack(thumbnails) if count else np.zeros((0, SIDE, SIDE), dtype=np.uint8),
             change=np.array(changes, dtype=np.float32),
-            detail=np.array(details, dtype=np.float32),
             colour=np.mean(colours, axis=0) if colours else np.zeros(3),
             frames=np.arange(count) if frames is None else frames,
         )

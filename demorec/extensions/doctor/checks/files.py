@@ -13,11 +13,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, Severity, check
+from demorec.check.base import Fault, NotApplicableError, Severity, check
 from demorec.datasets.lerobot.files import open_table, read_table
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted, range_errors, stored_dtype
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, STATS_PATH, TASKS_PATH, VIDEO_PATH, DatasetFeature
+from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, TASKS_PATH, VIDEO_PATH, DatasetFeature
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.extensions.doctor.evidence import DROP, REPAIR, Evidence
 
@@ -402,19 +402,3 @@ def unused_files(evidence: Evidence) -> Iterator[Fault]:
 def _unused(root: Path, files: Collection[Path]) -> str:
     more = f" and {len(files) - 1} more" if len(files) > 1 else ""
     return f"no episode uses {min(files).relative_to(root).as_posix()}{more}"
-
-
-@check(
-    family="files",
-    needs="a LeRobot dataset of v3.0",
-    measures="statistics that are missing",
-    why="Training cannot normalise without them.",
-    do=REPAIR,
-)
-def missing_statistics(evidence: Evidence) -> Iterator[Fault]:
-    """Check that meta/stats.json exists."""
-    folder = folder_of(evidence)
-    if folder.info.is_old:
-        raise NotMeasuredError("before v3.0 each episode has its own statistics")
-    if not (evidence.path / STATS_PATH).exists():
-        yield Fault(severity="broken", message=f"{STATS_PATH} is missing")

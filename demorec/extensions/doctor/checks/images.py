@@ -4,26 +4,22 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
+from demorec.extensions.doctor.evidence import DROP, EpisodeEvidence, Evidence
 from demorec.extensions.doctor.robust import held_period, runs
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails
-from demorec.extensions.doctor.visible_motion import visible_motion
+from demorec.extensions.doctor.units import other_units
 
 MIN_OTHERS = 3
 """Minimum number of episodes to compare one with."""
 MAX_BLANK_SPREAD = 3.0
 """Maximum standard deviation, of 255, of a blank thumbnail, in which noise averages out."""
-MIN_SHOWN_SPREAD = 10.0
-"""Minimum usual standard deviation of a camera that shows content."""
-MAX_COVERED_RATIO = 0.3
-"""Maximum contrast, relative to the camera's usual one, of a covered camera."""
-MIN_COVERED_S = 0.3
 FROZEN_RATIO = 0.08
 """Maximum change of a repeated image, relative to the usual change while the robot moves."""
 MIN_MISSING_CHANGE = 4.0
@@ -59,6 +55,9 @@ MIN_FIT_GAIN = 0.3
 """Minimum excess over the correlation with its own."""
 MAX_TWIN_DIFFERENCE = 1.0
 """Maximum mean difference of thumbnails, of 255, of two cameras with the same view."""
+MIN_FRAMES = 20
+"""Minimum number of frames for the fit."""
+_SWEEPS = 100
 
 
 @check(
@@ -125,39 +124,6 @@ def _spread(images: EpisodeThumbnails) -> Array:
 def _bounds(flags: NDArray[np.bool_]) -> tuple[int, int]:
     places = np.flatnonzero(flags)
     return int(places[0]), int(places[-1])
-
-
-@check(
-    family="images",
-    needs="images",
-    measures="a camera that is temporarily covered",
-    unit="s",
-    why="The policy acts without seeing in these frames.",
-    do=LOOK_OR_DROP,
-)
-def covered_camera(evidence: Evidence) -> Iterator[Fault]:
-    """Find segments with far lower contrast than the camera's other images, without being blank."""
-    for camera, images in evidence.need_images().items():
-        spreads = {number: _spread(each) for number, each in images.episodes.items()}
-        if not spreads:
-            continue
-        contrast = float(np.median([np.median(each) for each in spreads.values()]))
-        detail = float(np.median([np.median(each.detail) for each in images.episodes.values()]))
-        for number, spread in spreads.items():
-            if contrast < MIN_SHOWN_SPREAD:
-                break
-            dark = (spread < MAX_COVERED_RATIO * contrast) & (spread >= MAX_BLANK_SPREAD)
-            dark &= images.episodes[number].detail < MAX_COVERED_RATIO * detail
-            long = [(a, b) for a, b in runs(dark) if b - a >= max(2, MIN_COVERED_S * evidence.fps)]
-            if long:
-                first, end = max(long, key=lambda run: run[1] - run[0])
-                yield Fault(
-                    severity="look",
-                    episode=number,
-                    frames=(first, end - 1),
-                    value=f"{evidence.seconds(end - first):.1f} s",
-                    message=f"{camera} shows hardly anything for {evidence.seconds(end - first):.1f} s, as if covered",
-                )
 
 
 @check(
@@ -390,3 +356,58 @@ def _are_the_same(one: EpisodeThumbnails, two: EpisodeThumbnails) -> bool:
         return False
     error = np.abs(one.thumbnails.astype(np.int16) - two.thumbnails.astype(np.int16)).mean(axis=(1, 2))
     return float(np.quantile(error, 0.9)) < MAX_TWIN_DIFFERENCE
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class VisibleMotion:
+    """Effect of motion on the images of a camera.
+
+    Attributes:
+        weights: (D,) change of an image, of 255, for a step of each element by its usual range.
+        usual_change: Change of an image while the robot moves fast, of 255.
+    """
+
+    weights: Array
+    usual_change: float
+
+    def expected(self, evidence: Evidence, episode: EpisodeEvidence, images: EpisodeThumbnails) -> Array:
+        """Compute (N - 1,) change between consecutive images expected from the motion, at most the usual one."""
+        return np.asarray(np.minimum(_steps(evidence, episode, images) @ self.weights, 2 * self.usual_change))
+
+
+def visible_motion(evidence: Evidence, camera: CameraThumbnails) -> VisibleMotion | None:
+    """Fit the change of a camera's images to the joints' steps; None if nothing moves or changes."""
+    steps: list[Array] = []
+    changes: list[Array] = []
+    for number, images in camera.episodes.items():
+        episode = evidence.by_number.get(number)
+        if episode is None or episode.state is None or len(images.frames) < 2 or number in evidence.once(other_units):
+            continue
+        steps.append(_steps(evidence, episode, images))
+        changes.append(images.change[1:].astype(np.float64))
+    if not steps or sum(map(len, steps)) < MIN_FRAMES:
+        return None
+    x, y = np.concatenate(steps), np.concatenate(changes)
+    rest = float(np.median(y[x.max(axis=1, initial=0.0) == 0])) if (x == 0).all(axis=1).any() else 0.0
+    weights = _non_negative_fit(x.T @ x, x.T @ np.maximum(y - rest, 0.0))
+    moving = y[x @ weights > np.median(x @ weights)]
+    usual_change = float(np.quantile(moving, 0.75)) if len(moving) else 0.0
+    return VisibleMotion(weights=weights, usual_change=usual_change) if usual_change > 0 else None
+
+
+def _non_negative_fit(squares: Array, products: Array) -> Array:
+    """Solve (D,) non-negative least squares weights by coordinate descent on the normal equations."""
+    weights = np.zeros(len(products))
+    for _ in range(_SWEEPS):
+        for place in np.flatnonzero(np.diag(squares) > 0):
+            rest = products[place] - squares[place] @ weights
+            weights[place] = max(0.0, weights[place] + rest / squares[place, place])
+    return weights
+
+
+def _steps(evidence: Evidence, episode: EpisodeEvidence, images: EpisodeThumbnails) -> Array:
+    """Compute (N - 1, D) size of each element's step between images, in units of its usual range."""
+    assert episode.state is not None
+    position = episode.state[np.minimum(images.frames, len(episode.state) - 1)]
+    ranges = evidence.ranges
+    return np.asarray(np.abs(np.diff(position, axis=0)) / np.where(ranges > 0, ranges, np.inf))

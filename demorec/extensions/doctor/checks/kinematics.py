@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -14,9 +15,9 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
+from demorec.episode.element_names import joint_of
 from demorec.episode.features import EE_POSE
-from demorec.extensions.doctor.arm import arm_of
-from demorec.extensions.doctor.evidence import DROP, Evidence
+from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
 from demorec.robots.urdf import Urdf, UrdfJoint
 
 KNOWN_ERROR_M = 0.05
@@ -34,6 +35,90 @@ MAX_FIT_STEPS = 100
 LEVER_M = 0.1
 """Lever, metres, that converts a rotation to a distance."""
 _POSE = ("x", "y", "z", "qx", "qy", "qz", "qw")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class StateJoints:
+    """Joints of the state's D elements.
+
+    Attributes:
+        urdf: The joint tree.
+        joints: (D,) names in it, "" for an element that is not the position of a joint.
+        lower, upper: (D,) limits, rad or m; infinite if unknown.
+        is_sliding: (D,) whether the joint slides.
+    """
+
+    urdf: Urdf
+    joints: tuple[str, ...]
+    lower: Array
+    upper: Array
+    is_sliding: tuple[bool, ...]
+
+
+def arm_of(evidence: Evidence) -> StateJoints:
+    """Match the state's elements to the joints of the URDF: as recorded, by their names, else by their order."""
+    if not evidence.urdf or not evidence.elements:
+        raise NotMeasuredError("the robot's URDF is not known (name it: --urdf FILE)")
+    urdf = Urdf.parse(evidence.urdf)
+    joints = evidence.arm_joints if any(evidence.arm_joints) else _named_joints(urdf, evidence)
+    tree = {joint.name: joint for joint in urdf.joints}
+    found = [tree.get(joint) for joint in joints]
+    if not any(found):
+        raise NotMeasuredError("no element of the state has the name of a joint of the URDF")
+    return StateJoints(
+        urdf=urdf,
+        joints=joints,
+        lower=np.array([-np.inf if joint is None else joint.lower for joint in found]),
+        upper=np.array([np.inf if joint is None else joint.upper for joint in found]),
+        is_sliding=tuple(joint is not None and joint.kind == "prismatic" for joint in found),
+    )
+
+
+def _named_joints(urdf: Urdf, evidence: Evidence) -> tuple[str, ...]:
+    moving = [joint.name for joint in urdf.depth_first() if joint.kind != "fixed"]
+    stems = [joint_of(name) for name in evidence.elements]
+    if any(stem in moving for stem in stems):
+        return tuple(stem if stem in moving else "" for stem in stems)
+    is_ordered = len(moving) - len(stems) in (-1, 0)  # the last element is a gripper
+    return (*moving, "")[: len(stems)] if is_ordered else ()
+
+
+@check(
+    family="numbers",
+    needs="state, the robot's URDF",
+    measures="positions beyond the joints' limits",
+    unit="rad, m",
+    why="The numbers are not those of this robot: another unit, order of joints, or zero.",
+    do="compare units and zero positions with the URDF; name servos by --motor-units",
+)
+def joint_limits(evidence: Evidence) -> Iterator[Fault]:
+    """Compare the state with the limits of the robot's URDF.
+
+    The robot is that of the recording or the sidecar, the one named by --urdf or --motor-units, or a known one with
+    joints named like the state's elements. Up to 0.1 rad or m beyond a limit is attributed to calibration.
+    """
+    arm = evidence.once(arm_of)
+    known = np.flatnonzero(np.isfinite(arm.lower) | np.isfinite(arm.upper))
+    if not len(known):
+        raise NotMeasuredError("the URDF has no limits of the state's joints")
+    found: list[Fault] = []
+    for episode, state in evidence.need_state():
+        beyond = np.maximum(np.maximum(arm.lower - state, state - arm.upper), 0.0)[:, known]
+        frame, place = np.unravel_index(int(beyond.argmax()), beyond.shape)
+        worst = float(beyond[frame, place])
+        if worst > 0.1:
+            frames = np.flatnonzero((beyond > 0.1).any(axis=1))
+            unit = "m" if arm.is_sliding[known[place]] else "rad"
+            fault = Fault(
+                severity="broken" if worst > 0.5 else "look",
+                episode=episode.number,
+                frames=(int(frames[0]), int(frames[-1])),
+                value=f"{worst:.2f} {unit}",
+                message=f"{evidence.elements[known[place]]} is {worst:.2f} {unit} beyond its limit",
+            )
+            found.append(fault)
+    is_exception = len(found) <= len(evidence.episodes) / 2
+    yield from (replace(fault, do=LOOK_OR_DROP if is_exception else "") for fault in found)
 
 
 @check(

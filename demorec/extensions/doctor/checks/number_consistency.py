@@ -1,16 +1,14 @@
-"""Checks of numbers against each other: velocities, quaternions, and the limits of the joints."""
+"""Checks of numbers against each other: velocities and quaternions."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from demorec.check.base import Fault, NotApplicableError, NotMeasuredError, check
 from demorec.core.geometry import Array
-from demorec.extensions.doctor.arm import arm_of
-from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence, joined, quaternion_places
+from demorec.extensions.doctor.evidence import DROP, Evidence, joined, quaternion_places
 from demorec.extensions.doctor.robust import usual, without_gaps
 
 VELOCITY_WINDOW_S = 0.3
@@ -188,41 +186,3 @@ def _sign_faults(name: str, fours: Mapping[int, Array]) -> Iterator[Fault]:
             message=f"its quaternion in {name} changes its sign in frame {frames[0] + 1}, without any motion",
             do="keep the sign of the preceding frame in the program that recorded it, or drop the episode: " + DROP,
         )
-
-
-@check(
-    family="numbers",
-    needs="state, the robot's URDF",
-    measures="positions beyond the joints' limits",
-    unit="rad, m",
-    why="The numbers are not those of this robot: another unit, order of joints, or zero.",
-    do="compare units and zero positions with the URDF; name servos by --motor-units",
-)
-def joint_limits(evidence: Evidence) -> Iterator[Fault]:
-    """Compare the state with the limits of the robot's URDF.
-
-    The robot is that of the recording or the sidecar, the one named by --urdf or --motor-units, or a known one with
-    joints named like the state's elements. Up to 0.1 rad or m beyond a limit is attributed to calibration.
-    """
-    arm = evidence.once(arm_of)
-    known = np.flatnonzero(np.isfinite(arm.lower) | np.isfinite(arm.upper))
-    if not len(known):
-        raise NotMeasuredError("the URDF has no limits of the state's joints")
-    found: list[Fault] = []
-    for episode, state in evidence.need_state():
-        beyond = np.maximum(np.maximum(arm.lower - state, state - arm.upper), 0.0)[:, known]
-        frame, place = np.unravel_index(int(beyond.argmax()), beyond.shape)
-        worst = float(beyond[frame, place])
-        if worst > 0.1:
-            frames = np.flatnonzero((beyond > 0.1).any(axis=1))
-            unit = "m" if arm.is_sliding[known[place]] else "rad"
-            fault = Fault(
-                severity="broken" if worst > 0.5 else "look",
-                episode=episode.number,
-                frames=(int(frames[0]), int(frames[-1])),
-                value=f"{worst:.2f} {unit}",
-                message=f"{evidence.elements[known[place]]} is {worst:.2f} {unit} beyond its limit",
-            )
-            found.append(fault)
-    is_exception = len(found) <= len(evidence.episodes) / 2
-    yield from (replace(fault, do=LOOK_OR_DROP if is_exception else "") for fault in found)

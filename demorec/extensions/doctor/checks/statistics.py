@@ -25,7 +25,7 @@ _COUNTED = ("index", "episode_index", "task_index", "frame_index", "timestamp")
 @check(
     family="files",
     needs="a LeRobot dataset",
-    measures="statistics that do not match the rows",
+    measures="statistics that are missing or do not match the rows",
     unit="standard deviations",
     why="Training normalises by them: state and action are shifted and squeezed.",
     do=REPAIR,
@@ -37,18 +37,26 @@ def wrong_statistics(evidence: Evidence) -> Iterator[Fault]:
     merge. The deviation of a joint parked far from zero may have the rounding of LeRobot's float32.
     """
     folder = folder_of(evidence)
-    stats_path = OLD_STATS if folder.info.is_old else STATS_PATH
-    if not (evidence.path / stats_path).exists():
-        raise NotMeasuredError(f"{stats_path} is missing")
+    if folder.info.is_old and not (evidence.path / OLD_STATS).exists():
+        raise NotMeasuredError(f"{OLD_STATS} is missing")
+    if not folder.info.is_old and not (evidence.path / STATS_PATH).exists():
+        yield Fault(severity="broken", message=f"{STATS_PATH} is missing")
+        return
+    missing: dict[tuple[Severity, int | None, str, str], list[str]] = {}
     for error in statistic_errors(folder, {each.number: each.columns for each in evidence.episodes}):
-        is_there = math.isfinite(error.error)
-        found = "does not match the rows" if is_there else "is missing"
-        yield Fault(
-            severity=_severity(error),
-            episode=error.episode,
-            value=f"{error.error:.2g} deviations" if is_there else "missing",
-            message=f"the {error.quantity} of {error.feature} in {error.place} {found}",
-        )
+        if math.isfinite(error.error):
+            yield Fault(
+                severity=_severity(error),
+                episode=error.episode,
+                value=f"{error.error:.2g} deviations",
+                message=f"the {error.quantity} of {error.feature} in {error.place} does not match the rows",
+            )
+        else:
+            place = (_severity(error), error.episode, error.quantity, error.place)
+            missing.setdefault(place, []).append(error.feature)
+    for (severity, episode, quantity, file), features in missing.items():
+        message = f"the {quantity} of {', '.join(features)} in {file} is missing"
+        yield Fault(severity=severity, episode=episode, value="missing", message=message)
     if folder.info.is_old:
         return  # training aggregates the episodes' statistics
     if evidence.unreadable:
