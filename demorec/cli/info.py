@@ -312,7 +312,7 @@ def _dataset(path: Path, named: NamedRoles) -> Described:
 def _dataset_content(path: Path, named: NamedRoles) -> tuple[LeRobotFolder | None, list[tuple[str, str]], list[str]]:
     """The open dataset, table content beyond info.json, if readable, and the problems of the dataset."""
     from demorec.datasets.lerobot.folder import LeRobotFolder
-    from demorec.datasets.lerobot.inspect import attempt_counts, dataset_problems, episode_digests, without_digest
+    from demorec.datasets.lerobot.inspect import dataset_problems, episode_digests, without_digest
     from demorec.datasets.lerobot.layout import combined_digest
 
     folder: LeRobotFolder | None = None
@@ -328,10 +328,10 @@ def _dataset_content(path: Path, named: NamedRoles) -> tuple[LeRobotFolder | Non
                 facts.append(("camera", f"{name.removeprefix(IMAGE_PREFIX)} {width}x{height} {codec}"))
         if problems:
             return folder, facts, problems
-        if (counts := attempt_counts(folder)) is not None:
-            successes, unknown, attempts = counts
-            shown = f", {unknown} unknown" if unknown else ""
-            facts.insert(0, ("successes", f"{successes}, of {attempts} attempts{shown}"))
+        outcomes = [row["success"] for row in folder.sidecar(["success"])]
+        if any(outcome is not None for outcome in outcomes):
+            unknown = f", {outcomes.count(None)} unknown" if None in outcomes else ""
+            facts.insert(0, ("successes", f"{outcomes.count(True)} of {len(outcomes)}{unknown}"))
         if not without_digest(folder.info):
             facts.append(("digest", combined_digest(folder.info, episode_digests(folder))))
     except ExportError as error:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Literal
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.options import CommonOptions, parse_episodes
-from demorec.episode.episode import POLICY_PHASE, Outcome, interventions
+from demorec.episode.episode import POLICY_PHASE, interventions
 from demorec.mcap import Recording
 from demorec.runs.find import EPISODE_FOLDERS, expect, expect_recordings
 
@@ -32,23 +34,23 @@ def find_recordings(paths: Sequence[Path]) -> list[Path]:
     return found
 
 
-def is_wanted(recording: Recording, options: CommonOptions) -> bool:
-    """Whether the options ask for the episode of a recording (`--episodes`, `--corrected-only`). Raises RecordingError
-    if it is damaged.
+LeftOut = Literal["unwanted", "failures", "unknown"]
+"""Kind of a recording that is not exported: not requested, a failed attempt, or one without a known outcome."""
+
+
+def why_left_out(recording: Recording, options: CommonOptions) -> LeftOut | None:
+    """Find out why a recording is not exported; None if it is. An episode with unknown success is not a failure; a
+    recording in a folder `failed` always is. Raises RecordingError if it is damaged.
     """
     if not parse_episodes(options.episodes)(recording.info.episode_index):
-        return False
-    if not options.corrected_only:
-        return True
-    phases = recording.phases
-    return POLICY_PHASE not in phases or bool(interventions(phases).any())
-
-
-def goes_in(recording: Recording, options: CommonOptions) -> bool:
-    """Whether a recording of a wanted episode is exported, rather than left out as a failed attempt. An episode with
-    unknown success is not a failure; a recording in a folder `failed` always is.
-    """
-    return options.include_failures or not (recording.has_failed or recording.path.parent.name == "failed")
+        return "unwanted"
+    if options.corrected_only:
+        phases = recording.phases
+        if POLICY_PHASE in phases and not interventions(phases).any():
+            return "unwanted"
+    if options.include_failures or not (recording.has_failed or recording.path.parent.name == "failed"):
+        return None
+    return "unknown" if recording.outcome is None else "failures"
 
 
 def places_of(files: Sequence[Path]) -> list[Path]:
@@ -70,12 +72,12 @@ class Intake:
 
     Attributes:
         num_taken: Number of selected recordings.
-        skipped_failures: Number of failed attempts left out.
-        skipped_unknown: Number of recordings left out that end before their outcome.
+        skipped: Number of recordings left out, by kind.
     """
 
     def __init__(self, found: Sequence[Path], options: CommonOptions) -> None:
-        self.skipped_failures = self.skipped_unknown = self.num_taken = 0
+        self.num_taken = 0
+        self.skipped: Counter[LeftOut] = Counter()
         self._found = found
         self._options = options
         self._first: tuple[Mapping[str, str], Path] | None = None
@@ -94,23 +96,15 @@ class Intake:
             )
         self.num_taken += 1
 
-    def leave_out(self, outcome: Outcome | None) -> None:
-        """Count a failed attempt, or one with unknown outcome, for the success rate only."""
-        if outcome is None:
-            self.skipped_unknown += 1
-        else:
-            self.skipped_failures += 1
-
-    @property
-    def skipped_unwanted(self) -> int:
-        """Number of recordings that the options do not ask for; valid once all have been read."""
-        return len(self._found) - self.num_taken - self.skipped_failures - self.skipped_unknown
+    def leave_out(self, reason: LeftOut) -> None:
+        """Count a recording that is not exported."""
+        self.skipped[reason] += 1
 
     def nothing_to_export(self) -> ConfigError:
         """Return the error for an export without selected recordings."""
         corrected = " or were not corrected" if self._options.corrected_only else ""
         return ConfigError(
-            f"Nothing to export. Recordings: {len(self._found)}, failed attempts: {self.skipped_failures}, "
-            f"unknown outcome: {self.skipped_unknown} (--include-failures selects both); the others are not in "
-            f"--episodes{corrected}."
+            f"Nothing to export. Recordings: {len(self._found)}, failed attempts: {self.skipped['failures']}, "
+            f"unknown outcome: {self.skipped['unknown']} (--include-failures selects both); the others are not "
+            f"in --episodes{corrected}."
         )

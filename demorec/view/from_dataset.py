@@ -33,6 +33,21 @@ from demorec.view.episode import Playback, feature_curves, simulated_curves
 
 
 @contextmanager
+def open_stored_episode(dataset: LeRobotFolder, number: int) -> Iterator[DatasetRecording]:
+    """Open one episode of a dataset by its index, from 0, with scene and outcome as far as they are known.
+
+    Raises:
+        RecordingError: It cannot be read; also in the block.
+    """
+    try:
+        episode = _ShownEpisode(dataset, number)
+        yield _SimulatedEpisode(dataset, number) if episode.known.get("root_seed") is not None else episode
+    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
+        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
+        raise resource_error(error) or unreadable from error
+
+
+@contextmanager
 def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playback]:
     """Open one episode of a dataset by its index, from 0.
 
@@ -40,22 +55,17 @@ def open_dataset_episode(dataset: LeRobotFolder, number: int) -> Iterator[Playba
         ConfigError: It lacks a feature that the user named.
         RecordingError: It cannot be read.
     """
-    try:
-        episode = _read_episode(dataset, number)
-    except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
-        unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
-        raise resource_error(error) or unreadable from error
+    with open_stored_episode(dataset, number) as data:
+        episode = _playback(dataset, data)
     yield episode
 
 
-def _read_episode(dataset: LeRobotFolder, number: int) -> Playback:
+def _playback(dataset: LeRobotFolder, data: DatasetRecording) -> Playback:
     root, group = dataset.root, dataset.root.resolve().name
-    index, last = dataset.places[number].episode_index, dataset.places[number].length - 1
-    data: DatasetRecording = _ShownEpisode(dataset, number)
-    if data.known.get("root_seed") is not None:
-        data = simulated = _SimulatedEpisode(dataset, number)
+    index, last = data.place.episode_index, data.num_frames - 1
+    if isinstance(data, _SimulatedEpisode):
         motion, identity = data.motion(), f"dataset-{group}-{index}"
-        curves = simulated_curves(data, motion, has_targets=simulated.has_targets)
+        curves = simulated_curves(data, motion, has_targets=data.has_targets)
     else:
         motion, identity = data.motion(), hashlib.sha256(f"{root.resolve()} {index}".encode()).hexdigest()[:16]
         curves = feature_curves(data, dataset.roles)

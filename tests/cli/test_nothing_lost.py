@@ -135,16 +135,6 @@ def test_append_keeps_existing_files_or_refuses(place: Path, target: str) -> Non
     assert (place / "mixed/data/notes.txt").read_text() == "years of work"
 
 
-def test_a_third_party_workshop_is_left_alone(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    workshop = place / ".new.demorec-part"
-    (workshop / "new").mkdir(parents=True)
-    (workshop / "new" / "chapter_2.tex").write_text("years of work")
-    before = files_of(place)
-    assert exit_code("export", "lerobot", place / "runs/run", "--out", place / "new", "--no-verify") == 2
-    assert "not made by demorec" in capsys.readouterr().err
-    assert files_of(place) == before
-
-
 # A run: `generate --overwrite`.
 
 
@@ -212,16 +202,6 @@ def test_a_run_that_contains_the_current_folder_is_not_overwritten(run: Path, mo
     with pytest.raises(ConfigError, match="it is a repository"):
         run_fake(run, num_episodes=2, seed=1, overwrite=True)
     assert {name: data for name, data in files_of(run).items() if name != ".lock"} == before
-
-
-def test_folders_with_a_runs_names_are_not_overwritten(tmp_path: Path) -> None:
-    for name in ("episodes", "dataset"):
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "pilot.mkv").write_text("a series")
-    before = files_of(tmp_path)
-    with pytest.raises(ConfigError, match="not a run"):
-        run_fake(tmp_path, overwrite=True)
-    assert {name: data for name, data in files_of(tmp_path).items() if name != ".lock"} == before
 
 
 @pytest.mark.parametrize("origin", ["rendered", "imported", "imported, run.json lost", "imported among its own"])
@@ -302,15 +282,6 @@ def test_a_crash_while_overwriting_loses_nothing(tmp_path: Path, moment: str) ->
     settle_parts(tmp_path, names)
     assert files_of(tmp_path) == ({"run.json": b"new"} if moment == "made" else old)
     assert not aside.exists()
-
-
-def test_a_third_party_folder_does_not_count_as_set_aside_files(tmp_path: Path) -> None:
-    (tmp_path / ".demorec-replaced").mkdir()
-    (tmp_path / ".demorec-replaced" / "mine").touch()
-    (tmp_path / "run.json").touch()
-    with pytest.raises(ConfigError, match="not made by demorec"):
-        settle_parts(tmp_path, ("run.json",))
-    assert (tmp_path / ".demorec-replaced" / "mine").exists()
 
 
 # An evaluation.

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from support.check import checked
@@ -47,7 +46,7 @@ def boxes(root: Path) -> dict[tuple[int, int], list[tuple[Any, ...]]]:
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("simulated")
-    run = make_run(folder / "run", (12, 10, 11), failures=(1, 2, 7), segmentation=True)
+    run = make_run(folder / "run", (12, 10, 11), segmentation=True)
     export(run, folder / "d", boxes=True, progress=True, language=("task_aug", "subtask"))
     return folder / "d"
 
@@ -60,14 +59,9 @@ def failing(root: Path) -> set[str]:
 
 
 @pytest.mark.slow
-def test_attempts_boxes_and_poses_follow_their_episodes(
-    simulated: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_boxes_and_poses_follow_their_episodes(simulated: Path, tmp_path: Path) -> None:
     edit("reorder", simulated, "--order", "2,0,1", "--out", tmp_path / "r")
-    assert "failed attempts" not in capsys.readouterr().out
     edit("select", tmp_path / "r", "--episodes", "0,2", "--out", tmp_path / "s")
-    told = capsys.readouterr().out
-    assert "Left out: failed attempts: 1 (at episodes that are not in the result)" in told
     edit("trim", tmp_path / "s", "--head", 3, "--tail", 2, "--out", tmp_path / "t")
     before, origin = boxes(simulated), {0: 2, 1: 1}  # episode of s -> episode of the first dataset
     assert any(before.values())
@@ -77,8 +71,7 @@ def test_attempts_boxes_and_poses_follow_their_episodes(
             length = {1: 10, 2: 11}[old] - lost
             assert np.array_equal(poses(root, new), poses(simulated, old)[first : first + length])
             assert [found[new, t] for t in range(length)] == [before[old, first + t] for t in range(length)]
-        attempts = [(row["episode_index"], row["run_episode_index"]) for row in table(root, "demorec/attempts")]
-        assert attempts == [(None, 2), (0, 2), (None, 1), (1, 1)]
+        assert [row["run_episode_index"] for row in table(root, "demorec/episodes")] == [2, 1]
         assert failing(root) <= failing(simulated)
 
 
@@ -101,21 +94,3 @@ def test_omissions_are_named_before_and_after(
         told = capsys.readouterr().out
         assert "eft out: scenes of simulated episodes: 3 (" in told
         assert (tmp_path / "d").exists() == (flags == ())
-
-
-def test_progress_of_a_policy_and_files_of_other_programs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    run = make_run(tmp_path / "run", (6, 7, 5))
-    source = tmp_path / "d"
-    export(run, source)
-    index = np.arange(18)
-    counters = {name: data_table(source).column(name) for name in ("index", "episode_index", "frame_index")}
-    pq.write_table(pa.table({**counters, "progress_dense": index / 18}), source / "sarm_progress.parquet")
-    (source / "meta/modality.json").write_text("{}")
-    edit("reorder", source, "--order", "1,2,0", "--out", tmp_path / "r")
-    assert "left out" not in capsys.readouterr().out.lower()
-    assert (tmp_path / "r/meta/modality.json").read_text() == "{}"
-    edit("trim", tmp_path / "r", "--head", 1, "--out", tmp_path / "t")
-    assert pq.read_table(tmp_path / "t/sarm_progress.parquet").to_pydict() == {
-        **{name: data_table(tmp_path / "t").column(name).to_pylist() for name in counters},
-        "progress_dense": [number / 18 for number in (*range(7, 13), *range(14, 18), *range(1, 6))],
-    }

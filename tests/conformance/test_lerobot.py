@@ -17,11 +17,8 @@ from support.export import data_table, episode_rows, export, make_run
 from support.recording import make_episode
 
 import demorec.datasets.lerobot.parquet
-from demorec.datasets.lerobot import verify
 from demorec.datasets.lerobot.depth import DepthScale, quantised
-from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.inspect import dataset_digest
-from demorec.datasets.lerobot.options import ExportOptions
 from demorec.mcap import Recording
 
 LENGTHS = (20, 15, 17, 9, 31, 12)
@@ -164,19 +161,6 @@ def test_depth_is_read_as_metres(tmp_path: Path) -> None:
     assert np.array_equal(quantised(depth), quantize_depth(depth, video_backend=None, input_unit="m"))
     values = DepthScale().values()
     assert found.meta.stats["observation.images.front_depth"]["min"].reshape(-1)[0] == pytest.approx(values[0])
-
-
-@pytest.mark.slow
-def test_depth_without_its_colour_is_verified(tmp_path: Path) -> None:
-    run = make_run(tmp_path / "run", (6, 5), depth=True)
-    options = ExportOptions(
-        repo_id="local/test", depth=True, features=("observation.images.front_depth",), verify=False
-    )
-    export_lerobot([run], tmp_path / "d", options)
-    episodes = sorted((run / "episodes").iterdir())
-    samples = tuple(enumerate(episodes))
-    assert verify._verify(tmp_path / "d", samples, options) == 4  # in this process, which has loaded LeRobot already
-    assert open_dataset(tmp_path / "d").meta.camera_keys == ["observation.images.front_depth"]
 
 
 # ------------------------------------------------------------------------------------------- LeRobot's own tools, slow

@@ -10,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from numpy.typing import NDArray
+
+from support.drawn_datasets import write_tables
 
 FPS, LENGTH, EPISODES, LATE = 30, 120, 4, 3
 JOINTS = ("shoulder", "elbow", "wrist", "gripper")
@@ -120,46 +121,13 @@ def write_convention(root: Path, convention: Convention, *, frozen: bool = False
         for name, (names, values) in vectors.items()
     }
     features |= {name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()}
-    _write(root, features, vectors, convention.version)
+    info = {"codebase_version": convention.version, "fps": FPS, "robot_type": "arm", "features": features}
+    write_tables(root, info, [_rows(vectors, episode) for episode in range(EPISODES)], ["wave"])
+    if convention.version == "v3.0":
+        (root / "meta/stats.json").write_text("{}")
     if convention.modality is not None:
         (root / "meta/modality.json").write_text(json.dumps(convention.modality))
     return root
-
-
-def _write(root: Path, features: dict[str, Any], vectors: Mapping[str, Any], version: str) -> None:
-    is_old = version != "v3.0"
-    data = (
-        "chunk-{episode_chunk:03d}/episode_{episode_index:06d}"
-        if is_old
-        else "chunk-{chunk_index:03d}/file-{file_index:03d}"
-    )
-    info = {
-        "codebase_version": version, "fps": FPS, "features": features, "robot_type": "arm", "chunks_size": 1000,
-        "total_episodes": EPISODES, "total_frames": EPISODES * LENGTH, "total_tasks": 1, "video_path": None,
-        "data_path": f"data/{data}.parquet", "splits": {"train": f"0:{EPISODES}"}, "data_files_size_in_mb": 100,
-        "video_files_size_in_mb": 200,
-    }  # fmt: skip
-    for folder in ("meta/episodes/chunk-000", "data/chunk-000"):
-        (root / folder).mkdir(parents=True)
-    (root / "meta/info.json").write_text(json.dumps(info, indent=1))
-    tables = [_rows(vectors, episode) for episode in range(EPISODES)]
-    begins = LENGTH * np.arange(EPISODES)
-    if is_old:
-        for episode, table in enumerate(tables):
-            pq.write_table(table, root / f"data/chunk-000/episode_{episode:06d}.parquet")
-        lines = [json.dumps({"episode_index": n, "tasks": ["wave"], "length": LENGTH}) for n in range(EPISODES)]
-        (root / "meta/episodes.jsonl").write_text("\n".join(lines) + "\n")
-        (root / "meta/tasks.jsonl").write_text(json.dumps({"task_index": 0, "task": "wave"}) + "\n")
-        return
-    pq.write_table(pa.concat_tables(tables), root / "data/chunk-000/file-000.parquet")
-    pq.write_table(pa.table({"task": ["wave"], "task_index": [0]}), root / "meta/tasks.parquet")
-    places = {
-        "episode_index": np.arange(EPISODES), "length": [LENGTH] * EPISODES, "tasks": [["wave"]] * EPISODES,
-        "data/chunk_index": [0] * EPISODES, "data/file_index": [0] * EPISODES,
-        "dataset_from_index": begins, "dataset_to_index": begins + LENGTH,
-    }  # fmt: skip
-    pq.write_table(pa.table(places), root / "meta/episodes/chunk-000/file-000.parquet")
-    (root / "meta/stats.json").write_text("{}")
 
 
 def _rows(vectors: Mapping[str, tuple[Any, NDArray[np.float32]]], episode: int) -> pa.Table:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import io
 import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -117,14 +118,10 @@ def write_drawn(root: Path, drawn: DrawnDataset, seed: int = 0) -> Path:
     for length in drawn.lengths:
         parts.append(pa.table(columns).slice(first, length))
         first += length
-    info = {
-        "codebase_version": drawn.version, "robot_type": "arm", "fps": drawn.fps, "features": features,
-        "total_episodes": len(drawn.lengths), "total_frames": drawn.total, "total_tasks": len(TASKS),
-        "chunks_size": 1000, "splits": {"train": f"0:{len(drawn.lengths)}"},
-    }  # fmt: skip
-    (root / "meta").mkdir(parents=True)
-    (_write_old if drawn.version == "v2.1" else _write_new)(root, drawn, info, parts)
-    (root / "meta/info.json").write_text(json.dumps(info))
+    info = {"codebase_version": drawn.version, "robot_type": "arm", "fps": drawn.fps, "features": features}
+    task_of = [number % 2 for number in range(len(drawn.lengths))]
+    more = _write_videos(root, drawn)
+    write_tables(root, info, parts, TASKS, task_of=task_of, num_files=drawn.num_files, more=more)
     (root / "meta/notes of ours.txt").write_bytes(bytes([seed, 1, 2]))
     (root / "extra/deep").mkdir(parents=True)
     (root / "extra/deep/calibration.bin").write_bytes(random.bytes(20))
@@ -187,49 +184,79 @@ def _stored_images(total: int, kind: str, seed: int) -> pa.Array:
     return pa.array([{"bytes": image, "path": None} for image in images], struct)
 
 
-def _write_old(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: list[pa.Table]) -> None:
-    info["data_path"] = "data/chunk-{episode_chunk:03d}/episode_{episode_index:06d}.parquet"
-    info["video_path"] = "videos/chunk-{episode_chunk:03d}/{video_key}/episode_{episode_index:06d}.mp4"
+def write_tables(
+    root: Path,
+    info: dict[str, Any],
+    parts: Sequence[pa.Table],
+    tasks: Sequence[str],
+    *,
+    task_of: Sequence[int] | None = None,
+    num_files: int = 1,
+    more: Mapping[str, Any] | None = None,
+) -> None:
+    """Write info.json, to which paths and counts are added, and the tables of a dataset of v2.0 to v3.0.
+
+    Args:
+        root: Folder of the dataset.
+        info: Version, rate and features.
+        parts: Rows of each episode.
+        tasks: The instructions.
+        task_of: Number of each episode's task; all have the first one by default.
+        num_files: Data files of a dataset of v3.0.
+        more: Further columns of the table of episodes of v3.0.
+    """
+    lengths, numbers = [len(part) for part in parts], range(len(parts))
+    texts = [[tasks[number]] for number in task_of or [0] * len(parts)]
+    is_old = info["codebase_version"] != "v3.0"
+    name = "episode_chunk:03d}/episode_{episode_index:06d" if is_old else "chunk_index:03d}/file-{file_index:03d"
+    info |= {
+        "total_episodes": len(parts), "total_frames": sum(lengths), "total_tasks": len(tasks), "chunks_size": 1000,
+        "splits": {"train": f"0:{len(parts)}"}, "data_path": f"data/chunk-{{{name}}}.parquet",
+        "video_path": f"videos/chunk-{{{name.replace('/', '/{video_key}/')}}}.mp4" if is_old
+        else f"videos/{{video_key}}/chunk-{{{name}}}.mp4",
+    }  # fmt: skip
+    (root / "meta").mkdir(parents=True, exist_ok=True)
     (root / "data/chunk-000").mkdir(parents=True)
-    episodes = []
-    for number, part in enumerate(parts):
-        pq.write_table(part, root / f"data/chunk-000/episode_{number:06d}.parquet")
-        if drawn.camera in ENCODERS:
-            path = root / f"videos/chunk-000/{TOP}/episode_{number:06d}.mp4"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encoded(drawn.camera, len(part), drawn.gop, drawn.is_fragmented, drawn.pixels))
-        episodes.append({"episode_index": number, "tasks": [TASKS[number % 2]], "length": len(part)})
-    lines = "".join(json.dumps(row) + "\n" for row in episodes)
-    (root / "meta/episodes.jsonl").write_text(lines)
-    tasks = [{"task_index": number, "task": task} for number, task in enumerate(TASKS)]
-    (root / "meta/tasks.jsonl").write_text("".join(json.dumps(row) + "\n" for row in tasks))
-
-
-def _write_new(root: Path, drawn: DrawnDataset, info: dict[str, Any], parts: list[pa.Table]) -> None:
-    info["data_path"] = "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet"
-    info["video_path"] = "videos/{video_key}/chunk-{chunk_index:03d}/file-{file_index:03d}.mp4"
-    for folder in ("data/chunk-000", "meta/episodes/chunk-000", f"videos/{TOP}/chunk-000"):
-        (root / folder).mkdir(parents=True)
-    files = [min(number, drawn.num_files - 1) for number in range(len(parts))]
+    (root / "meta/info.json").write_text(json.dumps(info))
+    if is_old:
+        for number, part in enumerate(parts):
+            pq.write_table(part, root / f"data/chunk-000/episode_{number:06d}.parquet")
+        rows = [{"episode_index": number, "tasks": texts[number], "length": lengths[number]} for number in numbers]
+        (root / "meta/episodes.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+        lines = [json.dumps({"task_index": number, "task": task}) + "\n" for number, task in enumerate(tasks)]
+        (root / "meta/tasks.jsonl").write_text("".join(lines))
+        return
+    files = [min(number, num_files - 1) for number in numbers]
     for file in set(files):
         table = pa.concat_tables(part for part, place in zip(parts, files, strict=True) if place == file)
         pq.write_table(table, root / f"data/chunk-000/file-{file:03d}.parquet")
-    begins = np.cumsum([0, *drawn.lengths])
-    table = {
-        "episode_index": range(len(parts)), "length": drawn.lengths, "data/chunk_index": [0] * len(parts),
-        "tasks": [[TASKS[number % 2]] for number in range(len(parts))], "data/file_index": files,
-        "dataset_from_index": begins[:-1], "dataset_to_index": begins[1:],
+    begins = np.cumsum([0, *lengths])
+    episodes = {
+        "episode_index": numbers, "length": lengths, "tasks": texts, "data/chunk_index": [0] * len(parts),
+        "data/file_index": files, "dataset_from_index": begins[:-1], "dataset_to_index": begins[1:],
     }  # fmt: skip
-    if drawn.camera in ENCODERS:
-        path = root / f"videos/{TOP}/chunk-000/file-000.mp4"
-        path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.is_fragmented, drawn.pixels))
-        table |= {f"videos/{TOP}/{name}": [0] * len(parts) for name in ("chunk_index", "file_index")}
-        table |= {
-            f"videos/{TOP}/{name}_timestamp": [number / drawn.fps for number in numbers]
-            for name, numbers in (("from", begins[:-1]), ("to", begins[1:]))
-        }
-    pq.write_table(pa.table(table), root / "meta/episodes/chunk-000/file-000.parquet")
-    pq.write_table(pa.table({"task": TASKS, "task_index": range(len(TASKS))}), root / "meta/tasks.parquet")
+    (root / "meta/episodes/chunk-000").mkdir(parents=True)
+    pq.write_table(pa.table({**episodes, **(more or {})}), root / "meta/episodes/chunk-000/file-000.parquet")
+    pq.write_table(pa.table({"task": tasks, "task_index": range(len(tasks))}), root / "meta/tasks.parquet")
+
+
+def _write_videos(root: Path, drawn: DrawnDataset) -> dict[str, Any]:
+    """Write the videos, and return their columns of the table of episodes of v3.0."""
+    if drawn.camera not in ENCODERS:
+        return {}
+    if drawn.version == "v2.1":
+        for number, length in enumerate(drawn.lengths):
+            path = root / f"videos/chunk-000/{TOP}/episode_{number:06d}.mp4"
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(encoded(drawn.camera, length, drawn.gop, drawn.is_fragmented, drawn.pixels))
+        return {}
+    path = root / f"videos/{TOP}/chunk-000/file-000.mp4"
+    path.parent.mkdir(parents=True)
+    path.write_bytes(encoded(drawn.camera, drawn.total, drawn.gop, drawn.is_fragmented, drawn.pixels))
+    begins = np.cumsum([0, *drawn.lengths]) / drawn.fps
+    zeros = [0] * len(drawn.lengths)
+    columns = {"chunk_index": zeros, "file_index": zeros, "from_timestamp": begins[:-1], "to_timestamp": begins[1:]}
+    return {f"videos/{TOP}/{name}": column for name, column in columns.items()}
 
 
 @functools.cache

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 from PIL import Image
+
+from support.drawn_datasets import write_tables
 
 DATA, TASKS = "data/chunk-000/file-000.parquet", "meta/tasks.parquet"
 EPISODES = "meta/episodes/chunk-000/file-000.parquet"
@@ -30,8 +30,6 @@ def write_foreign(
 
     The values of the state are those of `state` for each element and row, by default noise.
     """
-    for place in (DATA, EPISODES):
-        (root / place).parent.mkdir(parents=True)
     rows, names = length * episodes, list(state or "abc")
     width = len(names)
     shapes: dict[str, Any] = {
@@ -40,13 +38,6 @@ def write_foreign(
         "observation.images.top": {"dtype": "image", "shape": [size[1], size[0], 3], "names": None},
         **{name: {"dtype": kind, "shape": [1], "names": None} for name, kind in _COUNTERS.items()},
     }
-    template = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200, "video_path": None}
-    info = {
-        "codebase_version": "v3.0", "fps": 10, "features": shapes, "total_episodes": episodes, "total_frames": rows,
-        "total_tasks": 1, "robot_type": "so100", "splits": {"train": f"0:{episodes}"}, **template,
-        "data_path": "data/chunk-{chunk_index:03d}/file-{file_index:03d}.parquet",
-    }  # fmt: skip
-    (root / "meta/info.json").write_text(json.dumps(info))
     shown = io.BytesIO()
     Image.new("RGB", size).save(shown, "PNG")
     noise = np.random.default_rng(0).normal(size=(rows, width))
@@ -63,14 +54,8 @@ def write_foreign(
         "index": np.arange(rows),
         "task_index": np.zeros(rows, np.int64),
     }
-    pq.write_table(pa.table(columns), root / DATA)
-    pq.write_table(pa.table({"task": ["push it"], "task_index": [0]}), root / TASKS)
-    begins = length * np.arange(episodes)
-    table = {
-        "episode_index": np.arange(episodes), "length": [length] * episodes, "tasks": [["push it"]] * episodes,
-        "data/chunk_index": [0] * episodes, "data/file_index": [0] * episodes,
-        "dataset_from_index": begins, "dataset_to_index": begins + length,
-    }  # fmt: skip
-    pq.write_table(pa.table(table), root / EPISODES)
+    info = {"codebase_version": "v3.0", "fps": 10, "robot_type": "so100", "features": shapes}
+    table = pa.table(columns)
+    write_tables(root, info, [table.slice(length * number, length) for number in range(episodes)], ["push it"])
     (root / "meta/stats.json").write_text("{}")
     return root

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 
 import h5py
@@ -159,22 +158,6 @@ def test_a_file_with_foreign_notes_or_links_is_not_replaced(run: Path, tmp_path:
         with pytest.raises(ConfigError, match=f"files that are not part of .*{word}"):
             export(run, target, "hdf5", overwrite=True)
         assert target.read_bytes() == before
-
-
-@pytest.mark.slow
-def test_no_times_are_kept(run: Path, tmp_path: Path) -> None:
-    """HDF5 stores whole seconds; with times, as in the last two files, a second later gives a different file."""
-
-    def make(name: str) -> None:
-        export(run, tmp_path / f"{name}.hdf5", "hdf5", episodes="0")
-        with h5py.File(tmp_path / f"{name}-timed.hdf5", "w") as file:
-            file.create_dataset("x", data=np.arange(3), track_times=True)
-
-    make("now")
-    time.sleep(1.1)
-    make("later")
-    assert (tmp_path / "now.hdf5").read_bytes() == (tmp_path / "later.hdf5").read_bytes()
-    assert (tmp_path / "now-timed.hdf5").read_bytes() != (tmp_path / "later-timed.hdf5").read_bytes()
 
 
 def test_robomimic_reads_it(run: Path, tmp_path: Path) -> None:

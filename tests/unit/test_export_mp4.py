@@ -75,19 +75,6 @@ def test_every_image_and_time_comes_back(tmp_path: Path, codec: str, fps: int) -
         assert np.array_equal(frame.to_ndarray(format="rgb24"), expected)
 
 
-def test_buffered_images_are_written_unchanged_and_removed(tmp_path: Path) -> None:
-    videos = [coded("h264", count, seed=count)[0] for count in (5, 9, 3, 7)]
-    aside = tmp_path / "aside"
-    aside.mkdir()
-    for name, put in (("a.mp4", ()), ("b.mp4", (1, 2)), ("c.mp4", (0, 1, 2, 3)), ("d.mp4", (0, 3))):
-        writer = Mp4Writer(tmp_path / name, videos[0], fps=30)
-        for number, video in enumerate(videos):
-            writer.add(video.put_aside(aside) if number in put else video)
-        writer.close()
-        assert (tmp_path / name).read_bytes() == (tmp_path / "a.mp4").read_bytes()
-        assert list(aside.iterdir()) == []
-
-
 def test_invalid_images_are_refused(tmp_path: Path) -> None:
     _, units = encoded("av1", 3)
     for nothing in (b"", b"\x12\x00"):  # the second is a temporal delimiter alone

@@ -125,13 +125,6 @@ def test_an_edited_card_is_kept_when_the_run_has_changed(run: Path, is_known: bo
     assert not (run / "unfinished" / "dataset").exists()
 
 
-def test_an_unedited_card_is_replaced_silently(run: Path) -> None:
-    said: list[str] = []
-    assert export_run(run, repo_id="me/other", says=said.append)[1] is not None
-    assert not said
-    assert not list((run / "unfinished").glob("*"))
-
-
 def test_a_dangling_link_is_reported(run: Path) -> None:
     shutil.rmtree(run / "dataset")
     (run / "dataset").symlink_to(run / "nowhere")

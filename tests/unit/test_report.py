@@ -23,9 +23,8 @@ from support.mcap import rewritten
 from support.recording import frame_number, write_episode
 
 from demorec.episode.roles import NO_NAMES, Column, find_roles
-from demorec.extensions.report.content import Components, add_motion
 from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, strip_budget
-from demorec.extensions.report.gather import gather
+from demorec.extensions.report.gather import Components, add_motion, gather
 from demorec.extensions.report.page import distribution, page
 from demorec.mcap import Recording
 
@@ -150,9 +149,8 @@ def test_a_dataset_and_its_run_have_the_same_report(run: Path, dataset: Path) ->
     ours, theirs = gather(run), gather(dataset)
     of_run = {key: np.concatenate(parts).tolist() for key, parts in gather(run / "episodes").distributions.items()}
     assert {key: np.concatenate(parts).tolist() for key, parts in theirs.distributions.items()} == of_run
-    assert [e.success for e in theirs.episodes] == [e.success for e in ours.episodes]
-    assert [e.phases for e in theirs.episodes[:3]] == [e.phases for e in ours.episodes[:3]]
-    assert theirs.episodes[3].failure == ours.episodes[3].failure
+    for name in ("name", "success", "phases", "seed", "instruction", "num_frames"):
+        assert [getattr(e, name) for e in theirs.episodes] == [getattr(e, name) for e in ours.episodes[:3]]
     assert not theirs.missing
 
 
@@ -171,12 +169,7 @@ def test_a_third_party_dataset_lists_missing_parts(dataset: Path, tmp_path: Path
         del plain["features"][f"observation.images.{name}"]
     file.write_text(json.dumps(plain))
     found = report_on(other)
-    for words in (
-        "Without a column next.success, the outcomes of the episodes are not known.",
-        "It has no color images, so there are no filmstrips.",
-        "No action found, so nothing was judged by it",
-    ):
-        assert words in found.words
+    assert "No action found, so nothing was judged by it" in found.words
     assert list(found.all("img")) == []
     assert all("outcome unknown" in words for words in found.articles)
 
@@ -268,16 +261,10 @@ def test_unreadable_inputs_are_reported(run: Path, tmp_path: Path) -> None:
     assert len(found.articles) == 4
 
 
-@pytest.mark.slow
-def test_workers_find_the_same(run: Path) -> None:
-    assert page(gather(run, workers=2)) == page(gather(run))
-
-
 def test_refusals(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     for arguments, words in (
         ((run, "--out", tmp_path / "x.pdf"), "--out names an .html file"),
         ((run, "--out", tmp_path / "no" / "x.html"), "is missing"),
-        ((run, "--out", tmp_path / "x.html", "--workers", "0"), "--workers is 0"),
         ((run, "--out", tmp_path / "x.html", "--no-checks", "--images"), "leave one of them out"),
     ):
         assert exit_code("report", *arguments) == 2

@@ -20,7 +20,7 @@ from demorec.datasets.lerobot.language import EVENTS, PERSISTENT
 from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, DatasetFeature, DatasetInfo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, SECOND_CARD_PATH, SIDECAR_DIR
-from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -112,7 +112,6 @@ tags:
 # {repo_id}
 
 {summary}
-{success}
 
 ## Task
 
@@ -198,7 +197,6 @@ def _card(
         simulation=wording.tags,
         repo_id=options.repo_id,
         summary=_summary(info, wording, is_transcoded=is_transcoded),
-        success=_success(root),
         tasks="\n".join(listed),
         features="\n".join(features),
         rows=wording.rows,
@@ -226,14 +224,3 @@ def _feature_meaning(key: str, item: DatasetFeature, meaning: Mapping[str, str])
     if key.startswith(IMAGE_PREFIX):
         return f"camera {markdown(key.removeprefix(IMAGE_PREFIX))}, RGB"
     return meaning.get(key, "as in the recordings")
-
-
-def _success(root: Path) -> str:
-    rows = rows_in(root, f"{SIDECAR_DIR}/attempts", ["success"], schema=ATTEMPT_SCHEMA)
-    outcomes = [row["success"] for row in rows]
-    good, unknown = outcomes.count(True), outcomes.count(None)
-    known = len(outcomes) - unknown
-    text = f"Episodes with an unknown outcome: {unknown}." if unknown else ""
-    if known:
-        text += f" {good} of {known} attempts that were made for this dataset succeeded ({100 * good / known:.1f} %)."
-    return text.strip()

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,12 +26,10 @@ from demorec.datasets.lerobot.layout import CODEBASE_VERSION, combined_digest
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.paths import CARD_PATH, DATASET, GROWING_DATASET
 from demorec.datasets.lerobot.prepare import NO_PLACE, ExportedEpisode, export_episode, prepare_episode
-from demorec.datasets.lerobot.sidecar import attempt_row
 from demorec.datasets.lerobot.verify import LEROBOT, MAX_EPISODES, Verifier, lerobot_is_installed
 from demorec.datasets.lerobot.writer import DatasetStart, DatasetWriter
 from demorec.datasets.options import ExportReport, ProgressCallback
-from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
-from demorec.episode.episode import Outcome
+from demorec.datasets.sources import Intake, LeftOut, find_recordings, places_of, why_left_out
 from demorec.mcap import open_recording
 
 _STATED_OPTIONS = (
@@ -98,17 +95,17 @@ class _Export:
         """Write all recordings to an empty folder, or to one with links to the existing dataset's files."""
         aside = folder.with_name(_ENCODED)  # removed with all files next to the new folder
         aside.mkdir(exist_ok=True)
-        found = self._noted(_read_recordings(self._found, self._options, progress, folder=aside))
-        begun: list[ReadRecording] = []  # until the first episode, which decides the features
-        for recording in found:
-            begun.append(recording)
-            if recording.episode is not None:
-                break
-        if not begun or (first := begun[-1].episode) is None:
+        episodes = self._episodes(aside, progress)
+        begin = next(episodes, None)
+        if begin is None:
             raise self._intake.nothing_to_export()
+        _, first = begin  # which decides the features
         with DatasetWriter(folder, self._start(first)) as writer:
-            for recording in chain(begun, found):
-                self._add(writer, recording)
+            for path, episode in chain([begin], episodes):
+                self._digests[path] = writer.add(episode.data)
+                if self._options.language is not None and not episode.has_statements:
+                    self._silent.append(path.name)
+                self._transcoded.update(dict.fromkeys(episode.transcoded))
             self._refuse_duplicates()
             self._refuse_silence()
             stated = {name: getattr(self._options, name) for name in _STATED_OPTIONS}
@@ -121,9 +118,9 @@ class _Export:
             num_episodes=finished.total_episodes,
             num_frames=finished.total_frames,
             new_episodes=len(self._digests),
-            skipped_failures=self._intake.skipped_failures,
-            skipped_unknown=self._intake.skipped_unknown,
-            skipped_unwanted=self._intake.skipped_unwanted,
+            skipped_failures=self._intake.skipped["failures"],
+            skipped_unknown=self._intake.skipped["unknown"],
+            skipped_unwanted=self._intake.skipped["unwanted"],
             transcoded=tuple(self._transcoded),
             left_out=(*self._left_out, *(NO_PLACE if self._options.motor_units else ())),
             depth_left_out=first.depth_left_out,
@@ -150,23 +147,24 @@ class _Export:
             )
         return start
 
-    def _noted(self, found: Iterable[ReadRecording]) -> Iterator[ReadRecording]:
-        """Count each recording, and compare it with the others, before it is written."""
-        for recording in found:
-            if recording.episode is None:
-                self._intake.leave_out(recording.outcome)
-            else:
-                self._intake.take(recording.path, recording.episode.traits)
-            yield recording
+    def _episodes(self, folder: Path, progress: ProgressCallback | None) -> Iterator[tuple[Path, ExportedEpisode]]:
+        """Yield each selected recording and its episode in order; count the others, and compare the traits.
 
-    def _add(self, writer: DatasetWriter, recording: ReadRecording) -> None:
-        if (episode := recording.episode) is None:
-            writer.add_attempt(recording.attempt)
-            return
-        self._digests[recording.path] = writer.add(episode.data)
-        if self._options.language is not None and not episode.has_statements:
-            self._silent.append(recording.path.name)
-        self._transcoded.update(dict.fromkeys(episode.transcoded))
+        Several processes read ahead if that saves time. They store the images in `folder`, because sending them through
+        a pipe takes as long as the rest of the work.
+        """
+        paths, options = self._found, self._options
+        workers = options.workers or _workers_that_pay(paths, options)
+        read = partial(_read, options=options, folder=None if workers == 1 else folder)
+        recordings = in_turn(read, paths, workers, ahead=_AHEAD)
+        for done, (path, found) in enumerate(zip(paths, recordings, strict=True), start=1):
+            if isinstance(found, ExportedEpisode):
+                self._intake.take(path, found.traits)
+                yield path, found
+            else:
+                self._intake.leave_out(found)
+            if progress is not None:
+                progress(done, len(paths))
 
     def _refuse_duplicates(self) -> None:
         there = {digest: number for number, digest in enumerate(self._before)}
@@ -226,50 +224,16 @@ _AHEAD = 3
 """Maximum number of recordings that each process may be ahead of the writer, to limit memory."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class ReadRecording:
-    """A recording read for a dataset.
-
-    Attributes:
-        attempt: Row of the table of attempts.
-        outcome: Recorded outcome; None if the recording has none.
-        episode: The episode; None for a failed attempt to leave out. Only the metadata of such an attempt is read, so
-        its faults do not stop the export.
-    """
-
-    path: Path
-    attempt: Mapping[str, Any]
-    outcome: Outcome | None
-    episode: ExportedEpisode | None
-
-
-def _read(path: Path, options: ExportOptions, folder: Path | None) -> ReadRecording | None:
-    """Read one recording; None if its episode is not selected (`is_wanted`)."""
+def _read(path: Path, options: ExportOptions, folder: Path | None) -> ExportedEpisode | LeftOut:
+    """Read one recording. Only the metadata of one to leave out is read, so its faults do not stop the export."""
     with open_recording(path) as recording:
-        if not is_wanted(recording, options):
-            return None
-        attempt = attempt_row(recording)
-        episode = prepare_episode(export_episode(recording, options)) if goes_in(recording, options) else None
-        outcome = recording.outcome
-    if episode is not None and folder is not None:
+        if (reason := why_left_out(recording, options)) is not None:
+            return reason
+        episode = prepare_episode(export_episode(recording, options))
+    if folder is not None:
         videos = {key: video.put_aside(folder) for key, video in episode.data.videos.items()}
         episode = replace(episode, data=replace(episode.data, videos=videos))
-    return ReadRecording(path=path, attempt=attempt, outcome=outcome, episode=episode)
-
-
-def _read_recordings(
-    sources: Sequence[Path], options: ExportOptions, progress: ProgressCallback | None, *, folder: Path
-) -> Iterator[ReadRecording]:
-    """Yield every selected recording in order. Several processes read ahead if that saves time. They store the images
-    in `folder`, because sending them through a pipe takes as long as the rest of the work.
-    """
-    workers = options.workers or _workers_that_pay(sources, options)
-    one = partial(_read, options=options, folder=None if workers == 1 else folder)
-    for done, recording in enumerate(in_turn(one, sources, workers, ahead=_AHEAD), start=1):
-        if recording is not None:
-            yield recording
-        if progress is not None:
-            progress(done, len(sources))
+    return episode
 
 
 def _workers_that_pay(sources: Sequence[Path], options: ExportOptions) -> int:

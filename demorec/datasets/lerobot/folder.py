@@ -28,7 +28,6 @@ from demorec.datasets.lerobot.episode_places import (
     places_by_rows,
     read_episode_table,
     read_tasks,
-    relocated,
     rows_by_file,
 )
 from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
@@ -43,7 +42,6 @@ if TYPE_CHECKING:
     from demorec.datasets.lerobot.boxes import StoredBoxes
     from demorec.datasets.lerobot.robots import DatasetRobot
     from demorec.datasets.lerobot.rows import StoredImages
-    from demorec.datasets.lerobot.sidecar import Attempts
     from demorec.datasets.lerobot.videos import EpisodeVideo, VideoFile
     from demorec.episode.info import Camera, Feature, Kept
     from demorec.robots.motors import Motors
@@ -100,6 +98,7 @@ class LeRobotFolder:
         self.camera = cache(self._camera)
         self.robot = cache(self._robot)
         self.boxes = cache(self._stored_boxes)
+        self._sidecar_index = cache(lambda table: IndexedRows(self.sidecar_tables(table), rows=64))
 
     def _video_file(self, path: Path) -> VideoFile:
         from demorec.datasets.lerobot.videos import VideoFile
@@ -115,12 +114,12 @@ class LeRobotFolder:
 
     @cached_property
     def listed(self) -> tuple[EpisodePlace, ...]:
-        """Episodes in the episodes' table, or located by the rows if it is missing or names other files."""
+        """Episodes in the episodes' table, or located by the rows if it is missing."""
         return self._listed_and_problem[0]
 
     @property
     def is_found_by_rows(self) -> bool:
-        """Whether the table of episodes is missing or wrong, so that the episodes were located by their rows."""
+        """Whether the table of episodes is missing, so that the episodes were located by their rows."""
         return self._listed_and_problem[1] != ""
 
     @property
@@ -178,12 +177,7 @@ class LeRobotFolder:
     @cached_property
     def _listed_and_problem(self) -> tuple[tuple[EpisodePlace, ...], str]:
         if has_episode_table(self.root, self.info):
-            listed = tuple(read_episode_table(self.root, self.info))
-            with suppress(ExportError):  # an unreadable file is reported for its own episodes
-                if not self.info.is_old and (found := relocated(self.root, listed)) is not None:
-                    moved = sum(a.data != b.data for a, b in zip(listed, found, strict=True))
-                    return found, f"The table of episodes names wrong data files for {moved} of them: {_BY_ROWS}"
-            return listed, ""
+            return tuple(read_episode_table(self.root, self.info)), ""
         found = places_by_rows(self.root, self.info, self.tasks) if tables_in(self.root, "data") else ()
         return found, f"The dataset has no table of episodes: {_BY_ROWS}" if found else ""
 
@@ -288,12 +282,12 @@ class LeRobotFolder:
         return {key: StoredImages(self.rows([key])) for key in keys}
 
     def sidecar_tables(self, table: str) -> list[Path]:
-        """List the files of a table of the sidecar: "episodes", "attempts", or "camera_poses"."""
+        """List the files of a table of the sidecar: "episodes" or "camera_poses"."""
         return tables_in(self.root, f"{SIDECAR_DIR}/{table}")
 
     def sidecar_rows(self, table: str, episode_index: int) -> list[dict[str, Any]]:
         """Read all rows of an episode in a table of the sidecar."""
-        found = IndexedRows(self.sidecar_tables(table), rows=64).read(episode_index)
+        found = self._sidecar_index(table).read(episode_index)
         return [] if found is None else found.to_pylist()
 
     def sidecar(self, names: Sequence[str]) -> list[dict[str, Any]]:
@@ -309,13 +303,6 @@ class LeRobotFolder:
             there = [name for name in ("episode_index", *names) if name in stored]
             found += [dict.fromkeys(names) | row for row in read_table(path, there, schema=EPISODE_SCHEMA).to_pylist()]
         return found
-
-    @cached_property
-    def attempts(self) -> Attempts:
-        """The attempts of the sidecar."""
-        from demorec.datasets.lerobot.sidecar import Attempts
-
-        return Attempts(self.sidecar_tables("attempts"))
 
     def _stored_boxes(self, key: str) -> StoredBoxes | None:
         from demorec.datasets.lerobot.boxes import BOXES_DIR, StoredBoxes

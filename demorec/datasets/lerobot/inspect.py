@@ -1,4 +1,4 @@
-"""Inspection of a dataset: attempts, missing parts, values of each episode, stored types, and the content digest."""
+"""Inspection of a dataset: missing parts, values of each episode, stored types, and the content digest."""
 
 from __future__ import annotations
 
@@ -35,20 +35,6 @@ _SIDECAR = ("source", "success", "failure_phase", "failure_reason", "num_retries
 """Columns of the sidecar for selecting episodes."""
 _DTYPE_NAMES = {"halffloat": "float16", "float": "float32", "double": "float64", "large_string": "string"}
 """Arrow's type names -> LeRobot's, if different."""
-
-
-def attempt_counts(folder: LeRobotFolder) -> tuple[int, int, int] | None:
-    """Count (successful episodes, episodes without a known outcome, attempts made); None if no outcome is known. Raises
-    ExportError if its tables are damaged.
-    """
-    attempts = folder.sidecar_tables("attempts")
-    if not attempts:
-        return None
-    outcomes = [row["success"] for row in folder.sidecar(["success"])]
-    if all(outcome is None for outcome in outcomes):
-        return None
-    num_attempts = sum(open_table(file).metadata.num_rows for file in attempts)
-    return outcomes.count(True), outcomes.count(None), num_attempts
 
 
 def known_units(folder: LeRobotFolder) -> Mapping[str, tuple[str, ...]]:

@@ -46,7 +46,6 @@ STATS_PATH = "meta/stats.json"
 OLD_EPISODES_PATH, OLD_TASKS_PATH = "meta/episodes.jsonl", "meta/tasks.jsonl"
 
 SIDECAR_EPISODES_PATH = f"{SIDECAR_DIR}/episodes/{_CHUNK}.parquet"
-SIDECAR_ATTEMPTS_PATH = f"{SIDECAR_DIR}/attempts/{_CHUNK}.parquet"
 SIDECAR_CAMERAS_PATH = f"{SIDECAR_DIR}/camera_poses/{_CHUNK}.parquet"
 
 FeatureType = Literal["float32", "float64", "int64", "bool", "string", "video", "image", "language"]
@@ -232,7 +231,6 @@ class DatasetInfo:
         other: Other entries of the file.
         version: Format of the dataset.
         unlisted: The added features.
-        splits: Splits to write; None for a single one with all episodes.
     """
 
     fps: int
@@ -249,7 +247,6 @@ class DatasetInfo:
     other: dict[str, Any] = field(default_factory=dict)
     version: str = CODEBASE_VERSION
     unlisted: tuple[str, ...] = ()
-    splits: Mapping[str, str] | None = None
 
     @property
     def is_old(self) -> bool:
@@ -270,7 +267,7 @@ class DatasetInfo:
             **{name: getattr(self, name) for name in _PLAIN_FIELDS},
             "video_path": self.video_path if self.video_keys else None,
             "robot_type": self.robot_type,
-            "splits": self.splits or {"train": f"0:{self.total_episodes}"},
+            "splits": {"train": f"0:{self.total_episodes}"},
             **self.other,
         }
         return json.dumps(data, indent=4, ensure_ascii=False) + "\n"

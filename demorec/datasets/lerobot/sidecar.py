@@ -4,8 +4,6 @@
   check with value and limit), phases, cameras with intrinsics and extrinsics, final poses of objects, and
   `episode_info`: the complete description of scene and robot as JSON, from which `demorec` can rebuild the world.
 - `camera_poses/`: one row per frame, for cameras that move.
-- `attempts/`: one row per attempt, including failed ones, for success rates. A failed attempt precedes the attempt that
-  became an episode.
 - `robots/`: the arms as URDFs (`demorec.datasets.lerobot.robots`).
 - `configs.json`: config digest -> resolved configuration; `export.json`: options of the export.
 """
@@ -15,7 +13,6 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -25,9 +22,8 @@ import pyarrow as pa
 from demorec.core.files import Closing
 from demorec.core.geometry import Array
 from demorec.core.plain import to_json, to_plain
-from demorec.datasets.lerobot.files import read_table, write_text
+from demorec.datasets.lerobot.files import write_text
 from demorec.datasets.lerobot.layout import (
-    SIDECAR_ATTEMPTS_PATH,
     SIDECAR_CAMERAS_PATH,
     SIDECAR_EPISODES_PATH,
     DatasetInfo,
@@ -40,7 +36,6 @@ from demorec.episode.episode import Outcome, consecutive_runs
 if TYPE_CHECKING:
     from demorec.datasets.episode import ExportEpisode
     from demorec.episode.info import Camera, Simulation
-    from demorec.mcap import Recording
 
 CONFIGS_PATH = f"{SIDECAR_DIR}/configs.json"
 EXPORT_PATH = f"{SIDECAR_DIR}/export.json"
@@ -86,28 +81,18 @@ EPISODE_SCHEMA = pa.schema(
 )
 
 
-_OF_ATTEMPT = (
-    "episode_index", "source", "run_episode_index", "attempt", "success", "failure_phase", "failure_reason",
-)  # fmt: skip
-ATTEMPT_SCHEMA = pa.schema([EPISODE_SCHEMA.field(name) for name in _OF_ATTEMPT])
-
-
 @dataclass(frozen=True, kw_only=True, eq=False)
 class EpisodeRecord:
     """The sidecar's data about one episode of the dataset.
 
     Attributes:
         row: Row of the table of episodes, without the index.
-        attempt: Row of the table of attempts, also without the index.
-        failed: Rows of the failed attempts before it, for an episode from another dataset.
         moving_cameras: Camera -> (T, 7) world_from_camera of every frame in the dataset.
         config: Configuration of the run.
         robot: The arm; None if unknown.
     """
 
     row: Mapping[str, Any]
-    attempt: Mapping[str, Any]
-    failed: Sequence[Mapping[str, Any]] = ()
     moving_cameras: Mapping[str, Array] = field(default_factory=dict)
     config: Mapping[str, Any] = field(default_factory=dict)
     robot: DatasetRobot | None = None
@@ -116,20 +101,23 @@ class EpisodeRecord:
     def of(cls, episode: ExportEpisode[Any]) -> EpisodeRecord:
         """Describe an episode; frame numbers are those of the dataset."""
         info, recording, simulation = episode.info, episode.recording, episode.info.simulation
-        attempt, robot = attempt_row(recording), robot_of(episode)
+        outcome, robot = recording.outcome, robot_of(episode)
         row = {
-            **{name: attempt[name] for name in ("source", "run_episode_index", "attempt", "success", "failure_reason")},
+            "source": recording.path.name,
+            "run_episode_index": info.episode_index,
+            "attempt": info.attempt,
+            "success": recording.success,
+            "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
             "origin": info.origin if isinstance(info.origin, str) else to_json(info.origin),
             "cameras": [_described_camera(camera) for camera in info.cameras],
             "robot_digest": None if robot is None else robot.digest,
         }
         if simulation is None:
-            return cls(row=row, attempt=attempt, robot=robot)
+            return cls(row=row, robot=robot)
         poses = recording.trajectory().world_from_camera
         moving = [camera.name for camera in info.cameras if camera.mount != "world"]
         return cls(
             row=row | _simulated_row(simulation, episode),
-            attempt=attempt,
             moving_cameras={name: poses[name][episode.rows] for name in moving},
             config=simulation.config,
             robot=robot,
@@ -184,7 +172,6 @@ class SidecarWriter(Closing):
         self._root, self._info = root, info
         self._tables: list[RollingParquet] = []
         self._episodes = self._table(SIDECAR_EPISODES_PATH, EPISODE_SCHEMA)
-        self._attempts = self._table(SIDECAR_ATTEMPTS_PATH, ATTEMPT_SCHEMA)
         self._camera_poses: RollingParquet | None = None
         self._configs: dict[str, Any] = dict(configs)
 
@@ -199,21 +186,14 @@ class SidecarWriter(Closing):
             table.abort()
 
     def add(self, episode_index: int, digest: str, record: EpisodeRecord) -> None:
-        """Add an episode of the dataset, its digest, and the attempts before it."""
+        """Add an episode of the dataset and its digest."""
         self._episodes.add_row({**record.row, "episode_index": episode_index, "content_digest": digest})
         if record.robot is not None:
             write_robot(self._root, record.robot)
         if record.config:
             self._configs.setdefault(record.row["config_digest"], record.config)
-        for attempt in record.failed:
-            self.add_attempt(attempt)
-        self.add_attempt(record.attempt, episode_index)
         if record.moving_cameras:
             self._add_camera_poses(episode_index, record.moving_cameras)
-
-    def add_attempt(self, attempt: Mapping[str, Any], episode_index: int | None = None) -> None:
-        """Add an attempt; `episode_index` is None if it is not in the dataset."""
-        self._attempts.add_row({**attempt, "episode_index": episode_index})
 
     def _add_camera_poses(self, episode_index: int, poses: Mapping[str, Array]) -> None:
         if self._camera_poses is None:
@@ -233,47 +213,3 @@ class SidecarWriter(Closing):
             table.close()
         write_text(self._root / CONFIGS_PATH, json.dumps(self._configs, indent=2, sort_keys=True) + "\n")
         write_text(self._root / EXPORT_PATH, json.dumps(dict(export), indent=2, sort_keys=True) + "\n")
-
-
-def attempt_row(recording: Recording) -> dict[str, Any]:
-    """Return one attempt, without `episode_index`, from the recording's metadata; `success` is None if unknown."""
-    info, outcome = recording.info, recording.outcome
-    return {
-        "source": recording.path.name,
-        "run_episode_index": info.episode_index,
-        "attempt": info.attempt,
-        "success": recording.success,
-        "failure_phase": "" if outcome is None else outcome.failure_phase,
-        "failure_reason": "cut off by a crash" if outcome is None else outcome.failure_reason,
-    }
-
-
-class Attempts:
-    """The rows of a sidecar's table of attempts, grouped by episode. Raises ExportError if a table cannot be read.
-
-    Attributes:
-        own: Episode -> the attempt that produced it.
-        failed: Episode -> failed attempts before it.
-        homeless: Failed attempts at episodes that are not in the dataset.
-        failures: All failed attempts, in order.
-    """
-
-    def __init__(self, paths: Sequence[Path]) -> None:
-        self.own: dict[int, dict[str, Any]] = {}
-        self.failed: dict[int, list[dict[str, Any]]] = {}
-        self.homeless: list[dict[str, Any]] = []
-        self.failures: list[dict[str, Any]] = []
-        waiting: list[dict[str, Any]] = []
-        for row in chain.from_iterable(
-            read_table(path, ATTEMPT_SCHEMA.names, schema=ATTEMPT_SCHEMA).to_pylist() for path in paths
-        ):
-            episode, run_episode = row["episode_index"], row["run_episode_index"]
-            if episode is None:
-                waiting.append(row)
-                self.failures.append(row)
-                continue
-            self.own[episode] = row
-            self.failed[episode] = [attempt for attempt in waiting if attempt["run_episode_index"] == run_episode]
-            self.homeless += [attempt for attempt in waiting if attempt["run_episode_index"] != run_episode]
-            waiting = []
-        self.homeless += waiting

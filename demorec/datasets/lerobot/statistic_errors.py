@@ -122,14 +122,7 @@ def _largest_errors(
     counts: Sequence[int],
     episodes: Sequence[Ranges],
 ) -> list[tuple[float, str]]:
-    """Find the largest error of each feature's quantities in standard deviations, and the quantity.
-
-    Args:
-        stored: Quantity -> its numbers, for each feature.
-        values: (N, D) rows of each feature, N the same for all: their columns are judged at once.
-        counts: Number of rows that each feature's count should have.
-        episodes: Quantiles of the episodes; those of the set may be between them.
-    """
+    """Find the largest error of each feature's (N, D) values in standard deviations, and its quantity."""
     widths = [each.shape[1] for each in values]
     entries = [entry or {} for entry in stored]
     found = np.stack(

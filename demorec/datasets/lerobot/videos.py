@@ -147,17 +147,10 @@ class VideoFile:
 
 
 class _Part(NamedTuple):
-    """The stored images from which some frames are decoded.
+    """The stored images from which some frames are decoded; `lead` are shown before them, and `tail` after them."""
 
-    Attributes:
-        numbers: (lead + T + tail,) image numbers in the file, in storage order.
-        places: (lead + T + tail,) display position of each, from 0.
-        lead: Number of images shown before the first frame.
-        tail: Number of images shown after the last frame.
-    """
-
-    numbers: NDArray[np.intp]
-    places: NDArray[np.int64]
+    numbers: NDArray[np.intp]  # (lead + T + tail,) in the file, in storage order
+    places: NDArray[np.int64]  # (lead + T + tail,) display position of each, from 0
     lead: int
     tail: int
 

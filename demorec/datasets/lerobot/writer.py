@@ -221,11 +221,6 @@ class DatasetWriter(Closing):
         self.num_episodes += 1
         return digest
 
-    def add_attempt(self, attempt: Mapping[str, Any]) -> None:
-        """Add an attempt that is not in the dataset to the sidecar."""
-        if self._sidecar is not None:
-            self._sidecar.add_attempt(attempt)
-
     def _write_rows(self, columns: Mapping[str, NDArray[Any] | pa.Array]) -> None:
         arrays = []
         for item in self._schema:

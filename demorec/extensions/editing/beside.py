@@ -1,6 +1,6 @@
 """Files next to an edited dataset's tables, and the data of its sources that it omits.
 
-These are the sidecar's rows, robots, attempts, camera poses, boxes and progress. Omissions are known before anything is
+These are the sidecar's rows, robots, camera poses, boxes and progress. Omissions are known before anything is
 written.
 """
 
@@ -11,27 +11,22 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
-
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
 from demorec.core.plain import listed, parse_json, to_json
 from demorec.datasets.lerobot.boxes import BOXES_DIR, SeenByCamera
 from demorec.datasets.lerobot.dataset_features import MODALITY_PATH
-from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS, write_progress
+from demorec.datasets.lerobot.facts import PROGRESS_PATH, PROPORTIONS_PATH, STAGE_COLUMNS
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES
 from demorec.datasets.lerobot.paths import CARD_PATH, INFO_PATH, SECOND_CARD_PATH, SIDECAR_DIR, is_dataset_file
 from demorec.datasets.lerobot.rows import IndexedRows
-from demorec.datasets.lerobot.sidecar import ATTEMPT_SCHEMA, CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
+from demorec.datasets.lerobot.sidecar import CONFIGS_PATH, EPISODE_SCHEMA, EXPORT_PATH, EpisodeRecord
 from demorec.extensions.editing.plan import EpisodeSlice, Plan
 
 _OF_SCENE = ("root_seed", "config_digest", "final_state_digest", "objects", "episode_info")
 """Columns that describe a simulated episode as recorded, and do not apply to a cut one."""
-_COUNTERS = ("index", "episode_index", "frame_index")
+_COUNTERS = ("episode_index", "frame_index")
 _ROWS_AT_ONCE = 4096
 _ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", MODALITY_PATH)
 """Files that are copied if all sources have the same."""
@@ -55,51 +50,12 @@ def _poses_are_kept(plan: Plan) -> bool:
     return len(found) <= 1 and None not in found
 
 
-def _has_stages(plan: Plan) -> bool:
-    """Whether progress is recomputed from demorec's stages."""
+def has_progress(plan: Plan) -> bool:
+    """Whether all sources have demorec's stages of their whole episodes, from which new progress is computed."""
     needed = {*STAGE_COLUMNS, "num_goals"}
-    return all(source.sidecar_tables("episodes") and needed <= set(source.fact_types) for source in plan.sources)
-
-
-def _progress_is_kept(plan: Plan) -> bool:
-    """Whether all sources have progress of the same kind."""
-    paths = [source.root / PROGRESS_PATH for source in plan.sources]
-    if not all(path.is_file() for path in paths):
-        return False
-    schemas = [open_table(path).schema_arrow for path in paths]
-    return _has_stages(plan) or (
-        set(_COUNTERS) <= set(schemas[0].names) and all(schema.equals(schemas[0]) for schema in schemas)
-    )
-
-
-def write_kept_progress(plan: Plan, folder: Path) -> None:
-    """Write the progress of the new dataset's rows: from stages, otherwise from the sources' frames."""
-    if not _progress_is_kept(plan):
-        return
-    if _has_stages(plan):
-        write_progress(folder)
-        return
-    sources = [IndexedRows([source.root / PROGRESS_PATH], rows=_ROWS_AT_ONCE) for source in plan.sources]
-    schema = open_table(plan.sources[0].root / PROGRESS_PATH).schema_arrow
-    tables = [schema.empty_table()]
-    total = 0
-    for episode, cut in enumerate(plan.cuts):
-        index = plan.sources[cut.source].places[cut.episode].episode_index
-        rows = sources[cut.source].frames(index, cut.first, cut.last)
-        if rows is not None:
-            tables.append(_counted(rows, cut, episode, total))
-        total += cut.last - cut.first
-    pq.write_table(pa.concat_tables(tables), folder / PROGRESS_PATH)
-
-
-def _counted(rows: pa.Table, cut: EpisodeSlice, episode: int, index: int) -> pa.Table:
-    """Rows of a cut with their numbers in the new dataset; `index` is its first frame's."""
-    frames = rows.column("frame_index").to_numpy() - cut.first
-    counted = {"index": frames + index, "episode_index": np.full(len(frames), episode), "frame_index": frames}
-    for name, values in counted.items():
-        number = rows.schema.get_field_index(name)
-        rows = rows.set_column(number, rows.schema.field(name), pa.array(values, rows.schema.field(name).type))
-    return rows
+    have_stages = all(needed <= set(source.fact_types) for source in plan.sources)
+    has_files = all((source.root / PROGRESS_PATH).is_file() for source in plan.sources)
+    return have_stages and has_files and all(map(plan.is_whole, plan.cuts))
 
 
 class SidecarReader:
@@ -119,7 +75,6 @@ class SidecarReader:
         self._poses = IndexedRows(tables, rows=_ROWS_AT_ONCE)
         found = {name: self._source.boxes(mapping.feature) for name, mapping in plan.mappings[number].items()}
         self._boxes = {name: boxes for name, boxes in found.items() if boxes is not None}
-        self._begun: set[int] = set()
 
     def boxes(self, cut: EpisodeSlice) -> dict[str, SeenByCamera]:
         """Return camera feature -> visible objects of an episode."""
@@ -139,16 +94,10 @@ class SidecarReader:
             row["phases"] = _cut_phases(row, cut)
         elif cut.task and row.get("episode_info") is not None:
             row["episode_info"] = _reworded(row["episode_info"], cut.task, source.root)
-        attempt = source.attempts.own.get(index) or {name: row.get(name) for name in ATTEMPT_SCHEMA.names}
         if not cut.has_end:  # an outcome is unknown for a part of an episode
             row["success"] = None
-            attempt = {**attempt, "success": None}
-        failed = () if index in self._begun else source.attempts.failed.get(index, ())
-        self._begun.add(index)
         return EpisodeRecord(
             row=row,
-            attempt=attempt,
-            failed=failed,
             moving_cameras=self._camera_poses(cut, index),
             robot=None if robot is None else source.robot(str(robot)),
         )
@@ -208,7 +157,7 @@ def left_out(plan: Plan) -> tuple[str, ...]:
         for name, reason in _files(plan, number):
             found.setdefault(reason, set()).add(name)
     phrases = [f"{listed(sorted(names), MAX_NAMES, ', ')} ({reason})" for reason, names in found.items()]
-    return (*phrases, *_scenes(plan), *_descriptions(plan), *_attempts(plan), *_facts(plan))
+    return (*phrases, *_scenes(plan), *_descriptions(plan), *_facts(plan))
 
 
 def copied_files(plan: Plan) -> tuple[str, ...]:
@@ -219,17 +168,9 @@ def copied_files(plan: Plan) -> tuple[str, ...]:
     return tuple(name for name in names if all(_is_equal(name, first.root, other.root) for other in others))
 
 
-def copied_unknown_files(plan: Plan) -> tuple[str, ...]:
-    """List the copied files whose purpose is unknown."""
-    return tuple(name for name in copied_files(plan) if name not in _ABOUT_THE_WHOLE)
-
-
-def copies_stale_modality(plan: Plan) -> bool:
-    """Whether modality.json is copied, although a feature that it may name was renamed, converted or left out."""
-    names = set(plan.sources[0].info.features) - set(AUTOMATIC_FEATURES)
-    mappings = plan.mappings[0]
-    is_changed = set(mappings) != names or not all(m.feature == name and m.is_copy for name, m in mappings.items())
-    return is_changed and MODALITY_PATH in copied_files(plan)
+def copied_unchecked_files(plan: Plan) -> tuple[str, ...]:
+    """List the copied files that may not fit the result: unknown ones, and modality.json with names of features."""
+    return tuple(name for name in copied_files(plan) if name == MODALITY_PATH or name not in _ABOUT_THE_WHOLE)
 
 
 def _is_equal(name: str, first: Path, other: Path) -> bool:
@@ -238,10 +179,7 @@ def _is_equal(name: str, first: Path, other: Path) -> bool:
 
 
 def _unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
-    """List the files, except links, that a dataset does not use and whose purpose is unknown from their names.
-
-    Unused tables in the folders of rows and episodes are left out: LeRobot would read a copy as part of the dataset.
-    """
+    """List the files of unknown purpose, without links and tables that LeRobot would read as part of the dataset."""
     root, used = source.root, _used_files(source)
     strange = [name for name in _files_below(root) if not is_dataset_file(name) and root / name not in used]
     return tuple(name for name in strange if not (root / name).is_symlink() and not _is_stray_table(name))
@@ -272,7 +210,7 @@ def _files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
                 yield name, f"{INFO_PATH} does not list this column of the data files"
     copied, used = copied_files(plan), _used_files(source)
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
-    keeps_poses, keeps_progress = _poses_are_kept(plan), _progress_is_kept(plan)
+    keeps_poses, keeps_progress = _poses_are_kept(plan), has_progress(plan)
     is_merged = len(plan.sources) > 1
     for name in _files_below(source.root):
         path = source.root / name
@@ -285,16 +223,14 @@ def _files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
             yield name, f"{differs}: copy it if it still applies"
         elif name.startswith(("data/", "videos/", "images/")):
             yield name, "no episode of the dataset is in this file"
-        elif (name in _ABOUT_THE_WHOLE and is_merged) or (name == PROGRESS_PATH and not keeps_progress):
+        elif name in _ABOUT_THE_WHOLE and is_merged:
             yield name, "not the same in all datasets"
         elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
             yield name, "the other datasets have other moving cameras"
         elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
             yield name, "its camera is left out"
-        elif name.startswith("meta/temporal_proportions_") and not (
-            name == PROPORTIONS_PATH and keeps_progress and _has_stages(plan)
-        ):
-            yield name, "they describe all episodes of the source"
+        elif name in (PROGRESS_PATH, PROPORTIONS_PATH) and not keeps_progress:
+            yield name, "its values hold for the episodes of the source"
 
 
 def _scenes(plan: Plan) -> Iterator[str]:
@@ -312,17 +248,6 @@ def _descriptions(plan: Plan) -> Iterator[str]:
     spoken = any(feature.dtype == "language" for feature in plan.info.features.values())
     if spoken and (count := sum(bool(cut.task) for cut in plan.cuts)):
         yield f"other wordings (task_aug) in episodes: {count} (they reword the old instruction)"
-
-
-def _attempts(plan: Plan) -> Iterator[str]:
-    lost = 0
-    for number, source in enumerate(plan.sources):
-        kept = {cut.episode for cut in plan.cuts if cut.source == number}
-        gone = [place.episode_index for episode, place in enumerate(source.places) if episode not in kept]
-        lost += sum(len(source.attempts.failed.get(index, ())) for index in gone)
-        lost += 0 if plan.takes_all_of(number) else len(source.attempts.homeless)
-    if lost:
-        yield f"failed attempts: {lost} (at episodes that are not in the result)"
 
 
 def _facts(plan: Plan) -> Iterator[str]:

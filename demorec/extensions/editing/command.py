@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _RESULT = replace(DATASET_KIND, advice="choose --overwrite or another --out")
 MAX_SHOWN = 20
-"""Maximum ranges of episodes, parts of an episode, or differences that are printed."""
+"""Maximum episodes, parts of an episode, or differences that are printed."""
 DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
 
 
@@ -113,7 +113,7 @@ class Edit:
                 say(f"Images of {counted(decoded, 'episode')} were decoded for their statistics.")
 
     def _print_result(self, begin: str, name: str, plan: Plan, left: str) -> None:
-        from demorec.extensions.editing.beside import MAX_NAMES, copied_unknown_files, copies_stale_modality, left_out
+        from demorec.extensions.editing.beside import MAX_NAMES, copied_unchecked_files, left_out
 
         lengths = [place.length for source in plan.sources for place in source.places]
         frames = sum(cut.last - cut.first for cut in plan.cuts)
@@ -123,12 +123,10 @@ class Edit:
         text = f"{begin}{len(plan.cuts)}{noun} of {counted(len(lengths), 'episode')}, {frames} of {sum(lengths)} frames"
         place = str(self.out / name) if self.out is not None else name
         if self.dry_run and len(plan.sources) == 1 and not is_in_parts and numbers != list(range(len(lengths))):
-            say(f"episodes {_ranges(numbers)}")
+            say(f"episodes {listed([str(number) for number in numbers], MAX_SHOWN, ',')}")
         say(f"{text}: {place}" if place else text, *(f"{left}: {item}." for item in left_out(plan)))
-        if copies_stale_modality(plan):
-            say("Copied, but written for the features of the source: meta/modality.json. Correct it.")
-        if unknown := copied_unknown_files(plan):
-            say(f"Copied, but unknown: {listed(unknown, MAX_NAMES, ', ')}. Check that they still apply.")
+        if unchecked := copied_unchecked_files(plan):
+            say(f"Copied, but not checked: {listed(unchecked, MAX_NAMES, ', ')}. Check that they still apply.")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,18 +189,6 @@ def dataset_at(path: Path) -> Path:
     if not is_dataset(path / DATASET):
         raise ConfigError(f"This run has no dataset in {DATASET}/, create one (demorec export lerobot): {path}")
     return path / DATASET
-
-
-def _ranges(numbers: Sequence[int]) -> str:
-    """Format some episode numbers in the form of --episodes."""
-    parts: list[tuple[int, int]] = []
-    for number in numbers:
-        if parts and parts[-1][1] == number:
-            parts[-1] = (parts[-1][0], number + 1)
-        else:
-            parts.append((number, number + 1))
-    texts = [f"{first}:{end}" if end - first > 1 else str(first) for first, end in parts]
-    return ",".join(texts[:MAX_SHOWN]) + (",..." if len(texts) > MAX_SHOWN else "")
 
 
 def pairs(words: Sequence[str], example: str) -> dict[str, str]:

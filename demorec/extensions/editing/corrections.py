@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
@@ -15,6 +14,7 @@ import numpy as np
 import pyarrow as pa
 
 from demorec.core.errors import ExportError, without_path
+from demorec.core.replacing import shown
 from demorec.datasets.lerobot.episode_places import EpisodePlace, read_tasks
 from demorec.datasets.lerobot.files import column_numbers, open_table, read_json, read_table, table_batches
 from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -25,16 +25,13 @@ from demorec.datasets.lerobot.layout import (
     TASKS_PATH,
     DatasetFeature,
     DatasetInfo,
-    FilePosition,
 )
 from demorec.datasets.lerobot.mp4_index import mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.datasets.lerobot.statistic_errors import statistic_errors
 
-_COUNTS: dict[str, int] = {
-    "total_episodes": 0, "total_frames": 0, "total_tasks": 0, "chunks_size": 1000, "data_files_size_in_mb": 100,
-    "video_files_size_in_mb": 200,
-}  # fmt: skip
+_SIZES = {"chunks_size": 1000, "data_files_size_in_mb": 100, "video_files_size_in_mb": 200}
+_COUNTS: dict[str, int] = {"total_episodes": 0, "total_frames": 0, "total_tasks": 0, **_SIZES}
 """Counts in info.json, and replacements for impossible values."""
 _MAX_COUNT = 1e9
 _DTYPES = frozenset(
@@ -61,7 +58,7 @@ def stated_info(root: Path) -> Mapping[str, Any]:
 
 
 def usable_info(stated: Mapping[str, Any], root: Path) -> DatasetInfo:
-    """Parse info.json without impossible counts and splits; ExportError if more of it is damaged."""
+    """Parse info.json without impossible counts; ExportError if more of it is damaged."""
     data = dict(stated)
     for name, default in _COUNTS.items():
         if not _is_possible(name, data.get(name)):
@@ -107,9 +104,9 @@ def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequenc
             )
         if found.shape == (1,) and pa.types.is_nested(schemas[0].field(name).type):
             changes.append(f"{name} is a list of one value in the rows, and becomes that value.")
-    shown = {path.parent.name for path in videos} | {path.parent.parent.name for path in videos}
+    cameras = {path.parent.name for path in videos} | {path.parent.parent.name for path in videos}
     for name, feature in list(features.items()):
-        if feature.is_video and name not in shown and shown & set(info.video_keys):
+        if feature.is_video and name not in cameras and cameras & set(info.video_keys):
             changes.append(f"{name} is left out: the dataset has no video for it.")
             del features[name]
         elif name not in AUTOMATIC_FEATURES and not feature.is_video and any(name not in s.names for s in schemas):
@@ -160,13 +157,13 @@ def repaired_rate(info: DatasetInfo, table: Path, videos: Sequence[Path]) -> Rep
     rate = round(1 / step)
     if abs(step * info.fps - 1) <= _MAX_RATE_ERROR or rate < 1:
         return info, []
-    shown = _video_rate(videos)
-    if shown is not None and abs(shown / info.fps - 1) <= _MAX_VIDEO_ERROR:
+    video_rate = _video_rate(videos)
+    if video_rate is not None and abs(video_rate / info.fps - 1) <= _MAX_VIDEO_ERROR:
         return info, []  # then the timestamps are wrong
-    if shown is not None and abs(shown * step - 1) > _MAX_RATE_ERROR:
+    if video_rate is not None and abs(video_rate * step - 1) > _MAX_RATE_ERROR:
         raise ExportError(
             f"The rate is ambiguous: info.json states {info.fps} frames per second, the timestamps {1 / step:.4g}, the "
-            f"videos {shown:.4g}. Correct fps in meta/info.json: {table}"
+            f"videos {video_rate:.4g}. Correct fps in meta/info.json: {table}"
         )
     return replace(info, fps=rate), [f"fps is {rate}, by the timestamps; info.json states {info.fps}."]
 
@@ -215,105 +212,42 @@ def table_changes(
         stated: Its info.json, before the repair.
         stored: Episode index -> location in the table of episodes; empty if it is rewritten from the rows.
     """
-    if stored:
-        yield from _places(folder, stored)
-        yield from _ends(folder)
-    yield from _paths(folder)
+    if stored and (wrong := _wrong_entries(folder, stored)):
+        yield f"The table of episodes is written from the rows: entries of {shown(sorted(wrong))} are wrong or missing."
     yield from _tasks(folder, stated)
-    yield from _totals(folder, stated)
-    yield from _strays(folder)
+    counts = {"total_episodes": len(folder.listed), "total_frames": sum(place.length for place in folder.listed)}
+    if not folder.info.is_old:
+        counts |= {name: getattr(folder.info, name) for name in _SIZES}
+    for name, count in counts.items():
+        if stated.get(name) != count:
+            yield f"info.json states {name} {stated.get(name)}; it is {count} now."
     if not folder.info.is_old or (folder.root / OLD_STATS).exists():
         yield from _statistics(folder)
 
 
-def _places(folder: LeRobotFolder, stored: Mapping[int, EpisodePlace]) -> Iterator[str]:
-    wrong: dict[str, int] = {}
+def _wrong_entries(folder: LeRobotFolder, stored: Mapping[int, EpisodePlace]) -> set[int]:
+    """Find the episodes whose entry in the table of episodes differs from rows and videos, or which have none."""
+    wrong = {episode for _, episode, *_ in range_errors(folder)}
     for place in folder.listed:
-        told = stored.get(place.episode_index)
-        if told is None:
-            found = {"an entry": True}
-        else:
-            found = {
-                "length": told.length != place.length,
-                "the data file": (told.data, told.first_row) != (place.data, place.first_row),
-                "dataset_from_index": told.from_index != place.from_index,
-                "tasks": set(told.tasks) != set(place.tasks) and bool(place.tasks),
-                **{f"the images of {key}": told.videos[key] != place.videos[key] for key in place.videos},
-            }
-        for name in (name for name, is_wrong in found.items() if is_wrong):
-            wrong[name] = wrong.get(name, 0) + 1
-    for name, count in wrong.items():
-        yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
-    if gone := sorted(set(stored) - {place.episode_index for place in folder.listed}):
-        yield f"The table of episodes loses {len(gone)} episodes that have no rows, such as episode {gone[0]}."
-
-
-def _ends(folder: LeRobotFolder) -> Iterator[str]:
-    for name, count in Counter(name for name, *_ in range_errors(folder)).items():
-        yield f"The table of episodes gets {name} of {count} of {len(folder.listed)} episodes from the rows."
-
-
-def _paths(folder: LeRobotFolder) -> Iterator[str]:
-    """Find path templates of info.json without files; before v3.0, because the repair writes the usual ones."""
-    last, info = folder.listed[-1], folder.info
-    position = FilePosition(chunk=last.episode_index // int(info.chunks_size), file=last.episode_index)
-    paths = {folder.root / position.path(info.data_path): last.data}
-    paths |= {folder.root / position.path(info.video_path or "", key): path for key, (path, _) in last.videos.items()}
-    if info.is_old and any(path != found for path, found in paths.items()):
-        yield "info.json names missing files: the paths are now those of v3.0."
+        entry = stored.get(place.episode_index)
+        if entry is None or replace(entry, tasks=place.tasks) != place or not set(place.tasks) <= set(entry.tasks):
+            wrong.add(place.episode_index)
+    return wrong | set(stored) - {place.episode_index for place in folder.listed}
 
 
 def _tasks(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
-    try:
-        tasks = read_tasks(folder.root)
-        numbers = list(range(len(tasks)))
+    """Find a table of tasks that LeRobot reads wrongly, or not at all."""
+    with suppress(ExportError):  # already a change
+        count = len(read_tasks(folder.root))
         if not folder.info.is_old:
-            numbers = read_table(folder.root / TASKS_PATH, ["task_index"]).column("task_index").to_pylist()
-    except ExportError:
-        return  # already a change
-    if numbers != list(range(len(numbers))):
-        yield "The table of tasks is numbered from 0, in order."
-    elif not folder.info.is_old:
-        pandas = (open_table(folder.root / TASKS_PATH).schema_arrow.metadata or {}).get(b"pandas", b"{}")
-        if not json.loads(pandas).get("index_columns"):
-            yield "The table of tasks has the text as its index, where LeRobot looks for it."
-    total = stated.get("total_tasks")
-    if total != len(numbers):
-        yield f"info.json states total_tasks {total}; the table of tasks has {len(numbers)}."
-
-
-def _totals(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Iterator[str]:
-    found = {
-        "total_episodes": len(folder.listed),
-        "total_frames": sum(place.length for place in folder.listed),
-    }
-    for name, count in found.items():
-        if stated.get(name) != count:
-            yield f"info.json states {name} {stated.get(name)}; the rows have {count}."
-    for name in ("chunks_size", "data_files_size_in_mb", "video_files_size_in_mb"):
-        usual = getattr(folder.info, name)
-        if not folder.info.is_old and stated.get(name) != usual:
-            yield f"info.json states {name} {stated.get(name)}; it is {usual} now."
-    if not has_possible_splits(stated.get("splits"), len(folder.listed)):
-        yield f"splits of info.json are one, train, of all {len(folder.listed)} episodes."
-
-
-def has_possible_splits(splits: Any, episodes: int) -> bool:
-    """Whether splits are disjoint ranges of the episodes."""
-    if not isinstance(splits, dict) or not splits:
-        return False
-    try:
-        ranges = sorted(tuple(int(end) for end in text.split(":")) for text in splits.values())
-    except (ValueError, AttributeError):
-        return False
-    ends = [0, *(end for each in ranges for end in each)]
-    return all(len(each) == 2 for each in ranges) and ends == sorted(ends) and ends[-1] <= episodes
-
-
-def _strays(folder: LeRobotFolder) -> Iterator[str]:
-    used = {path for place in folder.listed for path, _ in place.videos.values()}
-    for path in sorted(set((folder.root / "videos").rglob("*.mp4")) - used):
-        yield f"{path.relative_to(folder.root).as_posix()} is left out: no episode has images in it."
+            table = read_table(folder.root / TASKS_PATH, ["task_index"])
+            pandas = (open_table(folder.root / TASKS_PATH).schema_arrow.metadata or {}).get(b"pandas", b"{}")
+            if table.column("task_index").to_pylist() != list(range(count)):
+                yield "The table of tasks is numbered from 0, in order."
+            elif not json.loads(pandas).get("index_columns"):
+                yield "The table of tasks has the text as its index, where LeRobot looks for it."
+        if stated.get("total_tasks") != count:
+            yield f"info.json states total_tasks {stated.get('total_tasks')}; it is {count} now."
 
 
 def _statistics(folder: LeRobotFolder) -> Iterator[str]:
@@ -326,19 +260,8 @@ def _statistics(folder: LeRobotFolder) -> Iterator[str]:
     except ExportError as error:
         yield f"{STATS_PATH} is written from the rows: {without_path(error, folder.root)}"
         return
-    wrong = list(dict.fromkeys(error.feature for error in errors if error.episode is None))
+    wrong = dict.fromkeys(error.feature for error in errors)
     if not folder.info.is_old:
-        wrong += [name for name, feature in features.items() if feature.is_camera and name not in stored]
+        wrong |= dict.fromkeys(name for name, feature in features.items() if feature.is_camera and name not in stored)
     if wrong:
-        yield f"{STATS_PATH} gets the statistics of {', '.join(wrong)} from the rows and images."
-    if own := {error.episode for error in errors if error.episode is not None}:
-        yield f"The statistics of {len(own)} episodes are computed from their rows."
-    if unknown := [name for name in stored if name not in features]:
-        yield f"{STATS_PATH} loses {', '.join(unknown)}, which is not a feature."
-
-
-def stated_splits(folder: LeRobotFolder, stated: Mapping[str, Any]) -> Mapping[str, str] | None:
-    """The splits in info.json, if they are possible and the episodes keep their numbers."""
-    splits = stated.get("splits")
-    is_kept = [place.episode_index for place in folder.listed] == list(range(len(folder.listed)))
-    return splits if is_kept and has_possible_splits(splits, len(folder.listed)) else None
+        yield f"The statistics of {', '.join(wrong)} are computed from the rows and images."

@@ -27,14 +27,13 @@ class WatchedNumbers:
     Args:
         plan: Plan of a whole dataset.
         features: Features to watch; empty for the state.
-        option: The option that names features, for the error message.
         grippers: Whether to watch the grippers of the state.
 
     Raises:
         ConfigError: No such numeric feature, or the state is unknown.
     """
 
-    def __init__(self, plan: Plan, features: Sequence[str], option: str, *, grippers: bool = False) -> None:
+    def __init__(self, plan: Plan, features: Sequence[str], *, grippers: bool = False) -> None:
         (source,) = plan.sources
         own = source.info.features.items()
         numeric = [name for name, feature in own if feature.is_numeric and name not in AUTOMATIC_FEATURES]
@@ -42,7 +41,7 @@ class WatchedNumbers:
             check_choice("feature of numbers", feature, numeric)
         self._names = features or source.roles.state
         if not self._names:
-            raise ConfigError(f"No state was found: name a feature by --{option}: {source.root}")
+            raise ConfigError(f"No state was found: give frames (trim --head, cut --at), or --feature: {source.root}")
         self._is_watched = slice(None) if features or grippers else ~source.roles.grippers()
         self._places, self._rows = source.places, source.rows(self._names)
 
@@ -87,7 +86,7 @@ def cut_at_jumps(plan: Plan, features: Sequence[str], threshold: float) -> Plan:
         threshold: A jump is a step between frames that exceeds all steps near it by more than this ratio of its range
             over the dataset; in motion, neighbouring steps are similar.
     """
-    watched = WatchedNumbers(plan, features, "feature")
+    watched = WatchedNumbers(plan, features)
     least = watched.least("jump_threshold", threshold)
     parts = {}
     for number, cut in enumerate(plan.cuts):
@@ -110,7 +109,7 @@ def without_pauses(plan: Plan, features: Sequence[str], seconds: float, threshol
     min_frames = round(seconds * plan.info.fps)
     if min_frames < 2:
         raise OptionError("pauses", f"is shorter than two frames at {plan.info.fps} frames per second.")
-    watched = WatchedNumbers(plan, features, "feature")
+    watched = WatchedNumbers(plan, features)
     least = watched.least("still_threshold", threshold)
     parts = {}
     for number, cut in enumerate(plan.cuts):
@@ -125,16 +124,15 @@ def without_pauses(plan: Plan, features: Sequence[str], seconds: float, threshol
     return _in_parts(plan, parts)
 
 
-def without_idle_ends(plan: Plan, feature: str | None, threshold: float, margin: int) -> Plan:
+def without_idle_ends(plan: Plan, threshold: float, margin: int) -> Plan:
     """Cut off the still frames at the beginning and the end of each episode.
 
     Args:
         plan: Plan of a whole dataset.
-        feature: Feature to watch; None for the state.
         threshold: Maximum change of each number in still frames, as a ratio of its range over the dataset.
         margin: Still frames to keep at either end.
     """
-    watched = WatchedNumbers(plan, () if feature is None else (feature,), "idle-feature", grippers=True)
+    watched = WatchedNumbers(plan, (), grippers=True)
     least = watched.least("idle_threshold", threshold)
     cuts = []
     for cut in plan.cuts:

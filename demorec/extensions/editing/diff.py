@@ -150,10 +150,7 @@ def _digest(values: NDArray[Any]) -> bytes:
 
 
 def _matched(a: Sequence[Digests], b: Sequence[Digests]) -> dict[int, int]:
-    """Find the equal or changed episode of the second dataset for each episode of the first one.
-
-    Equal episodes are matched first, then those with the most in common, preferably at the same position.
-    """
+    """Match equal episodes, then those with the most in common, preferably at the same position."""
     found: dict[int, int] = {}
     equal: dict[tuple[bytes, ...], list[int]] = {}
     for number, digests in enumerate(b):

@@ -13,7 +13,6 @@ unit = "degree"                             # here: rad (unchanged), degree, or 
 
 from __future__ import annotations
 
-import json
 import math
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
@@ -152,46 +151,5 @@ def _differences(a: Plan, b: Plan) -> Iterator[str]:
             yield f"{name} of {root} has {what} {value}, not {first}"
 
 
-def suggested_mapping(plans: Sequence[Plan]) -> Iterator[str]:
-    """Yield the lines of a mapping that resolves the differences between datasets with the same rate, where possible.
-
-    Features that some datasets cannot provide are dropped, elements are put in one order.
-    """
-    plans = [plan for plan in plans if plan.info.fps == plans[0].info.fps]
-    if len(plans) < 2:
-        return
-    robots = [plan.info.robot_type for plan in plans if plan.info.robot_type]
-    first = plans[0].info.features
-    common = [name for name in first if all(_can_give(plan.info.features.get(name), first[name]) for plan in plans)]
-    for plan in plans:
-        features = plan.info.features
-        yield from ("[[dataset]]", f"path = {_quoted(str(plan.sources[0].root))}")
-        if robots and plan.info.robot_type != robots[0]:
-            yield f"robot_type = {_quoted(robots[0])}"
-        if dropped := [name for name in features if name not in common]:
-            yield f"drop = {_quoted(dropped)}"
-        for name in common:
-            if not _fits(features[name], first[name]):
-                yield f"[dataset.feature.{_quoted(name)}]"
-                yield f"elements = {_quoted(first[name].elements)}"
-        yield ""
-
-
-def _can_give(own: DatasetFeature | None, first: DatasetFeature) -> bool:
-    """Whether a feature equals the first dataset's, or has all of its elements."""
-    if own is None or own.dtype != first.dtype:
-        return False
-    return _fits(own, first) or (_is_vector(own, first) and set(first.elements) <= set(own.elements))
-
-
-def _quoted(value: object) -> str:
-    """Quote for TOML, which has no surrogates."""
-    return json.dumps(value, ensure_ascii=False)
-
-
 def _is_vector(*features: DatasetFeature) -> bool:
     return all(feature.is_numeric and len(feature.shape) == 1 for feature in features)
-
-
-def _fits(a: DatasetFeature, b: DatasetFeature) -> bool:
-    return not any(a.differences(b))

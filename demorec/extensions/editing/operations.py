@@ -35,10 +35,8 @@ class Trim(EditOne):
     """Frames to cut off at the end."""
     idle: bool = False
     """Cut off the frames before the first and after the last motion."""
-    idle_feature: str | None = None
-    """With --idle: feature whose changes count as motion (auto: the state)."""
     idle_threshold: float = 0.01
-    """With --idle: minimum change that counts as motion, as a ratio of the feature's range."""
+    """With --idle: minimum change of the state that counts as motion, as a ratio of its range."""
     idle_margin: int = 3
     """With --idle: still frames to keep at either end."""
 
@@ -50,7 +48,7 @@ class Trim(EditOne):
             raise ConfigError("Give either --idle, or frames by --head and --tail.")
         if self.idle:
             check_option("idle_margin", self.idle_margin, 0, 2**63 - 1, "frames")
-            return without_idle_ends(plan, self.idle_feature, self.idle_threshold, self.idle_margin)
+            return without_idle_ends(plan, self.idle_threshold, self.idle_margin)
         if min(self.head, self.tail) < 0:
             raise ConfigError("The number of frames to cut off must be at least 0.")
         if short := [str(cut.episode) for cut in plan.cuts if cut.last <= self.head + self.tail]:
@@ -148,11 +146,8 @@ class DropFeatures(EditOne):
 class Merge(Edit):
     """Merge datasets; features are matched by name, and all differences are reported at once.
 
-    If datasets differ, prints a mapping that merges as much as possible: check its lines, save them, and use --mapping.
-
     Examples:
       demorec dataset merge monday tuesday --out both
-      demorec dataset merge monday tuesday --out both > mapping.toml
       demorec dataset merge monday tuesday --mapping mapping.toml --out both
     """
 
@@ -170,14 +165,13 @@ class Merge(Edit):
 
     def plans(self, sources: Sequence[LeRobotFolder]) -> Mapping[str, Plan]:
         """All episodes, dataset after dataset."""
-        from demorec.extensions.editing.merge import differences, joined, mapped_plans, suggested_mapping
+        from demorec.extensions.editing.merge import differences, joined, mapped_plans
 
         plans = mapped_plans(sources, self.mapping)
         if wrong := differences(plans):
-            lines = list(suggested_mapping(plans))
-            say(*lines)
-            advice = " The lines above are a possible mapping: check each, save them (> FILE), use --mapping FILE."
-            raise ConfigError(f"These datasets differ: {'; '.join(wrong)}.{advice if lines else ''}")
+            raise ConfigError(
+                f"These datasets differ: {'; '.join(wrong)}. Resolve it by a --mapping (docs/datasets.md)."
+            )
         return {"": joined(plans)}
 
 

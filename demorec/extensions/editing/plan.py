@@ -115,11 +115,15 @@ class Plan:
         mappings = {name: FeatureMapping(feature=name) for name in own}
         return cls(sources=(source,), cuts=cuts, info=info, mappings=(mappings,))
 
+    def is_whole(self, cut: EpisodeSlice) -> bool:
+        """Whether an episode has all frames of its source."""
+        return (cut.first, cut.last) == (0, self.sources[cut.source].places[cut.episode].length)
+
     def keeps_scene(self, cut: EpisodeSlice) -> bool:
         """Whether an episode still matches its scene: all its frames, with its own states and actions."""
-        source = self.sources[cut.source]
-        if (cut.first, cut.last) != (0, source.places[cut.episode].length):
+        if not self.is_whole(cut):
             return False
+        source = self.sources[cut.source]
         for name in (STATE, ACTION):
             mapping = self.mappings[cut.source].get(name)
             is_kept = mapping is not None and mapping.is_copy and mapping.feature == name
@@ -153,12 +157,6 @@ class Plan:
                 f"dataset drop-features), or give the datasets the same tasks: {source.root}"
             )
         return numbers
-
-    def takes_all_of(self, number: int) -> bool:
-        """Whether all episodes of a source are included."""
-        return {cut.episode for cut in self.cuts if cut.source == number} == set(
-            range(len(self.sources[number].places))
-        )
 
     def with_cuts(self, cuts: Sequence[EpisodeSlice]) -> Plan:
         """Replace the episodes; ConfigError if none is left."""

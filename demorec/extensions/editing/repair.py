@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +36,6 @@ from demorec.extensions.editing.corrections import (
     repaired_features,
     repaired_rate,
     stated_info,
-    stated_splits,
     table_changes,
     usable_info,
 )
@@ -61,8 +59,8 @@ class RepairedDataset(LeRobotFolder):
 
     def __init__(self, root: Path) -> None:
         self.changes: list[str] = []
-        self.stated = stated_info(root)
-        super().__init__(root, info=usable_info(self.stated, root))
+        stated = stated_info(root)
+        super().__init__(root, info=usable_info(stated, root))
         self.data_tables = [path for path in self.data_tables if self._is_readable(path)]
         self.episode_tables = [path for path in self.episode_tables if self._is_readable(path)]
         stored = self._stored()
@@ -80,8 +78,7 @@ class RepairedDataset(LeRobotFolder):
         self._set_tasks(kept, stored)
         self.listed = self.places = placed(kept, images, self.tasks)
         self._check_timestamps()
-        self.changes += table_changes(self, self.stated, stored)
-        self.info = replace(self.info, splits=stated_splits(self, self.stated))
+        self.changes += table_changes(self, stated, stored)
 
     def _correct_info(self, repaired: Repaired) -> None:
         self.info, changes = repaired

@@ -16,7 +16,7 @@ from PIL import Image
 from demorec.core.errors import ExportError
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.episode_places import EpisodePlace, are_on_grid
-from demorec.datasets.lerobot.facts import STAGE_ENDS, STAGE_NAMES, STAGE_STARTS
+from demorec.datasets.lerobot.facts import STAGE_COLUMNS, write_progress
 from demorec.datasets.lerobot.files import column_numbers
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import episode_statistics
@@ -31,9 +31,9 @@ from demorec.datasets.options import ProgressCallback
 from demorec.extensions.editing.beside import (
     SidecarReader,
     copied_files,
+    has_progress,
     kept_configs,
     kept_export,
-    write_kept_progress,
 )
 from demorec.extensions.editing.plan import EpisodeSlice, FeatureMapping, Plan, reference_columns
 
@@ -76,11 +76,9 @@ def write_plan(
             writer.add(data)
             if progress is not None:
                 progress(done, len(plan.cuts))
-        for number, source in enumerate(plan.sources):
-            for attempt in source.attempts.homeless if plan.takes_all_of(number) else ():
-                writer.add_attempt(attempt)
         writer.finish(kept_export(plan))
-    write_kept_progress(plan, folder)
+    if has_progress(plan):
+        write_progress(folder)
     for name in copied_files(plan):
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         with open_regular(plan.sources[0].root / name) as source_file, (folder / name).open("wb") as target:
@@ -92,7 +90,7 @@ class _Reader:
     """Reader of one source's episodes for the plan."""
 
     def __init__(self, plan: Plan, number: int, *, decode: bool) -> None:
-        self.source = plan.sources[number]
+        self._plan, self.source = plan, plan.sources[number]
         self.num_decoded = 0
         self._features, self._fps = plan.info.features, plan.info.fps
         self._mappings: Mapping[str, FeatureMapping] = plan.mappings[number]
@@ -114,7 +112,7 @@ class _Reader:
         place = self.source.places[cut.episode]
         all_rows = self._rows.read(place)
         rows = all_rows.slice(cut.first, cut.last - cut.first)
-        whole = (cut.first, cut.last) == (0, place.length)
+        whole = self._plan.is_whole(cut)
         columns: dict[str, Any] = {}
         videos: dict[str, EncodedVideo] = {}
         video_info: dict[str, dict[str, Any]] = {}
@@ -170,11 +168,7 @@ class _Reader:
         return found
 
     def _timestamps(self, rows: pa.Table, cut: EpisodeSlice) -> NDArray[Any] | None:
-        """(T,) timestamps of a cut; None for multiples of 1/fps.
-
-        A cut that begins with its episode has bit-exact timestamps. For a later one with measured timestamps, the first
-        is subtracted in float64 and the result rounded once.
-        """
+        """(T,) timestamps of a cut, from 0 and rounded once; None for multiples of 1/fps."""
         if not self.source.keeps_timestamps:
             return None
         stored: NDArray[Any] = column_numbers(rows.column("timestamp").combine_chunks())[:, 0]
@@ -252,9 +246,7 @@ class _Reader:
             facts["duration_s"] = (cut.last - cut.first) / self._fps
         if "success" in facts and not cut.has_end:
             facts["success"] = None
-        if (cut.first, cut.last) != (0, place.length):
-            facts |= _clipped_stages(facts, cut)
-        return facts
+        return facts if self._plan.is_whole(cut) else facts | dict.fromkeys(STAGE_COLUMNS)
 
 
 def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
@@ -262,20 +254,6 @@ def _with_end(kept: pa.Array, column: pa.Array) -> pa.Array:
     if column_numbers(column)[:-1].any():
         return kept
     return pa.concat_arrays([kept[:-1], column[-1:]])
-
-
-def _clipped_stages(facts: Mapping[str, Any], cut: EpisodeSlice) -> dict[str, Any]:
-    """The stages of an episode within a cut, with frames counted from its first one."""
-    names, starts, ends = facts.get(STAGE_NAMES), facts.get(STAGE_STARTS), facts.get(STAGE_ENDS)
-    if not names or not starts or not ends:
-        return {}
-    found: dict[str, list[Any]] = {STAGE_NAMES: [], STAGE_STARTS: [], STAGE_ENDS: []}
-    for name, start, end in zip(names, starts, ends, strict=True):
-        if start < cut.last and end >= cut.first:
-            found[STAGE_NAMES].append(name)
-            found[STAGE_STARTS].append(max(start, cut.first) - cut.first)
-            found[STAGE_ENDS].append(min(end, cut.last - 1) - cut.first)
-    return found
 
 
 def _kept_statistics(source: LeRobotFolder) -> dict[tuple[int, str], tuple[int, NDArray[np.float64]]]:

@@ -16,7 +16,7 @@ from demorec.core.errors import ConfigError
 from demorec.core.tables import environment_name
 from demorec.datasets.episode import ExportEpisode
 from demorec.datasets.options import ExportReport, ProgressCallback
-from demorec.datasets.sources import Intake, find_recordings, goes_in, is_wanted, places_of
+from demorec.datasets.sources import Intake, find_recordings, places_of, why_left_out
 from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, IMAGE_PREFIX, STATE, VELOCITY
 from demorec.episode.roles import NO_NAMES, roles_of_recording
 from demorec.extensions.hdf5.file import DATASET, ENVIRONMENT_PREFIX, NewFile
@@ -60,15 +60,15 @@ def _write(
     depth_left_out: tuple[str, ...] = ()
     for done, path in enumerate(found, start=1):
         with open_recording(path) as recording:
-            if is_wanted(recording, options) and goes_in(recording, options):
+            if (reason := why_left_out(recording, options)) is None:
                 episode = ExportEpisode(recording, options)
                 intake.take(path, episode.traits())
                 _add(data, intake.num_taken - 1, episode)
                 depth_left_out = depth_left_out or episode.depth_left_out
                 num_frames += len(episode.rows)
                 file.flush()
-            elif is_wanted(recording, options):
-                intake.leave_out(recording.outcome)
+            else:
+                intake.leave_out(reason)
         if progress is not None:
             progress(done, len(found))
     if not intake.num_taken:
@@ -80,10 +80,10 @@ def _write(
         num_episodes=intake.num_taken,
         num_frames=num_frames,
         new_episodes=intake.num_taken,
-        skipped_failures=intake.skipped_failures,
-        skipped_unknown=intake.skipped_unknown,
-        skipped_unwanted=intake.skipped_unwanted,
         depth_left_out=depth_left_out,
+        skipped_failures=intake.skipped["failures"],
+        skipped_unknown=intake.skipped["unknown"],
+        skipped_unwanted=intake.skipped["unwanted"],
     )
 
 
@@ -205,11 +205,7 @@ def _attributes(episode: Hdf5Episode) -> dict[str, str | int]:
 
 
 def _states(episode: Hdf5Episode) -> tuple[NDArray[np.float64], tuple[str, ...]]:
-    """(T, D) float64 recorded state of the scene, and the names of its components.
-
-    Positions (rad, fingers m) and velocities (rad/s, m/s) of all joints, then world_from_object of every movable body:
-    xyz (m) and quaternion xyzw.
-    """
+    """(T, D) positions and velocities of all joints, then world_from_object of each movable body, and their names."""
     trajectory, joints = episode.recording.trajectory(), episode.info.simulated.robot.joint_names
     parts = [trajectory.joint_position, trajectory.joint_velocity, *trajectory.object_poses.values()]
     names = [f"{joint}.{what}" for what in ("pos", "vel") for joint in joints]

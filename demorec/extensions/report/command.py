@@ -18,7 +18,7 @@ from demorec.cli.shared.paths import (
     refuse_inside,
 )
 from demorec.core.atomic import atomic_write
-from demorec.core.errors import ConfigError, check_option
+from demorec.core.errors import ConfigError
 from demorec.core.replacing import REPORT, Target
 from demorec.runs.find import EPISODE_FOLDERS, expect
 from demorec.runs.foreign import imported_kinds
@@ -38,7 +38,7 @@ class ReportCommand:
     Examples:
       demorec report recordings/cubes --out cubes.html
       demorec report datasets/cubes --out cubes.html --camera wrist
-      demorec report recordings/cubes --out cubes.html --images --workers 4
+      demorec report recordings/cubes --out cubes.html --images
     """
 
     path: Annotated[Positional[Path], arg(help=f"One of: {WHAT_IS_READ}, evaluations.")]
@@ -51,8 +51,6 @@ class ReportCommand:
     """Run the checks."""
     images: bool = False
     """Also run the checks that decode all images."""
-    workers: int = 1
-    """Processes that read and check recordings."""
     overwrite: bool = False
     """Replace an existing report."""
     roles: NamedByFlags = field(default_factory=RoleFlags)
@@ -61,7 +59,6 @@ class ReportCommand:
         """Gather the content, then write the page."""
         if self.out.suffix.lower() not in (".html", ".htm"):
             raise ConfigError(f"--out names an .html file, found the name {self.out.name!r}.")
-        check_option("workers", self.workers, 1, 1024)
         if self.images and not self.checks:
             raise ConfigError("--images chooses checks, and --no-checks runs none: leave one of them out.")
         expect(self.path, "recording", "dataset", *imported_kinds(), *EPISODE_FOLDERS)
@@ -77,7 +74,6 @@ class ReportCommand:
                     path,
                     camera=self.camera,
                     diagnosis=self._diagnosis(path) if self.checks else None,
-                    workers=self.workers,
                     named=self.roles.named,
                     advance=bar.set,
                 )
@@ -91,6 +87,6 @@ class ReportCommand:
         from demorec.extensions.doctor.examine import examine
         from demorec.extensions.doctor.from_dataset import ReadOptions
 
-        options = CheckOptions(images=self.images, colours=False, workers=self.workers)
+        options = CheckOptions(images=self.images, colours=False)
         reports = list(check_subjects(find_subjects([path]), options))
         return examine(path, ReadOptions(images=self.images, named=self.roles.named), reports=reports)[0]

@@ -3,35 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import replace
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, without_path
-from demorec.core.processes import in_turn
+from demorec.check.base import Finding
+from demorec.core.errors import ConfigError, ExportError, RecordingError, resource_error, without_path
 from demorec.core.replacing import shown
-from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import noted
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
-from demorec.episode.episode import Outcome, SuccessCheck, consecutive_runs
-from demorec.episode.features import IMAGE_PREFIX
-from demorec.episode.roles import NO_NAMES, NamedRoles, roles_of_recording
+from demorec.episode.element_names import is_numbered
+from demorec.episode.episode import Outcome, consecutive_runs
+from demorec.episode.protocol import Episode
+from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
 from demorec.extensions.doctor.diagnosis import Diagnosis
-from demorec.extensions.report.content import (
-    MAX_COMPONENTS,
-    Components,
-    Report,
-    ReportedEpisode,
-    add_motion,
-    success_rate,
-)
+from demorec.extensions.policies.statistics import Rate
 from demorec.extensions.report.filmstrip import MAX_SHOWN, Filmstrip, filmstrip, strip_budget
-from demorec.mcap import Recording, open_recording
+from demorec.mcap import open_recording
 from demorec.runs.find import EPISODE_FOLDERS, Found, PathKind, expect, expect_recordings
 from demorec.runs.run_file import (
     FAILED,
@@ -41,6 +35,127 @@ from demorec.runs.run_file import (
     RunFile,
     load_any_run_file,
 )
+from demorec.view.from_dataset import open_stored_episode
+
+State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
+"""State of an episode. "flagged" is a success with a finding of a check."""
+MAX_COMPONENTS = 64
+"""Maximum components of state and action that are drawn."""
+MAX_SAMPLES = 200
+"""Maximum frames per episode from which a distribution is drawn, plus its extremes."""
+
+Components = dict[tuple[Literal["state", "action"], str], list[NDArray[np.float32]]]
+"""(role, component name) -> sampled values, one array per episode."""
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ReportedEpisode:
+    """One attempt at one episode. Facts missing from the source are None or empty.
+
+    Attributes:
+        name: "episode 3", or "episode 3, attempt 0" for a failed one.
+        source: Its file, relative to the path of the report.
+        problem: Reason why it cannot be read, or why nothing was recorded.
+        instruction: Text of the instruction.
+        outcome: None if unknown.
+        num_frames, fps: Length and frame rate.
+        seed: Root seed of the run.
+        phases: (name, first frame, frame after the last) of each phase, in order.
+        flags: Findings of checks, broken ones first.
+        score: Score by the doctor; 1 for a good or unjudged episode.
+        filmstrip: None without images, and for some successes in a long report.
+        facts: (name, value) for the summary of all episodes: robot, cameras, ...
+    """
+
+    name: str
+    source: str = ""
+    problem: str = ""
+    instruction: str = ""
+    outcome: Outcome | None = None
+    num_frames: int = 0
+    fps: int = 1
+    seed: int | None = None
+    phases: tuple[tuple[str, int, int], ...] = ()
+    flags: tuple[Finding, ...] = ()
+    score: float = 1.0
+    filmstrip: Filmstrip | None = None
+    facts: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def success(self) -> bool | None:
+        """None if unknown."""
+        return None if self.outcome is None else self.outcome.success
+
+    @property
+    def state(self) -> State:
+        """State in one word."""
+        if self.success is False:
+            return "failed"
+        if self.problem:
+            return "unreadable"
+        if self.flags:
+            return "flagged"
+        return "unknown" if self.success is None else "succeeded"
+
+    @property
+    def failure(self) -> str:
+        """Reason and phase of a failure; "" otherwise."""
+        if self.outcome is None or self.outcome.success is not False:
+            return ""
+        reason, phase = self.outcome.failure_reason or "no reason recorded", self.outcome.failure_phase
+        return f"{reason} in phase {phase}" if phase else reason
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Report:
+    """Content of a page.
+
+    Attributes:
+        title: Name of the run, recording or dataset.
+        kind: Kind of the source, in words.
+        facts: (name, value) of the summary.
+        episodes: Every attempt, in order.
+        distributions: Distributions of actions and states.
+        diagnosis: Results of the checks; None if none were run.
+        missing: Sentences about data missing from the source.
+    """
+
+    title: str
+    kind: str
+    facts: tuple[tuple[str, str], ...]
+    episodes: tuple[ReportedEpisode, ...]
+    distributions: Components
+    diagnosis: Diagnosis | None
+    missing: tuple[str, ...]
+
+
+def add_motion(into: Components, roles: Roles, columns: Mapping[str, NDArray[Any]]) -> None:
+    """Add samples of the state and the action of an episode: finite values, evenly spaced, and the extremes.
+
+    Args:
+        into: The components of all episodes.
+        roles: Roles of its features.
+        columns: Feature -> (T, D).
+    """
+    drawn: dict[Literal["state", "action"], tuple[str, ...]] = {"state": roles.state, "action": roles.action}
+    for role, parts in drawn.items():
+        names = roles.elements(parts)[:MAX_COMPONENTS]
+        if is_numbered(names):
+            names = tuple(f"component {name}" for name in names)
+        values = np.hstack([columns[part] for part in parts]) if parts else np.zeros((0, 0))
+        for name, column in zip(names, values.T, strict=False):
+            finite = column[np.isfinite(column)]
+            if len(finite):
+                sampled = finite[:: -(-len(finite) // MAX_SAMPLES)]
+                samples = np.array([*sampled, finite.min(), finite.max()], dtype=np.float32)
+                into.setdefault((role, name), []).append(samples)
+
+
+def success_rate(episodes: Sequence[ReportedEpisode]) -> Rate:
+    """Success rate over the attempts with a known outcome."""
+    known = [episode.success for episode in episodes if episode.success is not None]
+    return Rate(successes=sum(known), trials=len(known))
+
 
 _KINDS: Mapping[PathKind, str] = {
     "recording": "recording",
@@ -48,14 +163,6 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
-_AHEAD = 2
-"""Maximum episodes that a process may be ahead of the count."""
-_SUCCESS = "next.success"
-_SIDECAR_COLUMNS = (
-    "source", "run_episode_index", "attempt", "root_seed", "success", "failure_phase",
-    "failure_reason", "num_retries", "checks", "phases", "episode_info",
-)  # fmt: skip
-_Row = Mapping[str, Any]
 _Progress = Callable[[int, int], None]
 
 
@@ -64,7 +171,6 @@ def gather(
     *,
     camera: str = "",
     diagnosis: Diagnosis | None = None,
-    workers: int = 1,
     named: NamedRoles = NO_NAMES,
     advance: _Progress = lambda done, total: None,
 ) -> Report:
@@ -74,7 +180,6 @@ def gather(
         path: Path of the source.
         camera: Camera of the filmstrips; "" for the first one.
         diagnosis: Results of the checks; None if none were run.
-        workers: Number of processes that read recordings.
         named: Features whose role the user names, in data that demorec did not simulate.
         advance: Called with the number of read episodes and of all.
 
@@ -85,7 +190,139 @@ def gather(
     found = expect(path, "recording", "dataset", *EPISODE_FOLDERS)
     if found.kind == "dataset":
         return _dataset_report(path, camera, diagnosis, named, advance)
-    return _recordings_report(found, camera, diagnosis, workers, named, advance)
+    return _recordings_report(found, camera, diagnosis, named, advance)
+
+
+def _recordings_report(
+    found: Found, camera: str, diagnosis: Diagnosis | None, named: NamedRoles, advance: _Progress
+) -> Report:
+    files = (*found.recordings, *found.failed)
+    expect_recordings(found, files)
+    run, missing = _run_file(found)
+    stride, budget = -(-len(files) // MAX_SHOWN), strip_budget(len(files))
+    components: Components = {}
+    beyond = () if run is None or run.generation is None else run.beyond
+    unrequested = {found.path / attempt.file for attempt in beyond}
+    if unrequested:
+        missing += (f"{len(unrequested)} recordings of episodes beyond the number last requested are left out.",)
+    wanted = [number for number, file in enumerate(files) if file not in unrequested]
+    episodes: list[ReportedEpisode] = []
+    for number in wanted:
+        file = files[number]
+        strip_bytes = 0 if number % stride and file.parent.name != FAILED else budget
+        episode = _read(partial(open_recording, file), file, named, camera, strip_bytes, components)
+        source = file.name if file == found.path else file.relative_to(found.path).as_posix()
+        episodes.append(_judged(replace(episode, source=source), number, diagnosis))
+        advance(len(episodes), len(wanted))
+    if run is not None:
+        episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
+    facts = [("attempts" if found.failed else "recordings", str(len(episodes)))]
+    if run is not None and run.generation is not None:
+        facts.insert(0, ("episodes", f"{len(run.successes)} of {run.num_episodes} asked"))
+    facts += _common_facts(episodes, files)
+    if run is not None:
+        facts.append(("run digest", run.digest))
+    return Report(
+        title=found.path.resolve().name,
+        kind=_KINDS[found.kind],
+        facts=tuple(facts),
+        episodes=tuple(episodes),
+        distributions=components,
+        diagnosis=diagnosis,
+        missing=missing,
+    )
+
+
+def _dataset_report(
+    root: Path, camera: str, diagnosis: Diagnosis | None, named: NamedRoles, advance: _Progress
+) -> Report:
+    folder = LeRobotFolder(root, named=named)
+    stride, budget = max(1, -(-len(folder.places) // MAX_SHOWN)), strip_budget(len(folder.places))
+    flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
+    without_videos = folder.leave_out_missing_cameras()
+    components: Components = {}
+    episodes: list[ReportedEpisode] = []
+    for number, place in enumerate(folder.places):
+        strip_bytes = budget if place.episode_index in flagged or number % stride == 0 else 0
+        opened = partial(open_stored_episode, folder, number)
+        episode = _read(opened, root, folder.roles, camera, strip_bytes, components)
+        episode = replace(episode, name=f"episode {place.episode_index}")
+        episodes.append(_judged(episode, place.episode_index, diagnosis))
+        advance(len(episodes), len(folder.places))
+    files = (file for file in root.rglob("*") if file.is_file())
+    facts = [("episodes", str(len(episodes))), *_common_facts(episodes, files)]
+    missing = [*folder.notes, *(f"No episode has a video of {key}." for key in without_videos), *folder.roles.notes()]
+    if not folder.sidecar_tables("episodes"):
+        missing.append(
+            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
+            "and the conditions of success are not known."
+        )
+    return Report(
+        title=root.resolve().name,
+        kind="LeRobot dataset",
+        facts=(*facts, ("format", f"LeRobot {folder.info.version}")),
+        episodes=tuple(episodes),
+        distributions=components,
+        diagnosis=diagnosis,
+        missing=tuple(missing),
+    )
+
+
+def _read(
+    opened: Callable[[], AbstractContextManager[Episode]],
+    path: Path,
+    roles: Roles | NamedRoles,
+    camera: str,
+    strip_bytes: int,
+    components: Components,
+) -> ReportedEpisode:
+    """Read an episode and add its motion to the components; a damaged one is reported as damaged."""
+    try:
+        with opened() as episode:
+            info, table = episode.info, episode.table()
+            if camera and camera not in episode.cameras:
+                there = ", ".join(episode.cameras) or "none"
+                raise ConfigError(f"No camera {camera!r}, available are {there}: {path}")
+            cameras = [name for name in episode.cameras if camera in ("", name) and len(table.image_stamps[name])]
+            strip = None
+            if strip_bytes and cameras:
+                images_at = partial(episode.images_at, cameras[0])
+                strip = filmstrip(cameras[0], episode.num_frames, images_at, max_bytes=strip_bytes)
+            add_motion(
+                components,
+                roles if isinstance(roles, Roles) else roles_of_recording(info, roles),
+                table.features,
+            )
+            attempt = f", attempt {info.attempt}" if info.attempt or path.parent.name == FAILED else ""
+            return ReportedEpisode(
+                name=f"episode {info.episode_index}{attempt}",
+                problem="A crash cut the recording off; it was recovered." if episode.outcome is None else "",
+                instruction=info.instruction,
+                outcome=episode.outcome,
+                num_frames=episode.num_frames,
+                fps=info.fps,
+                seed=simulation_facts(info).get("root_seed"),
+                phases=tuple(consecutive_runs(episode.phases)),
+                filmstrip=strip,
+                facts=tuple(_facts_of(episode)),
+            )
+    except (RecordingError, ExportError) as error:
+        if (lack := resource_error(error)) is not None:
+            raise lack from error
+        return ReportedEpisode(name=path.stem, problem=without_path(error, path).replace(f"{path}/", ""))
+
+
+def _facts_of(episode: Episode) -> Iterator[tuple[str, str]]:
+    info, simulated = episode.info, simulation_facts(episode.info)
+    if simulated:
+        yield "task", simulated["task"]
+    yield "robot", info.robot_name
+    videos = ((name, episode.video_settings(name)) for name in episode.cameras)
+    yield "cameras", ", ".join(f"{name} {video.width}x{video.height}" for name, video in videos) or "none"
+    if simulated:
+        yield "root seed", str(simulated["root_seed"])
+    if version := info.versions.get("demorec"):
+        yield "made with", f"demorec {version}"
 
 
 def _judged(episode: ReportedEpisode, number: int, diagnosis: Diagnosis | None) -> ReportedEpisode:
@@ -108,97 +345,14 @@ def _common_facts(episodes: Sequence[ReportedEpisode], files: Iterable[Path]) ->
     yield "frames", f"{sum(episode.num_frames for episode in episodes):,} ({seconds / factor:.1f} {unit} at {rates})"
     size = sum(file.stat().st_size for file in files)
     yield "size", f"{size / 1000:.0f} kB" if size < 1_000_000 else f"{size / 1e6:.1f} MB"
+    facts = [fact for episode in episodes for fact in episode.facts]
+    for name in dict.fromkeys(name for name, _ in facts):
+        yield name, _few(value for of, value in facts if of == name)
 
 
 def _few(values: Iterable[str]) -> str:
     """The first three distinct values."""
     return shown(list(dict.fromkeys(values)), 3) or "unknown"
-
-
-def _recordings_report(
-    found: Found, camera: str, diagnosis: Diagnosis | None, workers: int, named: NamedRoles, advance: _Progress
-) -> Report:
-    files = (*found.recordings, *found.failed)
-    expect_recordings(found, files)
-    run, missing = _run_file(found)
-    stride = -(-len(files) // MAX_SHOWN)
-    budget = strip_budget(len(files))
-    strips = [0 if number % stride and file.parent.name != FAILED else budget for number, file in enumerate(files)]
-    read = partial(_read, found.path, camera, named)
-    episodes: list[ReportedEpisode] = []
-    components: Components = {}
-    beyond = () if run is None or run.generation is None else run.beyond
-    unrequested = {found.path / attempt.file for attempt in beyond}
-    if unrequested:
-        missing += (f"{len(unrequested)} recordings of episodes beyond the number last requested are left out.",)
-    wanted = [number for number, file in enumerate(files) if file not in unrequested]
-    results = in_turn(read, [(files[number], strips[number]) for number in wanted], workers, ahead=_AHEAD)
-    for number, (episode, own) in zip(wanted, results, strict=True):
-        episodes.append(_judged(episode, number, diagnosis))
-        for key, samples in own.items():
-            components.setdefault(key, []).extend(samples)
-        advance(len(episodes), len(wanted))
-    if run is not None:
-        episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
-    return Report(
-        title=found.path.resolve().name,
-        kind=_KINDS[found.kind],
-        facts=tuple(_run_facts(found, run, episodes)),
-        episodes=tuple(episodes),
-        distributions=components,
-        diagnosis=diagnosis,
-        missing=missing,
-    )
-
-
-def _read(root: Path, camera: str, named: NamedRoles, given: tuple[Path, int]) -> tuple[ReportedEpisode, Components]:
-    """Read a recording, in any process, with a size limit for its strip; a damaged one is reported as damaged."""
-    path, strip_bytes = given
-    components: Components = {}
-    try:
-        with open_recording(path) as recording:
-            episode = _read_recording(recording, camera, strip_bytes)
-            add_motion(components, roles_of_recording(recording.info, named), recording.table().features)
-    except RecordingError as error:
-        episode = ReportedEpisode(name=path.stem, problem=without_path(error, path))
-    return replace(episode, source=path.name if path == root else path.relative_to(root).as_posix()), components
-
-
-def _read_recording(recording: Recording, camera: str, strip_bytes: int) -> ReportedEpisode:
-    info = recording.info
-    if camera and camera not in recording.cameras:
-        there = ", ".join(recording.cameras) or "none"
-        raise ConfigError(f"No camera {camera!r}, available are {there}: {recording.path}")
-    strip = None
-    seen = next((name for name in recording.cameras if camera in ("", name) and recording.num_images(name)), None)
-    if strip_bytes and seen is not None:
-        strip = filmstrip(seen, recording.num_frames, partial(recording.images_at, seen), max_bytes=strip_bytes)
-    is_failed = recording.path.parent.name == FAILED
-    attempt = f", attempt {info.attempt}" if is_failed or info.attempt else ""
-    return ReportedEpisode(
-        name=f"episode {info.episode_index}{attempt}",
-        problem="A crash cut the recording off; it was recovered." if recording.outcome is None else "",
-        instruction=info.instruction,
-        outcome=recording.outcome,
-        num_frames=recording.num_frames,
-        fps=info.fps,
-        seed=simulation_facts(info).get("root_seed"),
-        phases=tuple(consecutive_runs(recording.phases)),
-        filmstrip=strip,
-        facts=tuple(_facts_of(recording)),
-    )
-
-
-def _facts_of(recording: Recording) -> Iterator[tuple[str, str]]:
-    info, simulated = recording.info, simulation_facts(recording.info)
-    if simulated:
-        yield "task", simulated["task"]
-    yield "robot", info.robot_name
-    videos = ((name, recording.video_settings(name)) for name in recording.cameras)
-    yield "cameras", ", ".join(f"{name} {video.width}x{video.height}" for name, video in videos) or "none"
-    if simulated:
-        yield "root seed", str(simulated["root_seed"])
-    yield "made with", f"demorec {info.versions.get('demorec', 'of an unknown version')}"
 
 
 def _run_file(found: Found) -> tuple[RunFile | None, tuple[str, ...]]:
@@ -217,151 +371,6 @@ def _without_recording(attempt: Attempt) -> ReportedEpisode:
     return ReportedEpisode(
         name=f"episode {attempt.episode_index}, attempt {attempt.attempt}",
         problem="Nothing was recorded, since no scene could be laid out.",
-        outcome=_outcome({"success": False, "failure_phase": attempt.phase, "failure_reason": attempt.reason}),
+        outcome=Outcome(success=False, num_frames=0, failure_phase=attempt.phase, failure_reason=attempt.reason),
         seed=attempt.seed,
     )
-
-
-def _run_facts(found: Found, run: RunFile | None, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
-    if run is not None and run.generation is not None:
-        yield "episodes", f"{len(run.successes)} of {run.num_episodes} asked"
-    yield "attempts" if found.failed else "recordings", str(len(episodes))
-    yield from _common_facts(episodes, (*found.recordings, *found.failed))
-    facts = [fact for episode in episodes for fact in episode.facts]
-    for name in dict.fromkeys(name for name, _ in facts):
-        yield name, _few(value for of, value in facts if of == name)
-    if run is not None:
-        yield "run digest", run.digest
-
-
-def _dataset_report(
-    root: Path, camera: str, diagnosis: Diagnosis | None, named: NamedRoles, advance: _Progress
-) -> Report:
-    folder = LeRobotFolder(root, named=named)
-    features, roles = folder.info.features, folder.roles
-    rows = {row["episode_index"]: row for row in folder.sidecar(_SIDECAR_COLUMNS)}
-    key = _camera_key(folder, camera)
-    wanted = dict.fromkeys((*roles.state, *roles.action))
-    if _SUCCESS in features and features[_SUCCESS].column.elements:
-        wanted[_SUCCESS] = None
-    reader = folder.rows(list(wanted)) if wanted else None
-    stride, budget = max(1, -(-len(folder.places) // MAX_SHOWN)), strip_budget(len(folder.places))
-    flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
-    components: Components = {}
-    episodes: list[ReportedEpisode] = []
-    for number, place in enumerate(folder.places):
-        columns: Mapping[str, NDArray[Any]] = {}
-        strip: Filmstrip | None = None
-        problems: list[str] = []
-        with noted(problems, root):
-            columns = {} if reader is None else reader.numbers(place)
-            add_motion(components, roles, columns)
-            if key is not None and (place.episode_index in flagged or number % stride == 0):
-                stored = folder.stored_images.get(key)
-                images_at = partial(stored.read, place) if stored else folder.video(key, place).images_at
-                strip = filmstrip(key.removeprefix(IMAGE_PREFIX), place.length, images_at, max_bytes=budget)
-        episode = _dataset_episode(place, int(folder.info.fps), columns, rows.get(place.episode_index))
-        episode = replace(episode, filmstrip=strip, problem="; ".join(problems))
-        episodes.append(_judged(episode, place.episode_index, diagnosis))
-        advance(len(episodes), len(folder.places))
-    episodes += [_left_out(row) for row in folder.attempts.failures]
-    return Report(
-        title=root.resolve().name,
-        kind="LeRobot dataset",
-        facts=tuple(_dataset_facts(folder, episodes)),
-        episodes=tuple(episodes),
-        distributions=components,
-        diagnosis=diagnosis,
-        missing=(*folder.notes, *_missing(folder, has_sidecar=bool(rows))),
-    )
-
-
-def _camera_key(folder: LeRobotFolder, camera: str) -> str | None:
-    """The feature whose images are shown; None for a dataset without color images.
-
-    Raises:
-        ConfigError: The camera does not exist.
-    """
-    keys = [key for key, feature in folder.info.features.items() if feature.is_camera and not feature.is_depth]
-    if not camera:
-        return keys[0] if keys else None
-    for key in keys:
-        if camera in (key, key.removeprefix(IMAGE_PREFIX)):
-            return key
-    there = ", ".join(key.removeprefix(IMAGE_PREFIX) for key in keys) or "none"
-    raise ConfigError(f"No camera {camera!r} with color images, available are {there}: {folder.root}")
-
-
-def _dataset_episode(
-    place: EpisodePlace, fps: int, columns: Mapping[str, NDArray[Any]], row: _Row | None
-) -> ReportedEpisode:
-    name = f"episode {place.episode_index}"
-    known = ReportedEpisode(name=name, instruction=", ".join(place.tasks), num_frames=place.length, fps=fps)
-    if row is None:
-        success = bool(columns[_SUCCESS][-1, 0]) if len(columns.get(_SUCCESS, ())) else None
-        return replace(known, outcome=_outcome({"success": success}))
-    try:
-        known = replace(known, source=str(row["source"]), outcome=_outcome(row))
-        if row["episode_info"] is None:  # without a scene there is no seed and no phase
-            return known
-        phases = tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"])
-        return replace(known, seed=row["root_seed"], phases=phases)
-    except (ValueError, KeyError, TypeError) as error:
-        raise ExportError(f"The sidecar's row of {name} cannot be used ({describe_error(error)})") from error
-
-
-def _outcome(row: _Row) -> Outcome | None:
-    """Outcome of an attempt, as far as a row records it."""
-    if row["success"] is None:
-        return None
-    return Outcome(
-        success=row["success"],
-        checks=tuple(SuccessCheck(**check) for check in row.get("checks") or ()),
-        failure_phase=row.get("failure_phase") or "",
-        failure_reason=row.get("failure_reason") or "",
-        num_frames=0,
-        num_retries=row.get("num_retries") or 0,
-    )
-
-
-def _left_out(row: _Row) -> ReportedEpisode:
-    return ReportedEpisode(
-        name=f"run's episode {row['run_episode_index']}, attempt {row['attempt']}",
-        problem="This attempt is not in the dataset; only its outcome is known.",
-        outcome=_outcome(row),
-    )
-
-
-def _missing(folder: LeRobotFolder, *, has_sidecar: bool) -> Iterator[str]:
-    """Sentences about data missing from the dataset."""
-    if not has_sidecar:
-        yield (
-            f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
-            "and the conditions of success are not known."
-        )
-        if _SUCCESS not in folder.info.features:
-            yield f"Without a column {_SUCCESS}, the outcomes of the episodes are not known."
-    if _camera_key(folder, "") is None:
-        yield "It has no color images, so there are no filmstrips."
-    roles = folder.roles
-    yield from roles.notes()
-    for role, parts in (("state", roles.state), ("action", roles.action)):
-        if (count := len(roles.elements(parts))) > MAX_COMPONENTS:
-            yield f"Only the first {MAX_COMPONENTS} of the {count} components of the {role} are drawn."
-
-
-def _dataset_facts(folder: LeRobotFolder, episodes: Sequence[ReportedEpisode]) -> Iterator[tuple[str, str]]:
-    yield "episodes", str(len(folder.places))
-    if left_out := len(episodes) - len(folder.places):
-        yield "attempts", f"{len(episodes)}, of which {left_out} are not in the dataset"
-    yield from _common_facts(episodes, (file for file in folder.root.rglob("*") if file.is_file()))
-    info = folder.info
-    yield "robot", info.robot_type or "unknown"
-    cameras = (
-        f"{key.removeprefix(IMAGE_PREFIX)} {'x'.join(str(n) for n in feature.shape[1::-1])}"
-        for key, feature in info.features.items()
-        if feature.is_camera
-    )
-    yield "cameras", ", ".join(cameras) or "none"
-    yield "tasks", str(info.total_tasks)
-    yield "format", f"LeRobot {info.version}"

@@ -25,8 +25,8 @@ from demorec.check.base import RANK, Finding
 from demorec.core.replacing import REPORT_MARK
 from demorec.core.text import printable
 from demorec.extensions.doctor.diagnosis import Diagnosis
-from demorec.extensions.report.content import MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
 from demorec.extensions.report.filmstrip import MAX_SHOWN
+from demorec.extensions.report.gather import MAX_SAMPLES, Report, ReportedEpisode, State, success_rate
 from demorec.view.style import phase_colors
 
 CHART_WIDTH = 220
@@ -213,10 +213,7 @@ def _distributions(report: Report) -> Iterator[Chart]:
 
 
 def _phase_bar(episode: ReportedEpisode, colors: Mapping[str, str]) -> Iterator[tuple[str, str, str, str]]:
-    """Yield (title, left, width, color) of each phase, in units of one image of the filmstrip above.
-
-    The middle of each image is above its own moment.
-    """
+    """Yield (title, left, width, color) of each phase, in images of the filmstrip, whose middles are their moments."""
     assert episode.filmstrip is not None
     last = max(episode.num_frames - 1, 1)
     for name, first, end in episode.phases:
