@@ -35,7 +35,6 @@ class Export:
     rare_flags: ClassVar[frozenset[str]] = frozenset(
         {
             "mapping",
-            "hold_images",
             "corrected_only",
             "allow_duplicates",
             "workers",
@@ -43,8 +42,6 @@ class Export:
             "data_files_mb",
             "video_files_mb",
             "files_per_chunk",
-            "transcode_codec",
-            "transcode_crf",
             "calibration",
             "motor_units",
             "intervention",

@@ -44,7 +44,6 @@ SCALARS: Mapping[str, Literal["float32", "bool"]] = {
     SUCCESS: "bool",
 }
 """Features with one number per frame, and their type."""
-_SECOND_NS = 1_000_000_000
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -245,27 +244,16 @@ class ExportEpisode[O: CommonOptions]:
             )
 
     def numbers(self, camera: ExportCamera) -> NDArray[np.int64]:
-        """(T,) number of the image that each frame shows, in the order of `recording.packets`. A frame without an image
-        shows the camera's last one, if holding is allowed. Raises ExportError if a frame has no image.
+        """(T,) number of the image that each frame shows, in the order of `recording.packets`. Raises ExportError if a
+        frame has no image.
         """
-        table = self.table
-        numbers, stamps = table.images[camera.name].copy(), table.image_stamps[camera.name]
-        longest = round(self.options.hold_images * _SECOND_NS)
+        numbers = self.table.images[camera.name]
         without = np.flatnonzero(numbers == NO_IMAGE)
-        for frame in without.tolist():
-            before = int(numbers[frame - 1]) if frame else NO_IMAGE
-            age = int(table.time_ns[frame] - stamps[before]) if before != NO_IMAGE else None
-            if age is None or age > longest:
-                last, hold = "none came before it", ""
-                if age is not None:
-                    last = f"the last one is {age / _SECOND_NS:.3g} s old"
-                    hold = "allow that one to be held (--hold-images SECONDS), or "
-                raise ExportError(
-                    f"Frame {frame} has no image of the camera {camera.name}, like {len(without)} of {len(numbers)} "
-                    f"frames, and {last}: {hold}leave the camera (--features) or the episode (--episodes) out: "
-                    f"{self.recording.path}"
-                )
-            numbers[frame] = before
+        if len(without):
+            raise ExportError(
+                f"Frame {without[0]} has no image of the camera {camera.name}, like {len(without)} of {len(numbers)} "
+                f"frames: leave the camera (--features) or the episode (--episodes) out: {self.recording.path}"
+            )
         return numbers[self.rows]
 
     def images(self, camera: ExportCamera) -> Iterator[NDArray[Any]]:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from demorec.core.errors import ConfigError, OptionError, check_option
+from demorec.core.errors import ConfigError, OptionError
 from demorec.episode.features import ACTION, STATE, ActionKind
 
 ProgressCallback = Callable[[int, int], None]
@@ -42,10 +42,6 @@ class CommonOptions:
     """Add depth images if the recordings have them."""
     fps: int | None = None
     """Frames per second of the dataset; must divide the recordings' rate; frames in between are left out."""
-    hold_images: float = 0.0
-    """For external episodes: seconds for which a frame without an image shows the camera's last one, as a policy would
-    see it; 0: an error.
-    """
     overwrite: bool = False
     """Replace an existing dataset; a folder with any other content is never replaced."""
 
@@ -56,7 +52,6 @@ class CommonOptions:
     def validate(self) -> None:
         """Raise ConfigError for impossible values and combinations."""
         parse_episodes(self.episodes)
-        check_option("hold_images", self.hold_images, 0, 3600, "s")
         if self.fps is not None and self.fps < 1:
             raise OptionError("fps", f"is {self.fps}, allowed are 1 or more.")
 

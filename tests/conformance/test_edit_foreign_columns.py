@@ -298,10 +298,10 @@ def test_a_merge_keeps_the_files_that_are_the_same_in_all(tmp_path: Path, capsys
     for flags in (("--dry-run",), ()):
         assert exit_code("dataset", "merge", *sources, "--out", tmp_path / "new", *flags) == 0
         printed = capsys.readouterr().out
-        assert "Copied, but not checked: meta/modality.json, extra/arm.urdf. Check that they still apply." in printed
+        assert "Copied, but not checked: extra/arm.urdf, meta/modality.json. Check that they still apply." in printed
         different = "extra/deep/calibration.bin, extra/only here.txt, meta/notes of ours.txt"
         assert f"eft out: {different} (not the same in all datasets: copy it if it still applies)" in printed
-        assert "meta/episodes/file-000.parquet (LeRobot gives no table this name)" in printed
+        assert "meta/episodes/file-000.parquet (LeRobot would read a copy as part of the dataset)" in printed
     assert {name: (tmp_path / "new" / name).read_bytes() for name in kept} == kept
     assert not (tmp_path / "new/meta/notes of ours.txt").exists()
 

@@ -67,11 +67,11 @@ def test_an_mp4_file_holds_one_set_of_parameters(tmp_path: Path) -> None:
 
 def test_transcoded_jpeg_recordings_are_reported(tmp_path: Path) -> None:
     write_episode(tmp_path / "e.mcap", num_frames=8, cameras=("front",), video=VideoConfig(codec="jpeg"))
-    report = export(tmp_path, tmp_path / "d", transcode_codec="av1", transcode_crf=20)
+    report = export(tmp_path, tmp_path / "d")
     assert len(report.transcoded) == 1
     assert "jpeg" in report.transcoded[0]
     coding = info(tmp_path / "d")["features"]["observation.images.front"]["info"]
-    assert (coding["video.codec"], coding["video.crf"]) == ("av1", 20)
+    assert (coding["video.codec"], coding["video.crf"]) == ("h264", 18)
     assert "some images were encoded again." in (tmp_path / "d" / "README.md").read_text()
     with Recording(tmp_path / "e.mcap") as recording:
         for found, expected in zip(video_frames(tmp_path / "d", "front"), recording.images("front"), strict=True):

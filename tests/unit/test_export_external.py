@@ -67,24 +67,12 @@ def test_numbers_that_float32_does_not_hold_are_refused_where_it_is_written(tmp_
         assert file["data/demo_0/obs/force"][2, 1] == 1e300
 
 
-def test_a_missing_image_is_an_error_unless_the_last_may_be_held(tmp_path: Path) -> None:
+def test_a_missing_image_is_an_error(tmp_path: Path) -> None:
     episode = complete(num_frames=30)
     gap = [replace(frame, images={}) if index in (7, 8) else frame for index, frame in enumerate(episode.frames)]
     run = run_of(tmp_path / "run", replace(episode, frames=gap))
-    age = episode.frames[8].time_ns - episode.images["top"][6][0]
     with pytest.raises(ExportError, match="Frame 7 has no image of the camera top, like 2 of 30 frames"):
         export(run, tmp_path / "d")
-    with pytest.raises(ExportError, match="Frame 8"):
-        export(run, tmp_path / "d", hold_images=(age - 10**6) / 1e9)
-    report = export(run, tmp_path / "d", hold_images=(age + 10**6) / 1e9)
-    assert report.transcoded == ("top, frames show images again, or leave some out",)
-    with av.open(str(next((tmp_path / "d" / "videos").rglob("*.mp4")))) as file:
-        shown = [float(frame.to_ndarray(format="rgb24")[30, 30, 1]) for frame in file.decode(video=0)]
-    assert np.abs(np.array(shown) - [5 * (6 if index in (7, 8) else index) for index in range(30)]).max() < 12
-    assert json.loads((tmp_path / "d" / "demorec" / "export.json").read_text())["hold_images"] > 0
-    first = replace(episode, frames=[replace(episode.frames[0], images={}), *episode.frames[1:]])
-    with pytest.raises(ExportError, match="none came before it: leave the camera"):
-        export(run_of(tmp_path / "first", first), tmp_path / "e", hold_images=9)
 
 
 def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ from demorec.mcap import open_recording
 
 _STATED_OPTIONS = (
     "action", "state", "privileged", "features", "include_failures", "episodes", "fps", "depth", "motor_units", "boxes",
-    "progress", "hold_images",
+    "progress",
 )  # fmt: skip
 """Options that decide the content of the episodes; `demorec/export.json` lists them."""
 

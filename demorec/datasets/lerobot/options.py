@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 from demorec.annotate import KINDS, LanguageKind
 from demorec.core.errors import ConfigError, OptionError, check_option
@@ -67,10 +66,6 @@ class ExportOptions(CommonOptions):
     """Maximum size of an mp4 file in MiB."""
     files_per_chunk: int = 1000
     """Number of files in a chunk folder."""
-    transcode_codec: Literal["h264", "av1"] = "h264"
-    """Codec for images that cannot pass through (jpeg, or --fps between keyframes)."""
-    transcode_crf: int | None = 18
-    """Constant rate factor of transcoded images, lower is better; auto: as in a recording."""
 
     @property
     def spoken(self) -> tuple[LanguageKind, ...]:
@@ -101,7 +96,6 @@ class ExportOptions(CommonOptions):
         for name in ("data_files_mb", "video_files_mb"):
             check_option(name, getattr(self, name), MIN_FILE_MIB, MAX_FILE_MIB, "MiB")
         check_option("files_per_chunk", self.files_per_chunk, 1, 1_000_000)
-        check_option("transcode_crf", self.transcode_crf, 0, 51 if self.transcode_codec == "h264" else 63)
 
 
 def check_repo_id(repo_id: str) -> None:

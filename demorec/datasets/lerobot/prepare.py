@@ -39,6 +39,8 @@ from demorec.robots.motors import Motors
 LeRobotEpisode = ExportEpisode[ExportOptions]
 NO_PLACE = (VELOCITY, EE_POSE, REWARD, DONE, SUCCESS)
 """Features that LeRobot does not record from a real arm."""
+_TRANSCODED = VideoConfig(codec="h264", crf=18)
+"""Encoding of images that cannot pass through: jpeg, or with --fps between keyframes."""
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -245,9 +247,8 @@ def _lead(recording: Recording, camera: str, number: int) -> int:
 
 
 def _transcoded_video(episode: LeRobotEpisode, camera: ExportCamera) -> tuple[EncodedVideo, VideoSettings]:
-    size, options = episode.recording.video_settings(camera.name), episode.options
-    video = VideoConfig(codec=options.transcode_codec, crf=options.transcode_crf)
-    encoder = make_encoder(video=video, width=size.width, height=size.height, fps=episode.fps)
+    size = episode.recording.video_settings(camera.name)
+    encoder = make_encoder(video=_TRANSCODED, width=size.width, height=size.height, fps=episode.fps)
     units = [unit for image in episode.images(camera) for unit in encoder.encode(image)]
     units += encoder.finish()
     lengths = [len(unit) for unit in units]

@@ -32,6 +32,7 @@ _ABOUT_THE_WHOLE = (CARD_PATH, SECOND_CARD_PATH, ".gitattributes", MODALITY_PATH
 """Files that are copied if all sources have the same."""
 _OF_OTHER_TOOLS = (".cache/", ".git/")
 """Folders created by downloading a dataset."""
+_COPIED = "copied"
 MAX_NAMES = 5
 """Maximum files listed of one kind."""
 
@@ -154,83 +155,61 @@ def left_out(plan: Plan) -> tuple[str, ...]:
     """One phrase for each omission with its reason in brackets, except the user's choices."""
     found: dict[str, set[str]] = {}
     for number in range(len(plan.sources)):
-        for name, reason in _files(plan, number):
+        for name, reason in (*_columns(plan, number), *_other_files(plan, number)):
             found.setdefault(reason, set()).add(name)
+    found.pop(_COPIED, None)
     phrases = [f"{listed(sorted(names), MAX_NAMES, ', ')} ({reason})" for reason, names in found.items()]
     return (*phrases, *_scenes(plan), *_descriptions(plan), *_facts(plan))
 
 
-def copied_files(plan: Plan) -> tuple[str, ...]:
+def copied_files(plan: Plan) -> list[str]:
     """List the files that are copied unchanged: those about a whole dataset and unknown ones, equal in all sources."""
-    first, *others = plan.sources
-    known = [name for name in _ABOUT_THE_WHOLE if (first.root / name).is_file()]
-    names = (*known, *_unknown_files(first))
-    return tuple(name for name in names if all(_is_equal(name, first.root, other.root) for other in others))
+    return [name for name, reason in _other_files(plan, 0) if reason == _COPIED]
 
 
-def copied_unchecked_files(plan: Plan) -> tuple[str, ...]:
+def copied_unchecked_files(plan: Plan) -> list[str]:
     """List the copied files that may not fit the result: unknown ones, and modality.json with names of features."""
-    return tuple(name for name in copied_files(plan) if name == MODALITY_PATH or name not in _ABOUT_THE_WHOLE)
+    return [name for name in copied_files(plan) if name == MODALITY_PATH or name not in _ABOUT_THE_WHOLE]
 
 
-def _is_equal(name: str, first: Path, other: Path) -> bool:
-    path = other / name
-    return path.is_file() and not path.is_symlink() and filecmp.cmp(first / name, path, shallow=False)
-
-
-def _unknown_files(source: LeRobotFolder) -> tuple[str, ...]:
-    """List the files of unknown purpose, without links and tables that LeRobot would read as part of the dataset."""
-    root, used = source.root, _used_files(source)
-    strange = [name for name in _files_below(root) if not is_dataset_file(name) and root / name not in used]
-    return tuple(name for name in strange if not (root / name).is_symlink() and not _is_stray_table(name))
-
-
-def _is_stray_table(name: str) -> bool:
-    return name.startswith(("data/", "meta/episodes/")) and name.endswith(".parquet")
-
-
-def _used_files(source: LeRobotFolder) -> set[Path]:
-    """Files of rows and videos that are in use."""
-    return {place.data for place in source.places} | {
-        path for place in source.places for path, _ in place.videos.values()
-    }
-
-
-def _files_below(root: Path) -> list[str]:
-    names = (path.relative_to(root).as_posix() for path in sorted(root.rglob("*")) if path.is_file())
-    return [name for name in names if not name.startswith(_OF_OTHER_TOOLS)]
-
-
-def _files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
-    """Yield (name, reason) of the files of a source, and columns of its rows, that the result omits."""
+def _columns(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
     source = plan.sources[number]
     for path in filter(Path.exists, source.num_rows):
         for name in open_table(path).schema_arrow.names:
             if name not in source.info.features:
                 yield name, f"{INFO_PATH} does not list this column of the data files"
-    copied, used = copied_files(plan), _used_files(source)
+
+
+def _other_files(plan: Plan, number: int) -> Iterator[tuple[str, str]]:
+    """Yield (name, reason) of the files of a source that are not written anew: copied ones, and those left out."""
+    source = plan.sources[number]
     cameras = {mapping.feature for mapping in plan.mappings[number].values()}
     keeps_poses, keeps_progress = _poses_are_kept(plan), has_progress(plan)
-    is_merged = len(plan.sources) > 1
-    for name in _files_below(source.root):
-        path = source.root / name
-        if name in copied or path in used:
+    used = {place.data for place in source.places}
+    used |= {path for place in source.places for path, _ in place.videos.values()}
+    for path in sorted(source.root.rglob("*")):
+        name = path.relative_to(source.root).as_posix()
+        if not path.is_file() or path in used or name.startswith(_OF_OTHER_TOOLS):
             continue
-        if _is_stray_table(name) and not is_dataset_file(name):
-            yield name, "LeRobot gives no table this name"
-        elif not is_dataset_file(name):
-            differs = "not the same in all datasets" if is_merged else "unknown to demorec"
-            yield name, f"{differs}: copy it if it still applies"
+        is_unknown = not is_dataset_file(name)
+        is_table = name.startswith(("data/", "meta/episodes/")) and path.suffix == ".parquet"
+        if is_unknown and is_table:
+            yield name, "LeRobot would read a copy as part of the dataset"
+        elif is_unknown or name in _ABOUT_THE_WHOLE:
+            is_same = not path.is_symlink() and all(_is_equal(path, other.root / name) for other in plan.sources)
+            yield name, _COPIED if is_same else "not the same in all datasets: copy it if it still applies"
         elif name.startswith(("data/", "videos/", "images/")):
             yield name, "no episode of the dataset is in this file"
-        elif name in _ABOUT_THE_WHOLE and is_merged:
-            yield name, "not the same in all datasets"
         elif name.startswith(f"{SIDECAR_DIR}/camera_poses/") and not keeps_poses:
             yield name, "the other datasets have other moving cameras"
         elif name.startswith(f"{BOXES_DIR}/") and path.stem not in cameras:
             yield name, "its camera is left out"
         elif name in (PROGRESS_PATH, PROPORTIONS_PATH) and not keeps_progress:
             yield name, "its values hold for the episodes of the source"
+
+
+def _is_equal(path: Path, other: Path) -> bool:
+    return path == other or (other.is_file() and not other.is_symlink() and filecmp.cmp(path, other, shallow=False))
 
 
 def _scenes(plan: Plan) -> Iterator[str]:

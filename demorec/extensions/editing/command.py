@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 _RESULT = replace(DATASET_KIND, advice="choose --overwrite or another --out")
 MAX_SHOWN = 20
-"""Maximum episodes, parts of an episode, or differences that are printed."""
+"""Maximum episodes, or parts of an episode, that are printed."""
 DatasetPath = Annotated[Positional[Path], arg(metavar="DATASET", help="A dataset, or a run that has one.")]
 
 

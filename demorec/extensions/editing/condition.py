@@ -113,16 +113,15 @@ class _Condition:
             case ast.Compare(left=left, ops=kinds, comparators=rights):
                 values = [self._value(part, row) for part in (left, *rights)]
                 return all(self._compare(*each) for each in zip(kinds, values, values[1:], strict=False))
-        name = _column_name(node)
-        if name is None:
-            raise ConfigError(
-                "A condition has columns, values, comparisons, and, or, not and parentheses, and nothing else: "
-                f"{self._text}"
-            )
-        if name in _CONSTANTS and name not in row:
-            return _CONSTANTS[name]
-        check_column(name, self._rows)
-        return row.get(name)
+            case ast.Name(id=name):
+                if name in _CONSTANTS and name not in row:
+                    return _CONSTANTS[name]
+                check_column(name, self._rows)
+                return row.get(name)
+        raise ConfigError(
+            "A condition has columns, values, comparisons, and, or, not and parentheses, and nothing else: "
+            f"{self._text}"
+        )
 
     def _compare(self, kind: ast.cmpop, left: Any, right: Any) -> bool:
         if type(kind) not in _COMPARED:
@@ -133,17 +132,3 @@ class _Condition:
             return bool(_COMPARED[type(kind)](left, right))
         except TypeError as error:
             raise ConfigError(f"{left!r} and {right!r} cannot be compared so: {self._text}") from error
-
-
-def _column_name(node: ast.expr) -> str | None:
-    """Name of a column, which may contain slashes and dots."""
-    match node:
-        case ast.Name(id=name):
-            return name
-        case ast.Attribute(value=value, attr=last):
-            first = _column_name(value)
-            return None if first is None else f"{first}.{last}"
-        case ast.BinOp(op=ast.Div(), left=left, right=right):
-            a, b = _column_name(left), _column_name(right)
-            return None if a is None or b is None else f"{a}/{b}"
-    return None

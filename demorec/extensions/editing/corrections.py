@@ -61,18 +61,10 @@ def usable_info(stated: Mapping[str, Any], root: Path) -> DatasetInfo:
     """Parse info.json without impossible counts; ExportError if more of it is damaged."""
     data = dict(stated)
     for name, default in _COUNTS.items():
-        if not _is_possible(name, data.get(name)):
+        value = data.get(name)
+        if not isinstance(value, int | float) or not 0 < value < _MAX_COUNT:
             data[name] = default
     return DatasetInfo.from_json(data, root)
-
-
-def _is_possible(name: str, value: object) -> bool:
-    """Whether a count in info.json is possible; file sizes may be fractions of a MB."""
-    if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < _MAX_COUNT:
-        return False
-    if name.endswith("_in_mb"):
-        return value > 0
-    return value == int(value) and (value > 0 or name.startswith("total"))
 
 
 def repaired_features(info: DatasetInfo, tables: Sequence[Path], videos: Sequence[Path]) -> Repaired:

@@ -34,14 +34,12 @@ class DatasetDiff:
     """Result of a comparison of datasets A and B.
 
     Attributes:
-        pairs: Number of an episode in A -> its number in B.
         num_episodes: Number of episodes in A and in B.
         num_same: Number of pairs with equal rows and packets.
         differences: Description of a difference -> its pairs of episodes; none if it concerns the whole dataset.
         notes: Sentences on how the datasets were read.
     """
 
-    pairs: Mapping[int, int]
     num_episodes: tuple[int, int]
     num_same: int
     differences: Mapping[str, Sequence[tuple[int, int]]]
@@ -53,18 +51,6 @@ class DatasetDiff:
             numbers = [f"{a}{'' if a == b else f' (in B {b})'}" for a, b in pairs]
             where = f"episode{'s' * (len(numbers) > 1)} {listed(numbers, 8, ', ')}: " if numbers else ""
             yield f"{where}{text}"
-
-    def to_json(self) -> dict[str, Any]:
-        """The result as plain data."""
-        return {
-            "same": not self.differences,
-            "episodes_a": self.num_episodes[0],
-            "episodes_b": self.num_episodes[1],
-            "episodes_same": self.num_same,
-            "pairs": [list(pair) for pair in self.pairs.items()],
-            "differences": [{"text": text, "episodes": pairs} for text, pairs in self.differences.items()],
-            "notes": list(self.notes),
-        }
 
 
 def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetDiff:
@@ -100,7 +86,6 @@ def diff(a: Path, b: Path, progress: ProgressCallback | None = None) -> DatasetD
             for text in _episode_differences(readers, pair, [name for name in one if one[name] != other[name]]):
                 differences.setdefault(text, []).append(pair)
     return DatasetDiff(
-        pairs=pairs,
         num_episodes=(len(digests[0]), len(digests[1])),
         num_same=num_same,
         differences=differences,

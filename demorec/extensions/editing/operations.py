@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 from demorec.cli.shared.flags import Positional, arg
-from demorec.cli.shared.output import ProgressBar, counted, say, say_json
+from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.core.errors import ConfigError, ExportError, check_option
 from demorec.core.plain import listed
-from demorec.extensions.editing.command import MAX_SHOWN, Edit, EditOne, dataset_at, pairs
+from demorec.extensions.editing.command import Edit, EditOne, dataset_at, pairs
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
@@ -216,13 +216,10 @@ class Diff:
 
     Examples:
       demorec dataset diff cups sorted
-      demorec dataset diff cups sorted --json
     """
 
     a: Annotated[Positional[Path], arg(metavar="A", help="A dataset, or a run that has one.")]
     b: Annotated[Positional[Path], arg(metavar="B", help="Another dataset, or a run that has one.")]
-    json: bool = False
-    """Print all differences as JSON."""
 
     def run(self) -> int:
         """Compare and print the differences."""
@@ -237,14 +234,7 @@ class Diff:
         except ExportError as error:  # its exit code would mean that the datasets differ
             raise ConfigError(str(error)) from error
         count = len(found.differences)
-        if self.json:
-            say_json(found.to_json())
-            return int(count > 0)
-        lines = list(found.lines())
-        say(*lines[:MAX_SHOWN])
-        if count > MAX_SHOWN:
-            say(f"{count - MAX_SHOWN} more (--json)")
-        say(*found.notes)
+        say(*found.lines(), *found.notes)
         episodes = f"{found.num_same} of {found.num_episodes[0]} and {found.num_episodes[1]} episodes are the same"
         say(f"{counted(count, 'difference') if count else 'No difference'}: {episodes}.")
         return int(count > 0)
