@@ -380,24 +380,6 @@ def test_features_missing_from_info_json_are_distinguished_from_missing_columns(
     assert exit_code("check", source, "--only", "table_schema") == 0  # LeRobot reads everything but frame_index
 
 
-def test_a_table_that_belongs_to_no_episode_is_one_finding(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    source = write_foreign(tmp_path / "set")
-    data = source / DATA
-    pq.write_table(pq.read_table(data).append_column("weight", pa.array(np.zeros(16))), data)
-    raw = source / "data/chunk-001/file-000.parquet"
-    raw.parent.mkdir()
-    pq.write_table(pa.table({f"joint_{number}": [0.0, 1.0] for number in range(20)}), raw)
-    checks = ("unused_files", "table_schema", "contradicting_counts")
-    assert exit_code("check", source, "--only", *checks, "--json") == 1
-    report = json.loads(capsys.readouterr().out)
-    found = [(finding["check"], finding["severity"]) for finding in report["findings"]]
-    assert found == [("unused_files", "broken"), ("table_schema", "look")]
-    assert exit_code("dataset", "select", source, "--episodes", "0", "--out", tmp_path / "new") == 0
-    printed = capsys.readouterr().out
-    assert "Left out: weight (meta/info.json does not list this column of the data files)" in printed
-    assert not list((tmp_path / "new").rglob("chunk-001"))
-
-
 def test_tasks_as_categories_with_doubles_as_numbers_are_read(tmp_path: Path) -> None:
     numbers = pa.array(np.repeat([4, 0, 1, 0], LENGTH).astype(float))
     source = foreign(tmp_path / "set", {"task_index": numbers})

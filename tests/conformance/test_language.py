@@ -20,8 +20,7 @@ from demorec.annotate.referring import place_of
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
 from demorec.core.tables import TASKS
-from demorec.datasets.lerobot.folder import LeRobotFolder
-from demorec.datasets.lerobot.inspect import dataset_digest, episode_digests
+from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.episode.scene import Body, Shape
 from demorec.episode.variation import Ranges
 from demorec.episode.words import nouns_of
@@ -331,31 +330,6 @@ def test_episodes_are_filtered_by_facts(runs: list[Path], dataset: Path) -> None
             "mild",
         )
         assert (row["object_x"], row["object_y"]) == tuple(body.world_from_body.position[:2])
-
-
-@pytest.mark.slow
-def test_lerobots_tools_keep_the_language(runs: list[Path], tmp_path: Path) -> None:
-    from lerobot.datasets import LeRobotDataset
-    from lerobot.datasets.aggregate import aggregate_datasets
-    from lerobot.datasets.dataset_tools import delete_episodes, split_dataset
-
-    parts = [tmp_path / "first", tmp_path / "second"]
-    chosen = [[runs[0], runs[2]], [runs[3]]]
-    for run, part in zip(chosen, parts, strict=True):
-        export(run, part, language=(), progress=True)
-    known = [digest for part in parts for digest in episode_digests(LeRobotFolder(part))]
-    aggregate_datasets(["local/1", "local/2"], "local/all", roots=parts, aggr_root=tmp_path / "merged")
-    assert episode_digests(LeRobotFolder(tmp_path / "merged")) == known
-    facts = [row["task_name"] for row in episode_rows(tmp_path / "merged")]
-    assert facts == [run.name for part in chosen for run in part]
-
-    first = LeRobotDataset("local/1", root=parts[0])
-    delete_episodes(first, [0], output_dir=tmp_path / "left", repo_id="local/left")
-    split_dataset(first, {"one": [0], "other": [1]}, output_dir=tmp_path / "split")
-    for out, digest in (("left", known[1]), ("split/one", known[0]), ("split/other", known[1])):
-        assert episode_digests(LeRobotFolder(tmp_path / out)) == [digest]
-        assert "task_name" not in episode_rows(tmp_path / out)[0]  # unknown to LeRobot
-        assert not (tmp_path / out / "sarm_progress.parquet").exists()
 
 
 def test_progress_continues_at_the_end_of_a_dataset(runs: list[Path], tmp_path: Path) -> None:

@@ -89,23 +89,6 @@ def test_lerobot_reads_every_frame_as_it_was_recorded(run: Path, dataset: Path, 
             row += 1
 
 
-def test_windows_in_time_stop_at_the_ends_of_an_episode(run: Path, dataset: Path) -> None:
-    steps = [-0.1, 0.0, 1 / 30, 0.2]
-    found = open_dataset(dataset, delta_timestamps={"action": steps, "observation.images.front": steps})
-    first, last = 20, 34  # of episode 1
-    images = recorded_images(run, 1)["front"]
-    for row in (first, 27, last):
-        item = found[row]
-        wanted = [row - 3, row, row + 1, row + 6]
-        pad = [not first <= index <= last for index in wanted]
-        assert item["action_is_pad"].tolist() == item["observation.images.front_is_pad"].tolist() == pad
-        for k, index in enumerate(wanted):
-            held = min(max(index, first), last)
-            assert np.array_equal(item["action"][k].numpy(), found.hf_dataset[held]["action"].numpy())
-            image = item["observation.images.front"][k].numpy().transpose(1, 2, 0)
-            assert np.array_equal(image, images[held - first])
-
-
 def test_statistics_equal_those_of_the_decoded_data(dataset: Path) -> None:
     found = open_dataset(dataset)
     stats = found.meta.stats
@@ -198,20 +181,6 @@ def test_datasets_can_be_merged(run: Path, dataset: Path, tmp_path: Path) -> Non
     assert [name for name, verdict in verdicts.items() if verdict == "broken"] == ["copied_episodes"]  # they are
     edit_json(tmp_path / "both/meta/stats.json", lambda data: data["action"].update(q90=data["action"]["max"]))
     assert verdict_of(tmp_path / "both", "wrong_statistics", "dataset") == "broken"
-
-
-@pytest.mark.slow
-def test_features_can_be_added_and_removed(dataset: Path, tmp_path: Path) -> None:
-    from lerobot.datasets.dataset_tools import add_features, remove_feature
-
-    extra = np.arange(sum(LENGTHS), dtype=np.float32)[:, None]
-    added = add_features(
-        open_dataset(dataset), {"extra": (extra, {"dtype": "float32", "shape": (1,), "names": None})}, tmp_path / "a"
-    )
-    assert float(added[40]["extra"]) == 40
-    removed = remove_feature(open_dataset(dataset), "observation.velocity", tmp_path / "b")
-    assert "observation.velocity" not in removed.features
-    assert not any((tmp_path / name / "demorec").exists() for name in ("a", "b"))
 
 
 def lerobot_command(name: str, *arguments: str, timeout: float = 280) -> str:

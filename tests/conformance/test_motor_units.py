@@ -6,8 +6,6 @@ import json
 import math
 import shutil
 from collections.abc import Callable
-from contextlib import suppress
-from itertools import islice
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -17,11 +15,10 @@ import pytest
 from numpy.typing import NDArray
 from support.check import checked, edit_column, simulate, simulate_run
 from support.commands import exit_code
-from support.export import data_table, export, info
+from support.export import data_table, info
 
-from demorec.core.errors import ConfigError
 from demorec.extensions.policies.policy import trained_action
-from demorec.mcap import EpisodeWriter, Recording, open_recording, recover
+from demorec.mcap import Recording, open_recording
 from demorec.robots.motors import CALIBRATIONS, MotorUnits
 from demorec.robots.so101 import SO101_FOLLOWER
 
@@ -234,27 +231,3 @@ def test_other_robots_are_refused_in_motor_units(
     assert not (tmp_path / "b").exists()
     (tmp_path / "train_config.json").write_text(json.dumps({"dataset": {"root": str(dataset)}}))
     assert trained_action(tmp_path) is None  # of a policy trained on it
-
-
-def test_a_recording_cut_off_by_a_crash_stays_out(run: Path, tmp_path: Path) -> None:
-    (path,) = (run / "episodes").glob("*.mcap")
-    with (
-        open_recording(path) as recording,
-        suppress(InterruptedError),
-        EpisodeWriter(tmp_path / "cut.mcap", recording.info) as writer,
-    ):
-        for frame in islice(recording, 70):
-            writer.write(frame)
-        raise InterruptedError
-    recover(tmp_path / "cut.mcap.part", tmp_path / "recovered.mcap")
-    report = export([path, tmp_path / "recovered.mcap"], tmp_path / "d", motor_units="degrees")
-    assert (report.num_episodes, report.skipped_failures, report.skipped_unknown) == (1, 0, 1)
-
-
-@pytest.mark.slow
-def test_differences_between_recordings_are_named(run: Path, tmp_path: Path) -> None:
-    (path,) = (run / "episodes").glob("*.mcap")
-    other = simulate(tmp_path / "other.mcap", robot="so101", seed=11, cameras=("wrist",))
-    with pytest.raises(ConfigError, match="cameras is wrist instead of front") as refused:
-        export([path, other], tmp_path / "d", motor_units="degrees")
-    assert "kind of episode" not in str(refused.value)

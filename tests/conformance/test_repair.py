@@ -185,19 +185,6 @@ def test_lerobot_reads_every_frame_of_a_repaired_dataset(
     assert not (tmp_path / "again").exists()
 
 
-def test_float64_rows_stay_float64(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = Path(shutil.copytree(whole, tmp_path / "d"))
-    as_double(root)
-    assert repair(root, "--out", tmp_path / "new") == 0
-    assert "observation.state is float64 of shape (3,)" in capsys.readouterr().out
-    assert (
-        json.loads((tmp_path / "new/meta/info.json").read_text())["features"]["observation.state"]["dtype"] == "float64"
-    )
-    tables = [pq.read_table(path / "data").column("observation.state").to_pylist() for path in (root, tmp_path / "new")]
-    assert tables[0] == tables[1]
-    items(tmp_path / "new")
-
-
 @pytest.mark.parametrize(
     ("names", "shape"),
     [([["x", "y", "z"]], [3]), ({"motors": ["x", "y", "z"]}, [5]), ({"axes": ["x", "y", "z"]}, [3]), (["x", "y"], [5])],
@@ -213,15 +200,6 @@ def test_names_keep_their_form(
     assert ("The names of observation.state are left out" in capsys.readouterr().out) != fits
     found = json.loads((tmp_path / "new/meta/info.json").read_text())["features"]["observation.state"]
     assert (found["dtype"], found["shape"], found["names"]) == ("float64", [3], names if fits else None)
-
-
-def test_a_camera_may_have_any_name(whole: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The columns of its ranges end in from_timestamp and to_timestamp."""
-    name = "observation.images.photo_to_top"
-    assert exit_code("dataset", "rename", whole, f"{TOP}={name}", "--out", tmp_path / "named") == 0
-    capsys.readouterr()
-    assert repair(tmp_path / "named", "--dry-run") == 0
-    assert capsys.readouterr().out.startswith("Nothing to repair")
 
 
 @pytest.mark.parametrize("place", ["data", f"videos/{TOP}"])
@@ -242,18 +220,6 @@ def test_episodes_in_files_that_cannot_be_read_are_left_out_and_named(
     assert all(same(a, frames[n]) for a, n in zip(found, kept, strict=True))
     assert repair(tmp_path / "new", "--dry-run") == 0
     assert "Nothing to repair" in capsys.readouterr().out
-
-
-@pytest.mark.slow
-def test_an_old_dataset_is_repaired(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    root = write_v21(tmp_path / "d")
-    assert repair(root, "--dry-run") == 0
-    assert "Nothing to repair" in capsys.readouterr().out
-    assert exit_code("dataset", "select", root, "--episodes", "0,1", "--out", tmp_path / "expected") == 0
-    (root / "meta/episodes.jsonl").unlink()
-    assert repair(root, "--out", tmp_path / "new") == 0
-    found, expected = items(tmp_path / "new"), items(tmp_path / "expected")
-    assert all(same(a, b) for a, b in zip(found, expected, strict=True))
 
 
 @pytest.mark.slow

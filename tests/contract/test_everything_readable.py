@@ -21,7 +21,6 @@ from pathlib import Path
 from typing import Any
 
 import h5py
-import numpy as np
 import pytest
 from rosbags.rosbag2 import StoragePlugin
 from support import bag_mappings, bags, hdf5
@@ -250,16 +249,6 @@ def test_bags_get_their_import_word(
     assert not (tmp_path / "new" / "run.json").exists()
 
 
-def test_numbers_are_those_of_the_file(
-    places: dict[str, list[Path | str]], scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (source,) = places["robomimic"]
-    assert exit_code("export", "hdf5", source, "--out", tmp_path / "new.hdf5") == 0
-    with h5py.File(source) as old, h5py.File(tmp_path / "new.hdf5") as new:
-        for theirs, ours in (("demo_0", "demo_0"), ("demo_1", "demo_1"), ("demo_10", "demo_2")):
-            np.testing.assert_array_equal(old[f"data/{theirs}/actions"], new[f"data/{ours}/actions"])
-
-
 def test_omissions_and_the_mapping_are_reported(
     places: dict[str, list[Path | str]], scratch: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -269,22 +258,6 @@ def test_omissions_and_the_mapping_are_reported(
     assert printed.out.startswith(f"{source}: ")
     assert f"{source}: read by the suggested mapping (observation.state from obs/robot0_joint_pos and" in printed.err
     assert "because the mapping does not name them: dones, next_obs, rewards, states." in printed.err
-
-
-def test_findings_of_the_import_are_checked(scratch: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    notes = bags.in_order(bags.so101(3.0))
-    gone = {note.log_ns for note in bags.of_topic(notes, "/follower/joint_states")[20:24]}
-    kept = [note for note in notes if note.topic != "/follower/joint_states" or note.log_ns not in gone]
-    bag = bags.write_mcap(kept, tmp_path / "bag.mcap")
-    mapping = bag_mappings.write_mapping(bag_mappings.SO101, tmp_path / "so101.toml")
-    assert exit_code("check", bag, "--mapping", mapping, "--all") == 0
-    printed = capsys.readouterr().out
-    assert printed.startswith(f"{bag}: state observation.state; ")
-    assert "look as a whole: 1 episode, " in printed
-    (judged,) = [line for line in printed.splitlines() if "  import_findings  " in line]
-    assert judged.lstrip().startswith("look")
-    assert "gap, observation.state" in judged
-    assert f"-> look at it: demorec view {bag}" in printed
 
 
 @pytest.mark.parametrize(

@@ -7,8 +7,6 @@ from typing import Any
 
 import numpy as np
 
-from support.export import data_table, episode_rows
-
 TOP = "observation.images.top"
 
 
@@ -67,12 +65,3 @@ def same(a: list[dict[str, Any]], b: list[dict[str, Any]], *, but: tuple[str, ..
         and all(x[name].dtype == y[name].dtype and np.array_equal(x[name], y[name]) for name in set(x) - set(but))
         for x, y in zip(a, b, strict=True)
     )
-
-
-def content(root: Path) -> tuple[Any, list[Any]]:
-    """Rows and the table of episodes, for a comparison with another dataset."""
-    rows = [
-        {name: value for name, value in row.items() if not name.startswith(("videos/", "data/", "meta/"))}
-        for row in episode_rows(root)
-    ]
-    return data_table(root).to_pydict(), rows
