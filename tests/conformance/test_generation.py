@@ -11,7 +11,7 @@ import pytest
 from support.commands import exit_code
 
 from demorec.cli import generate_dataset_main
-from demorec.core.config import EpisodePlan, GenerateConfig, deciding_versions
+from demorec.core.config import GenerateConfig
 from demorec.datasets.lerobot.export import export_lerobot
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import dataset_digest
@@ -66,13 +66,6 @@ def test_recordings_contain_the_data_of_their_run(tmp_path: Path, reference: Run
     assert result.made == ()
     assert result.run.digest == reference.run.digest
     assert [a.sha256 for a in result.run.attempts] == [a.sha256 for a in reference.run.attempts]
-
-
-def test_run_and_recordings_have_the_same_versions(reference: RunResult) -> None:
-    from demorec.loop import prepare
-
-    assert reference.run.versions == deciding_versions()
-    assert prepare(EpisodePlan(config=CONFIG, episode_index=0)).info.versions == deciding_versions()
 
 
 @pytest.mark.slow

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import functools
 import json
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,16 +15,16 @@ from support.export import data_table, export, info
 from demorec.check.report import CheckOptions, Subject, check_subject
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.core.errors import ConfigError
-from demorec.core.geometry import Array, Pose
+from demorec.core.geometry import Array
 from demorec.core.plain import to_plain
 from demorec.core.tables import EXPORTERS
-from demorec.episode.episode import POLICY_PHASE, Action, Frame, Observation
+from demorec.episode.episode import POLICY_PHASE, Frame
 from demorec.episode.features import ActionKind
 from demorec.extensions.policies import TakeOver, rollouts
 from demorec.extensions.policies.evaluation import Evaluation, Settings
-from demorec.extensions.policies.gym_env import DemorecEnv, Situation
+from demorec.extensions.policies.gym_env import DemorecEnv
 from demorec.extensions.policies.rollouts import make_rollout
-from demorec.extensions.policies.turns import Turns, Watch, read_takeover
+from demorec.extensions.policies.turns import Turns, read_takeover
 from demorec.extensions.remake.demonstration import open_file
 from demorec.extensions.remake.drive import replay_all
 from demorec.generate.options import RunOptions
@@ -37,8 +37,6 @@ from demorec.runs.run_file import Attempt
 pytestmark = pytest.mark.slow
 
 FPS = 30
-UNSEEN = Action(joint_target=np.zeros(7), gripper_target=0.0, base_from_tcp_target=Pose())
-"""A command that only the deviation rule evaluates."""
 
 
 class Lazy:
@@ -148,49 +146,6 @@ def test_episodes_without_corrections_can_be_left_out(
         assert report.num_frames == plain.num_frames + corrected.num_frames
     with pytest.raises(ConfigError, match="or were not corrected"):
         export(uncorrected, tmp_path / "none.hdf5", exporter, corrected_only=True)
-
-
-@dataclass
-class Hand:
-    """The part of an observation that takeover rules read: a hand that is open, and its position."""
-
-    position: Array
-    gripper_width: float = 0.08
-
-    @property
-    def base_from_tcp(self) -> Pose:
-        return Pose(position=self.position)
-
-
-def situations(speed: float) -> list[Situation]:
-    """Ten seconds and one frame, in which the hand moves at the given speed in m/s."""
-    hands = [Hand(np.array([speed * frame / FPS, 0.0, 0.2])) for frame in range(301)]
-    return [
-        Situation(
-            frame_index=frame,
-            observation=cast(Observation, hand),
-            images={},
-            last_frame=None,
-            checks=(),
-            is_success=False,
-        )
-        for frame, hand in enumerate(hands)
-    ]
-
-
-@pytest.mark.parametrize(
-    ("takeover", "speed", "expected"),
-    [
-        (TakeOver(stuck_seconds=1.0), 0.0, (FPS - 1, "the policy is stuck")),
-        (TakeOver(stuck_seconds=1.0), 0.02, (300, "the policy has had its time")),  # m/s: 2 cm a second is not rest
-        (TakeOver(stuck_seconds=0.0), 0.0, (300, "the policy has had its time")),
-    ],
-)
-def test_the_moment_of_a_takeover(takeover: TakeOver, speed: float, expected: tuple[int, str]) -> None:
-    episode = prepare(EpisodePlan(config=GenerateConfig(cameras=()), episode_index=0))
-    watch = Watch(takeover, episode, max_frames=300)
-    told = enumerate(watch.reason(situation, UNSEEN) for situation in situations(speed))
-    assert next((frame, reason) for frame, reason in told if reason) == expected
 
 
 class Wanderer:

@@ -13,17 +13,15 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AsyncVectorEnv, SyncVectorEnv
 from support.check import simulate
 from support.docs import run_examples
-from support.export import data_table
 from support.present import present
 from support.sim import episode
 from support.tasks import tasks_with_slow_ones
 
 from demorec.core.errors import ConfigError, SceneError
-from demorec.datasets.lerobot.export import export_lerobot
-from demorec.datasets.lerobot.options import ExportOptions
 from demorec.episode import features
 from demorec.episode.episode import Trajectory
 from demorec.episode.info import EpisodeInfo
+from demorec.episode.simulated import on_request
 from demorec.extensions.policies.gym_env import DemorecEnv, env_id
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world
 from demorec.loop.actions import ACTION_KINDS
@@ -34,12 +32,7 @@ ON_REQUEST = ("observation.effort", "observation.contact_force", "observation.wr
 FRAMES = 45
 VARYING = ("sort_by_color", "pick_from_clutter", "pick_shapes", "pick_anything")
 """Tasks whose scenes differ in the number of objects, so that no vector of fixed size can hold their poses."""
-KEYS = {
-    "observation.state": "agent_pos",
-    "observation.velocity": "velocity",
-    "observation.ee_pose": "ee_pose",
-    "observation.environment_state": "environment_state",
-}
+KEYS = {"observation.state": "agent_pos"}
 
 
 def make(task: str = "pick_place", **options: Any) -> DemorecEnv:
@@ -57,10 +50,6 @@ def test_objects_are_drawn_from_the_named_shelves_and_their_split() -> None:
     assert (
         env.episode.info.simulated.scene
         == episode(3, task="pick_anything", variation="mild", **flags).info.simulated.scene
-    )
-    assert (
-        env.episode.info.simulated.scene
-        != episode(3, task="pick_anything", variation="mild", split="all").info.simulated.scene
     )
     env.close()
     plugin = pytest.importorskip("lerobot_env_demorec")
@@ -83,45 +72,24 @@ def test_a_recordings_commands_give_its_observations_bit_exact(task: str, tmp_pa
     """The features exported from a file equal those that a policy would observe."""
     with Recording(simulate(tmp_path / "e.mcap", episode_index=3, task=task)) as recording:
         info, trajectory = recording.info, recording.trajectory()
-    expected = features.observation_vectors(trajectory, info.simulated.robot, info.simulated.scene, privileged=True)
+    sensed = tuple(feature for feature in on_request(info) if feature.name in ON_REQUEST)
+    expected = features.observation_vectors(
+        trajectory, info.simulated.robot, info.simulated.scene, privileged=True, sensed=sensed
+    )
     # The first task runs to its end, the others until they touch an object.
     count = trajectory.num_frames if task == "pick_place" else min(trajectory.num_frames, 2 * FRAMES)
 
-    env = make(task, split="all")
+    env = make(task, split="all", sensed=ON_REQUEST)
     observation, _ = env.reset(seed=3)
-    assert len(observation) == 4 - (task in VARYING)
+    assert len(observation) == 4 + len(ON_REQUEST) - (task in VARYING)
     for t in range(count):
         for name, key in env.keys.items():
-            assert key == KEYS[name]
+            assert key == KEYS.get(name, name.removeprefix("observation."))
             assert np.array_equal(observation[key], expected[name][t]), (name, t)
         command = np.append(trajectory.command_joint_target[t], trajectory.command_gripper[t])
-        observation, _, terminated, _, _ = env.step(command)
+        observation, _, terminated, _, told = env.step(command)
+        assert np.array_equal(told["command"], command)
     assert terminated == (task == "pick_place")
-    env.close()
-
-
-@pytest.mark.slow
-def test_features_requested_by_name_equal_the_export(tmp_path: Path) -> None:
-    """Every feature of `export --features`, row by row; the command is that of the step that leads to the next row."""
-    path = simulate(tmp_path / "e.mcap", episode_index=3)
-    export_lerobot([path], tmp_path / "ds", ExportOptions(verify=False, features=(*ON_REQUEST, "command")))
-    table = data_table(tmp_path / "ds")
-    exported = {
-        name: np.array(table.column(name).to_pylist(), np.float32) for name in (*ON_REQUEST, "command", "action")
-    }
-    with Recording(path) as recording:
-        trajectory = recording.trajectory()
-    env = make(split="all", sensed=tuple(ON_REQUEST))
-    observation, _ = env.reset(seed=3)
-    assert env.observation_space.contains(observation)
-    assert np.abs(exported["observation.contact_force"]).max() > 1.0
-    for t in range(trajectory.num_frames):
-        for name in ON_REQUEST:
-            expected = exported[name][t].reshape(-1)  # a column of one number is a column of scalars
-            assert np.array_equal(observation[name.removeprefix("observation.")], expected), (name, t)
-        command = np.append(trajectory.command_joint_target[t], trajectory.command_gripper[t])
-        observation, *_, found = env.step(command)
-        assert np.array_equal(found["command"].astype(np.float32), exported["command"][t])
     env.close()
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from contextlib import nullcontext
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ import pytest
 from support.present import present
 from support.sim import episode
 
-from demorec.core.errors import SceneError
 from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Action
 from demorec.robots.assets import asset_path, mesh_path
@@ -103,19 +101,6 @@ def _weight(world: World) -> np.ndarray[Any, Any]:
         force += held
         torque += np.cross(np.subtract(centre, place[4]), held)
     return np.concatenate((axes.T @ force, axes.T @ torque))
-
-
-@pytest.mark.parametrize("hand", ["no_such_link", "base"])
-def test_a_hand_that_no_joint_carries_is_refused(spec: RobotSpec, hand: str) -> None:
-    name = spec.base_link if hand == "base" else hand
-    scene = episode(0, robot=spec.name, variation="none").info.simulated.scene
-    with (
-        World(replace(spec, hand_link=name)) as world,
-        pytest.raises(
-            SceneError, match=f"hand_link .*'{name}'.*; name the link that|hand_link .*'{name}', which the URDF"
-        ),
-    ):
-        world.reset(scene)
 
 
 def test_the_open_hand_is_no_larger_than_a_deliberate_miss_assumes(spec: RobotSpec) -> None:

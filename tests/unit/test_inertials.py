@@ -50,7 +50,6 @@ def test_models_of_pybullet_and_demorec_specify_their_masses(model: str) -> None
         arm(base=BOX, ground=BOX),  # the mass of fixed bodies does not matter
         arm(base=BOX + inertial(mass="0"), ground=BOX + inertial(mass="0")),  # as in kuka_iiwa/model.urdf
         arm(tool=inertial(mass="0")),  # as in franka_panda/panda.urdf
-        arm(tool=inertial(mass="0", moments=("0", "0", "0"))),
         arm(arm="", tool=BOX + inertial()),  # one body of two links
         arm(tool=BOX + inertial(mass="1e-9", moments=("0", "0", "0"))),  # as in SO-101's own URDF
     ],
@@ -65,25 +64,16 @@ def test_frames_and_fixed_bodies_need_no_mass(text: str) -> None:
         (arm(arm=BOX), r"'arm' \(moves and has a shape, but no <inertial>\)"),
         (arm(arm=""), r"'arm' \(moves, but has no mass\)"),
         (arm(arm=inertial(mass="0")), r"'arm' \(moves, but has no mass\)"),
-        (arm(tool=BOX), r"'tool' \(moves and has a shape, but no <inertial>\)"),
         (arm(arm=inertial(mass="-1")), r"'arm' \(a mass of -1 kg\)"),
-        (arm(base=inertial(mass="-1")), r"'base' \(a mass of -1 kg\)"),
         (arm(arm=inertial(mass="nan")), r"'arm' \('nan' of the URDF should be a finite number\)"),
-        (arm(arm=inertial(mass="inf")), "a finite number"),
-        (arm(arm=inertial(mass="2 kg")), "a finite number"),
         (arm(arm=inertial(mass="20000")), r"'arm' \(a mass of 20000 kg\)"),
-        (arm(arm="<inertial/>"), "without mass or inertia"),
         (arm(arm='<inertial><mass value="1"/></inertial>'), "without mass or inertia"),
-        (arm(arm=inertial(moments=("0", "0", "0"))), "smallest principal value of 0 kg"),
-        (arm(arm=inertial(moments=("0.01", "-0.01", "0.01"))), "smallest principal value of -0.01 kg"),
         (arm(arm=inertial(xy="0.02")), "smallest principal value of -0.01 kg"),
-        (arm(arm=inertial(moments=("0.01", "nan", "0.01"))), "a finite number"),
         (
             arm(arm=inertial(moments=("5000", "5000", "5000"))),
             r"principal inertias of 5e\+03 to 5e\+03 kg m\^2 for 2 kg",
         ),
         (arm(arm=BOX, tool=BOX), "'arm' .*, 'tool' "),
-        (arm(arm="", tool=BOX + inertial(moments=("0", "0", "0"))), "'tool' .*smallest principal value of 0 kg"),
         (arm(tool=BOX + inertial(moments=("0.01", "-0.01", "0.01"))), "'tool' .*smallest principal value of -0.01"),
     ],
 )

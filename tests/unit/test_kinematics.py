@@ -46,18 +46,6 @@ def link_pose(client: Any, body: int, link: int) -> tuple[NDArray[np.float64], R
     return np.array(state[4]), Rotation.from_quat(state[5])
 
 
-def test_forward_kinematics_equals_the_simulators(robot: SimulatedRobot) -> None:
-    spec, client, body, links, joints = robot
-    arm = arm_kinematics(spec)
-    for q in random_positions(spec, 50):
-        for name, value in zip(spec.arm_joints, q, strict=True):
-            client.resetJointState(body, joints[name], value)
-        position, rotation = link_pose(client, body, links[spec.tcp_link])
-        pose = arm.forward(q)
-        assert np.abs(pose.position - position).max() < 1e-6
-        assert (Rotation.from_quat(pose.quat_xyzw) * rotation.inv()).magnitude() < 1e-5
-
-
 def test_every_link_of_the_urdf_is_where_the_simulator_has_it(robot: SimulatedRobot) -> None:
     spec, client, body, links, joints = robot
     urdf = Urdf.load(asset_path(spec.urdf))
@@ -93,14 +81,6 @@ def test_inverse_kinematics_reaches_the_pose_in_the_simulator(robot: SimulatedRo
         assert math.dist(position, wanted.position) < 5e-5
         assert (Rotation.from_quat(wanted.quat_xyzw) * rotation.inv()).magnitude() < 5e-4
     assert solved >= 38
-
-
-def test_out_of_reach_is_none(robot: SimulatedRobot) -> None:
-    spec, *_ = robot
-    arm = arm_kinematics(spec)
-    home = np.array(spec.home_q)
-    pose = Pose(position=np.array([3.0, 0.0, 0.5]), quat_xyzw=np.array([1.0, 0.0, 0.0, 0.0]))
-    assert arm.inverse(pose, start=home, rest=home) is None
 
 
 def test_a_straight_path_is_straight_and_turns_evenly(robot: SimulatedRobot) -> None:
