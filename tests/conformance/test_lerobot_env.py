@@ -89,6 +89,8 @@ def test_the_plugin_maps_features_as_the_dataset_names_them(trained: Path) -> No
     images = env_to_policy_features(cameras)["observation.images.front"]
     assert images.shape == (3, 48, 64)
     assert "environment_state" not in cameras.features
+    kwargs = DemorecEnvConfig(task="pick_anything", objects=["blocks"], object_split="eval").gym_kwargs
+    assert (kwargs["objects"], kwargs["object_split"]) == (("blocks",), "eval")
 
 
 @pytest.mark.long

@@ -59,7 +59,6 @@ TIME = np.arange(HZ + 1) / HZ
     ("damping", "friction", "solution"),
     [
         (0.02, 0.0, lambda t: np.exp(-0.02 * t / INERTIA)),
-        (0.0, 0.01, lambda t: np.maximum(1 - 0.01 * t / INERTIA, 0)),
         (0.02, 0.01, lambda t: np.maximum(1.5 * np.exp(-0.02 * t / INERTIA) - 0.5, 0)),
         (20.0, 1.0, lambda t: np.maximum(1.05 * np.exp(-20 * t / INERTIA) - 0.05, 0)),  # 12 times a step's inertia
     ],
@@ -73,9 +72,7 @@ def test_an_unpowered_joint_slows_down_by_its_equation(
     assert (found >= -1e-9).all()
 
 
-@pytest.mark.parametrize(
-    ("limit", "damping", "friction"), [(0.05, 0.02, 0.0), (0.12, 0.1, 0.02), (1.0, 5.0, 0.1), (3.0, 50.0, 1.0)]
-)
+@pytest.mark.parametrize(("limit", "damping", "friction"), [(0.05, 0.02, 0.0), (3.0, 50.0, 1.0)])
 def test_a_motor_at_its_limit_reaches_its_steady_speed(
     limit: float, damping: float, friction: float, tmp_path: Path
 ) -> None:

@@ -79,10 +79,6 @@ def mesh_name(package: Path) -> str:
     return name
 
 
-def test_only_meshes_of_shapes_are_meshes(package: Path) -> None:
-    assert mesh_name(package).startswith("package://vendor_description/meshes/visual/part.")
-
-
 def test_a_mesh_is_found_in_its_package_whatever_the_repository_is_called(package: Path) -> None:
     name = mesh_name(package)
     file = package / "meshes" / "visual" / name.rpartition("/")[2]

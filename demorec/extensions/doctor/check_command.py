@@ -202,8 +202,7 @@ def _verdict(report: DeepReport) -> str:
     if report.error:
         return "not possible"
     if not report.differences:
-        aside = "; labels, phases and events are taken over in a derived recording" if report.is_derived else ""
-        return f"the same to the bit in all {report.num_frames} frames{aside}"
+        return f"the same to the bit in all {report.num_frames} frames"
     frames = {frame for difference in report.differences for frame in difference.frames}
     count = len(report.differences)
     amount = "1 field differs" if count == 1 else f"{count} fields differ"

@@ -151,7 +151,10 @@ class Evaluate(RolloutFlags):
         out = self.out or Path("evaluations") / self.task.rpartition(":")[2]
         evaluation = self.carry_out(self.policy, out, title="evaluating")
         if self.json:
-            say_json(_plain(evaluation))
+            from demorec.core.plain import to_plain
+
+            rate = evaluation.rate
+            say_json({**to_plain(evaluation), "success_rate": rate.value, "interval": list(rate.interval)})
         else:
             say(*_evaluation_lines(evaluation, out))
         return 0
@@ -172,15 +175,6 @@ def _evaluation_lines(evaluation: Evaluation, out: Path) -> Iterator[str]:
 def _counts(title: str, reasons: Iterable[str]) -> Iterator[str]:
     for number, (reason, count) in enumerate(Counter(reasons).most_common()):
         yield f"{title if number == 0 else '':<13} {count:>4}  {reason}"
-
-
-def _plain(evaluation: Evaluation) -> dict[str, Any]:
-    from demorec.core.plain import to_plain
-
-    plain: dict[str, Any] = to_plain(evaluation)
-    plain["success_rate"] = evaluation.rate.value
-    plain["interval"] = list(evaluation.rate.interval)
-    return plain
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -85,11 +85,6 @@ class Evaluation:
         """Rate of strict successes."""
         return Rate(successes=sum(bool(r.success) for r in self.rollouts), trials=len(self.rollouts))
 
-    @property
-    def successes(self) -> dict[int, bool]:
-        """Scene (episode index) -> success."""
-        return {r.episode_index: bool(r.success) for r in self.rollouts}
-
 
 def load_evaluation(folder: Path) -> Evaluation:
     """Read evaluation.json. Raises ConfigError if it is missing, DemorecError if it is damaged."""

@@ -26,7 +26,7 @@ from demorec.core.tables import CAMERAS, TASKS, environment_name
 from demorec.episode import features
 from demorec.episode.episode import POLICY_PHASE, Action, CameraImages, Frame, Observation, Observations, SuccessCheck
 from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
-from demorec.episode.info import EpisodeInfo, Feature
+from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.simulated import on_request, with_simulation
 from demorec.episode.variation import Preset
@@ -162,7 +162,8 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self._render_camera, self._render_size = render_camera, (render_width, render_height)
         self.episode = prepare(EpisodePlan(config=config, episode_index=0))
         info = self.episode.info
-        self._sensed = _on_request(info, sensed)
+        known = {feature.name: feature for feature in on_request(info)}
+        self._sensed = tuple(known[check_choice("sensed", name, tuple(known))] for name in sensed)
         num_goals = max(1, len(info.simulated.scene.goals))
         self._max_episode_steps = episode_length or round(SECONDS_PER_GOAL * config.fps * num_goals)
         self.privileged = self._is_privileged() if privileged is None else privileged
@@ -346,11 +347,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 def _key(feature: str) -> str:
     """Key of a dataset feature in the observation; LeRobot's `preprocess_observation` maps it back."""
     return "agent_pos" if feature == features.STATE else feature.removeprefix("observation.")
-
-
-def _on_request(info: EpisodeInfo, names: Collection[str]) -> tuple[Feature, ...]:
-    known = {feature.name: feature for feature in on_request(info)}
-    return tuple(known[check_choice("sensed", name, tuple(known))] for name in names)
 
 
 def _observation_space(info: EpisodeInfo, vector_lengths: Mapping[str, int]) -> spaces.Dict:

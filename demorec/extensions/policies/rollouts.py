@@ -137,27 +137,23 @@ def evaluate(
         DemorecError: A rollout failed to run.
     """
     with open_evaluation(settings, out, overwrite=overwrite) as evaluation:
-        return _with_missing(evaluation, out, num_episodes=num_episodes, workers=workers, progress=progress)
-
-
-def _with_missing(
-    evaluation: Evaluation, out: Path, *, num_episodes: int, workers: int, progress: Callable[[Evaluation], None]
-) -> Evaluation:
-    """Run the policy in the episodes missing from an evaluation."""
-    config, done = evaluation.settings.config, evaluation.successes
-    due = [EpisodePlan(config=config, episode_index=index) for index in range(num_episodes) if index not in done]
-    with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
-        for report in chain.from_iterable(executor.carry_out(functools.partial(next, iter(due), None))):
-            if isinstance(report, Raised):
-                if report.kind == MissingDependencyError.__name__:
-                    raise DemorecError(report.message)
-                raise report.error(
-                    f"Episode {report.plan.episode_index}: {report.message.rstrip('.')}; the same command continues."
-                )
-            evaluation = with_rollouts(evaluation, [*evaluation.rollouts, report.attempt])
-            save_evaluation(evaluation, out)
-            progress(evaluation)
-    return with_rollouts(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
+        done = {rollout.episode_index for rollout in evaluation.rollouts}
+        due = iter(
+            EpisodePlan(config=settings.config, episode_index=index)
+            for index in range(num_episodes)
+            if index not in done
+        )
+        with LocalExecutor(MAKE_ROLLOUT, out, workers=workers, recycle_after=1000) as executor:
+            for report in chain.from_iterable(executor.carry_out(lambda: next(due, None))):
+                if isinstance(report, Raised):
+                    if report.kind == MissingDependencyError.__name__:
+                        raise DemorecError(report.message)
+                    why = report.message.rstrip(".")
+                    raise report.error(f"Episode {report.plan.episode_index}: {why}; the same command continues.")
+                evaluation = with_rollouts(evaluation, [*evaluation.rollouts, report.attempt])
+                save_evaluation(evaluation, out)
+                progress(evaluation)
+        return with_rollouts(evaluation, [r for r in evaluation.rollouts if r.episode_index < num_episodes])
 
 
 def make_rollout(plan: EpisodePlan, folder: Path) -> Attempt:

@@ -46,7 +46,6 @@ class DeepReport:
         there are any, nothing is provable here, and differences are warnings.
         differences: Everything that differs, ordered by the first frame.
         error: Reason why it could not be remade; "" if it could.
-        is_derived: Whether it is a replay or a render, whose labels, phases and events are copied.
         num_frames: Number of recorded frames.
     """
 
@@ -54,7 +53,6 @@ class DeepReport:
     versions: tuple[str, ...] = ()
     differences: tuple[RemakeDifference, ...] = ()
     error: str = ""
-    is_derived: bool = False
     num_frames: int = 0
 
     @property
@@ -87,8 +85,7 @@ def deep_check(path: Path, simulators: SimulatorCache = _simulators, allowed: Se
             open_simulated(path) as recording,
         ):
             info = recording.info
-            report = replace(report, num_frames=recording.num_frames, is_derived=bool(info.origin))
-            report = replace(report, versions=_unlike_here(info, allowed))
+            report = replace(report, num_frames=recording.num_frames, versions=_unlike_here(info, allowed))
             again = Path(folder) / "again.mcap"
             remake(recording, again, simulators, allowed)
             found, made = Contents.of(path), Contents.of(again)

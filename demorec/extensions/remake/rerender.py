@@ -40,16 +40,14 @@ class RerenderReport:
     """Result of rendering a recording again.
 
     Attributes:
-        source, path: The recording and the new one.
-        num_frames, num_images: Size of the new recording.
+        source: The recording.
+        num_images: Number of images in the new recording.
         compared: Cameras whose encoded images were compared with the recorded ones, because they should not change.
         differing: Camera of these -> first frame whose packet differs.
         was_there: Whether an earlier call had drawn it.
     """
 
     source: Path
-    path: Path
-    num_frames: int
     num_images: int
     compared: tuple[str, ...] = ()
     differing: Mapping[str, int] = field(default_factory=dict)
@@ -172,15 +170,6 @@ def drawing_config(info: EpisodeInfo, options: RerenderOptions) -> dict[str, Any
     return config | options.config | video
 
 
-def _video_options(info: EpisodeInfo, config: Mapping[str, Any]) -> VideoConfig:
-    """Read the video options of a drawing config. Raises ConfigError for impossible ones, recorded or new."""
-    config_as(info.simulated.config.get("video", {}), VideoConfig)
-    try:
-        return from_plain(config.get("video", {}), VideoConfig)
-    except ValueError as error:
-        raise ConfigError(f"The video options cannot be used ({error}).") from error
-
-
 def rerender(
     source: Path,
     out: Path,
@@ -215,7 +204,7 @@ def rerender(
             raise RecordingError(f"The recording has no frames: {source}")
         view, config = new_view(info, options, allowed), drawing_config(info, options)
         RENDERERS.check_name(str(config.get("renderer", "raster")))
-        video = _video_options(info, config)
+        video = config_as(config.get("video", {}), VideoConfig)
         new_info = _drawn_info(recording, view, config)
         was_there = not overwrite and finished_outcome(out, new_info) == _outcome(recording)
         if not was_there:
@@ -232,8 +221,6 @@ def rerender(
         compared = _compare(recording, out, options)
     return RerenderReport(
         source=source,
-        path=out,
-        num_frames=trajectory.num_frames,
         num_images=trajectory.num_frames * len(view.scene.cameras),
         compared=tuple(compared),
         differing={name: frame for name, frame in compared.items() if frame is not None},

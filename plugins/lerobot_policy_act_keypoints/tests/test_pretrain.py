@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import fcntl
 import json
-import os
 import re
-import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -150,44 +148,6 @@ def test_a_policy_that_reads_can_be_saved_from_a_gpu(tmp_path: Path, monkeypatch
         save_model(torch.nn.ModuleList([torch.nn.GRU(4, 4)]), str(tmp_path / "plain.safetensors"))
     ActKeypointsPolicy(config).to("cpu").save_pretrained(tmp_path / "policy")
     assert (tmp_path / "policy/model.safetensors").exists()
-
-
-@pytest.mark.long
-def test_a_killed_call_goes_on_to_the_same_weights(settings: Path, pretrained: Path, tmp_path: Path) -> None:
-    from lerobot_policy_act_keypoints import pretrain as pretraining
-    from lerobot_policy_act_keypoints.training import training_config
-
-    out = tmp_path / "killed"
-    program = (
-        "import sys; from lerobot_policy_act_keypoints import pretrain as p; "
-        "from lerobot_policy_act_keypoints.training import training_config; "
-        "from pathlib import Path; "
-        "p.pretrain(training_config([sys.argv[1]]), p.PretrainConfig(updates=6, batch_size=4, seed=1000), "
-        "Path(sys.argv[2]), "
-        "frame_cache_bytes=1 << 28, on_progress=lambda text: print(text, flush=True), save_every=2)"
-    )
-    command = [sys.executable, "-c", program, f"--config_path={settings}", str(out)]
-    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline().startswith("update 2 of 6")
-        os.kill(process.pid, signal.SIGKILL)
-    assert (out / "unfinished.pt").exists()
-    assert not (out / "model.safetensors").exists()
-    reported: list[str] = []
-    pretraining.pretrain(
-        training_config([f"--config_path={settings}"]),
-        pretraining.PretrainConfig(updates=6, batch_size=4, seed=1000),
-        out,
-        frame_cache_bytes=1 << 28,
-        on_progress=reported.append,
-        save_every=2,
-    )
-    assert "update 2" not in " ".join(reported)
-    assert reported[-2].startswith("update 6 of 6")
-    one, other = weights(pretrained), weights(out)
-    assert one.keys() == other.keys()
-    for name in one:
-        np.testing.assert_array_equal(one[name], other[name], err_msg=name)
 
 
 @pytest.mark.long
