@@ -373,6 +373,19 @@ def test_measured_velocities_as_actions_are_worth_a_look(sound: Evidence) -> Non
     assert severities == {"look"}
 
 
+@pytest.mark.parametrize(("frame", "severity"), [(60, "broken"), (-8, "look")])
+def test_a_gap_during_which_the_arm_rests_loses_nothing(frame: int, severity: str, sound: Evidence) -> None:
+    each = sound.episodes[BAD]
+    assert each.state is not None
+    state = each.state.copy()
+    state[-16:] = state[-1]
+    time_s = np.arange(each.length) / FPS
+    time_s[frame:] += 0.2
+    episodes = [replace(each, state=state, time_s=time_s) if each.number == BAD else each for each in sound.episodes]
+    diagnosis = diagnose(replace(sound, episodes=episodes, cameras={}))
+    assert {e.severity for e in diagnosis.findings if e.check == "time_gaps"} == {severity}
+
+
 @pytest.mark.parametrize("num_resting", [1, EPISODES])
 def test_the_pose_of_an_object_rests_until_it_is_touched(num_resting: int, sound: Evidence) -> None:
     """In simulation an object rests bit-exactly; a sensor that rests in one episode alone is frozen."""
@@ -433,6 +446,20 @@ def test_slow_motion_in_one_corner_is_not_frozen(speed: int, sound: Evidence) ->
     shown[BAD] = as_images(thumbnails)
     diagnosis = diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)}))
     assert found(diagnosis, "frozen_images") == (set() if speed else {BAD})
+
+
+def test_images_that_every_episode_repeats_now_and_then_are_a_fault_of_the_camera(sound: Evidence) -> None:
+    """A recorder that polls a slow camera copies about a third of the images, every second one for a while."""
+    shown = {}
+    for number, images in sound.cameras["top"].episodes.items():
+        count = len(images.thumbnails)
+        is_copy = np.random.default_rng(number).random(count) < 0.35
+        if number == BAD:
+            is_copy = np.arange(count) % 2 == 1
+        copied = as_images(images.thumbnails[np.maximum.accumulate(np.where(is_copy, 0, np.arange(count)))])
+        shown[number] = replace(copied, change=4 * copied.change)  # a camera close to the arm
+    diagnosis = diagnose(replace(sound, cameras={"top": CameraThumbnails(episodes=shown)}))
+    assert found(diagnosis, "repeated_images") == {None}
 
 
 def test_keyframes_do_not_hide_a_camera_at_a_third_of_the_rate() -> None:

@@ -46,6 +46,11 @@ MIN_RATE_CHANGE = 1.5
 """Minimum usual change of images, of 255, for a close examination: codecs skip smaller ones in every second image."""
 MIN_REPEATED = 0.3
 """Minimum ratio of repeated images of a camera that is slower than the frames."""
+MIN_REPEATED_IRREGULARLY = 0.2
+"""The same ratio, without a regular order, of images that repeat every pixel: a dropped image is copied, slow motion
+and codecs seldom leave every pixel as it was."""
+REPEATED_TIMES = 3.0
+"""Minimum factor over the usual ratio of repeated images of an unusual episode."""
 MIN_REPEATED_OF_FEW = 0.45
 """The same ratio in up to three episodes: a codec that skips every third image of slow motion looks like a camera."""
 MIN_FIT = 0.8
@@ -203,7 +208,7 @@ def _repeats(images: EpisodeThumbnails, usual_change: float) -> NDArray[np.bool_
     do="record at the camera's own rate, or accept it: the images are late by up to a period",
 )
 def repeated_images(evidence: Evidence) -> Iterator[Fault]:
-    """Find cameras with regularly repeated images: short repeats in at least a third of the moving frames.
+    """Find cameras with repeated images in the moving frames: a third of them regularly, or a fifth exactly.
 
     In a single episode, or a set of up to three, it must be half of them. A keyframe changes a repeated image, so that
     for a camera at a third of the rate or less the repeats between keyframes count.
@@ -211,6 +216,7 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
     evidence.need_state()
     for camera, images in evidence.need_images().items():
         shares: dict[int, float] = {}
+        equal: dict[int, float] = {}
         visible = evidence.once(visible_motion, images)
         for number, each in images.episodes.items():
             episode = evidence.by_number.get(number)
@@ -223,6 +229,7 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
             if len(gaps) >= MIN_GAPS and visible.usual_change >= MIN_RATE_CHANGE:
                 period = held_period(repeats, visibly)
                 shares[number] = 1 - 1 / period if period > 2 else _share_repeated(gaps)
+                equal[number] = float(np.mean(each.change[1:][visibly] == 0))
         if not shares:
             continue
         least = MIN_REPEATED if len(shares) > MIN_OTHERS else MIN_REPEATED_OF_FEW
@@ -236,8 +243,16 @@ def repeated_images(evidence: Evidence) -> Iterator[Fault]:
                 message=f"{camera} repeats {share:.0%} of its images: its rate is {rate:.0f} images per second, not "
                 f"{evidence.fps:g}",
             )
-        elif float(np.median(list(shares.values()))) == 0:
-            for number in (number for number in slow if shares[number] > MIN_REPEATED_OF_FEW):
+            continue
+        usual, typical = (float(np.median(list(each.values()))) for each in (equal, shares))
+        if usual > MIN_REPEATED_IRREGULARLY:
+            yield Fault(
+                severity="look",
+                value=f"{usual:.0%} of moving frames",
+                message=f"{camera} repeats {usual:.0%} of its images while the robot moves, in no regular order",
+            )
+        for number in slow:
+            if shares[number] > max(MIN_REPEATED_OF_FEW, REPEATED_TIMES * max(usual, typical)):
                 yield Fault(
                     severity="look",
                     episode=number,

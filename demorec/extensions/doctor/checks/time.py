@@ -16,6 +16,10 @@ MAX_GAP_PERIODS = 2.5
 """Maximum periods between two frames without missing ones; one late frame takes two."""
 NEIGHBOURS = 5
 """Number of frames on each side of a gap that show the speed of the state there."""
+MAX_REST = 0.002
+"""Maximum step of an arm at rest between two frames, as a ratio of an element's usual range."""
+MIN_SPAN = 0.01
+"""Minimum usual range of an element, relative to the largest, whose steps are more than noise."""
 MAX_RATE_ERROR = 0.1
 """Maximum relative error of the measured rate; above it motion has a wrong speed."""
 MIN_FRAMES = 5
@@ -37,7 +41,7 @@ def _timed(evidence: Evidence) -> Iterator[tuple[EpisodeEvidence, Array]]:
     needs="timestamps",
     measures="frames that are missing between others",
     unit="s",
-    why="The arm moves during the gap, so the preceding action seems to have a larger effect than it had.",
+    why="What happened in the gap is lost, so the preceding action seems to have a larger effect than it had.",
     do="look at it: demorec view {path} --episodes {episode}; then cut or drop it: " + DROP,
 )
 def time_gaps(evidence: Evidence) -> Iterator[Fault]:
@@ -48,13 +52,15 @@ def time_gaps(evidence: Evidence) -> Iterator[Fault]:
             continue
         gaps = np.flatnonzero(steps * evidence.fps > MAX_GAP_PERIODS)
         if len(gaps):
-            longest = int(gaps[np.argmax(steps[gaps])])
+            moving = np.array([gap for gap in gaps if not _rests(evidence, episode, int(gap))], dtype=np.intp)
+            judged = moving if len(moving) else gaps
+            longest = int(judged[np.argmax(steps[judged])])
             more = f", and {len(gaps) - 1} more gaps" if len(gaps) > 1 else ""
             seconds = float(steps[longest])
-            moves_on = _moves_on(evidence, episode, longest, seconds * evidence.fps)
-            what = "the state moves on as usual, but its clock jumps by {} s" if moves_on else "{} s are missing"
+            moves_on = len(moving) > 0 and _moves_on(evidence, episode, longest, seconds * evidence.fps)
+            what = "the state moves on as usual, but its clock jumps by {} s" if moves_on else "{} s pass"
             yield Fault(
-                severity="broken",
+                severity="broken" if len(moving) else "look",
                 episode=episode.number,
                 frames=(int(gaps[0]) + 1, int(gaps[-1]) + 1),
                 value=f"{seconds:.2f} s",
@@ -63,14 +69,26 @@ def time_gaps(evidence: Evidence) -> Iterator[Fault]:
             )
 
 
+def _rests(evidence: Evidence, episode: EpisodeEvidence, frame: int) -> bool:
+    """Check whether the arm is known to rest before, during, and after a gap."""
+    at, around = _steps(evidence, episode, frame)
+    return max(at, around) <= MAX_REST
+
+
 def _moves_on(evidence: Evidence, episode: EpisodeEvidence, frame: int, periods: float) -> bool:
     """Check whether the state after a gap, at a known frame, is where it would be one frame later."""
+    at, around = _steps(evidence, episode, frame)
+    return at < around * periods / 4
+
+
+def _steps(evidence: Evidence, episode: EpisodeEvidence, frame: int) -> tuple[float, float]:
+    """Compute the step of the state across a gap and the median of those around it, in ranges; inf if unknown."""
     if episode.state is None:
-        return False
-    alive = evidence.ranges > 0
+        return np.inf, np.inf
+    alive = evidence.ranges > MIN_SPAN * evidence.ranges.max(initial=0.0)
     steps = (np.abs(np.diff(episode.state[:, alive], axis=0)) / evidence.ranges[alive]).max(axis=1, initial=0.0)
     around = np.delete(steps[max(frame - NEIGHBOURS, 0) : frame + NEIGHBOURS + 1], min(frame, NEIGHBOURS))
-    return bool(steps[frame] < float(np.median(around)) * periods / 4)
+    return float(steps[frame]), float(np.median(around))
 
 
 def _is_of_other_rate(steps: Array, fps: float) -> bool:
