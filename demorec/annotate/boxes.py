@@ -16,11 +16,7 @@ from demorec.mcap import Recording
 
 
 def seen_objects(recording: Recording, rows: NDArray[np.intp], camera: str) -> Iterator[BoxEntry]:
-    """Yield every object that a camera with segmentation sees in the given frames, row by row.
-
-    Raises:
-        RecordingError: The recording is damaged.
-    """
+    """Yield every object that a camera with segmentation sees in the given frames, row by row."""
     row_of = {int(frame): row for row, frame in enumerate(rows.tolist())}
     bodies = {body.name: body for body in recording.info.simulated.scene.bodies}
     named = [(value, bodies[name]) for value, name in recording.segment_names().items() if name in bodies]

@@ -79,9 +79,6 @@ def episode_timeline(recording: Recording) -> EpisodeTimeline:
 
     An attempt begins when the script announces a grasp; a recording without such events is one attempt at its only
     goal.
-
-    Raises:
-        RecordingError: The recording is damaged.
     """
     trajectory = recording.trajectory()
     attempts = _attempts(recording, trajectory, recording.info.simulated.scene)

@@ -95,7 +95,7 @@ class CheckedEpisode(ExitStack):
 
     @cached_property
     def scan(self) -> dict[str, TopicScan]:
-        """Every message of every topic, read once; this verifies the checksum of every chunk and attachment."""
+        """Every message of every topic, read once; this verifies the checksum of every chunk."""
         with closing(Container(self.path)) as container:
             return _scan_topics(container)
 
@@ -108,8 +108,6 @@ def _scan_topics(container: Container) -> dict[str, TopicScan]:
         times[topic].append(time_ns)
         if schemas[topic] in _STAMP_FIRST:
             stamps[topic].append(_stamp_ns(data))
-    for name in container.attachments:
-        container.attachment(name)
     return {
         topic: TopicScan(
             schema=schema,
@@ -155,7 +153,7 @@ def opens(episode: CheckedEpisode) -> Iterator[Fault]:
 
 @file_check(measures="damaged chunks, and messages that differ from the index")
 def checksums(episode: CheckedEpisode) -> Iterator[Fault]:
-    """Verify the checksum of every chunk and attachment, and the counts of the index."""
+    """Verify the checksum of every chunk, and the counts of the index."""
     counts = {topic: len(scan.time_ns) for topic, scan in episode.scan.items()}
     return listed(
         [

@@ -165,11 +165,7 @@ class EpisodeInfo:
 
     @property
     def simulated(self) -> Simulation:
-        """The simulation of the episode, for code that requires one.
-
-        Raises:
-            RecordingError: demorec did not simulate this episode.
-        """
+        """The simulation of the episode, for code that requires one; RecordingError for any other episode."""
         if self.simulation is None:
             raise RecordingError(NOT_SIMULATED)
         return self.simulation

@@ -128,11 +128,7 @@ def encode_mesh(mesh: SolidMesh) -> str:
 
 @functools.lru_cache(maxsize=64)
 def decode_mesh(text: str) -> SolidMesh:
-    """Decode the text of `encode_mesh`.
-
-    Raises:
-        SceneError: The text is invalid.
-    """
+    """Decode the text of `encode_mesh`; SceneError if it is invalid."""
     try:
         data = base64.b64decode(text, validate=True)
         if len(data) < 12:

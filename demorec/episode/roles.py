@@ -194,11 +194,7 @@ class Roles:
 
 
 def roles_of_recording(info: EpisodeInfo, named: NamedRoles) -> Roles:
-    """Find the roles of a recording's features.
-
-    Raises:
-        ConfigError: As `find_roles`, or the user named features of a simulated recording.
-    """
+    """Find the roles of a recording's features; raises as `find_roles`, or if the user named those of a simulation."""
     if named and info.simulation is not None:
         raise ConfigError(SIMULATED_ROLES)
     return roles_of_features(info.features, named)
@@ -219,8 +215,7 @@ def roles_of_features(features: Iterable[Feature], named: NamedRoles) -> Roles:
 def find_roles(columns: Mapping[str, Column], named: NamedRoles, modality: Modality | None = None) -> Roles:
     """Find the role of each feature: named by the user, else in `modality.json`, else implied by its name.
 
-    Raises:
-        ConfigError: The user named a missing feature, one that is not a vector, or one feature for two roles.
+    ConfigError if the user named a missing feature, one that is not a vector, or one feature for two roles.
     """
     modality = modality or Modality()
     columns = {

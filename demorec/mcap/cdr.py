@@ -105,19 +105,12 @@ class _Writer:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Layout:
-    """A message of constant length with variable timestamps and values.
+    """A message of constant length with variable timestamps and values."""
 
-    Attributes:
-        dtype: Type of the values: float64 or int64.
-        constant: (L,) uint8, the message with zeros in the slots.
-        time_slots: (S,) offsets of the timestamps, which are all set to the message's time.
-        value_slots: (K,) offsets of the values, of eight bytes each like the timestamps.
-    """
-
-    dtype: Literal["<f8", "<i8"]
-    constant: NDArray[np.uint8]
-    time_slots: NDArray[np.intp]
-    value_slots: NDArray[np.intp]
+    dtype: Literal["<f8", "<i8"]  # type of the values
+    constant: NDArray[np.uint8]  # (L,) the message with zeros in the slots
+    time_slots: NDArray[np.intp]  # (S,) offsets of the timestamps, which are all set to the message's time
+    value_slots: NDArray[np.intp]  # (K,) offsets of the values, of eight bytes each like the timestamps
 
     @cached_property
     def _value_runs(self) -> list[tuple[int, int]]:
@@ -169,36 +162,16 @@ Reader = Callable[[memoryview, int], tuple[Any, int]]
 _MAX_DEPTH = 32
 
 
-def strict_text(raw: bytes) -> str:
-    """Decode a string exactly as in a message; ValueError if it is invalid."""
-    if not raw.endswith(b"\x00"):
-        raise ValueError("a string without its closing NUL")
-    return raw[:-1].decode()
-
-
-def lenient_text(raw: bytes) -> str:
-    """Decode a string as its sender wrote it, replacing undecodable bytes."""
-    return raw[:-1].decode(errors="replace")
-
-
 class Readers:
     """Readers of the types in a definition, which is data: one per type, however often it occurs.
 
     Args:
         order: Byte order of numbers, "<" or ">".
         is_aligned: Whether numbers are aligned, as in CDR; those of ROS 1 are not.
-        text: Function that decodes the bytes of a string.
     """
 
-    def __init__(
-        self,
-        types: Types,
-        *,
-        order: str = "<",
-        is_aligned: bool = True,
-        text: Callable[[bytes], str] = strict_text,
-    ) -> None:
-        self._types, self._order, self._is_aligned, self._decode = types, order, is_aligned, text
+    def __init__(self, types: Types, *, order: str = "<", is_aligned: bool = True) -> None:
+        self._types, self._order, self._is_aligned = types, order, is_aligned
         self._made: dict[str, tuple[Reader, int]] = {}
 
     def of(self, kind: str) -> Reader:
@@ -256,15 +229,15 @@ class Readers:
         return read
 
     def _text(self) -> Reader:
-        length_of, decode, has_nul = self._scalar("uint32"), self._decode, self._is_aligned
+        """Return the reader of a string, which replaces undecodable bytes; in CDR it ends with a zero byte."""
+        length_of, end_bytes = self._scalar("uint32"), 1 if self._is_aligned else 0
 
         def read(data: memoryview, position: int) -> tuple[str, int]:
             length, position = length_of(data, position)
             end = position + length
             if end > len(data):
                 raise ValueError("a text extends beyond the message's end")
-            raw = bytes(data[position:end])
-            return decode(raw if has_nul else raw + b"\0"), end
+            return bytes(data[position : end - end_bytes]).decode(errors="replace"), end
 
         return read
 
@@ -315,12 +288,12 @@ def read_whole(read: Reader, data: memoryview) -> tuple[Values, int]:
 
 
 @lru_cache(maxsize=128)
-def _reader_of(schema: str, text: Callable[[bytes], str]) -> Reader:
-    return Readers(types_of(schema), text=text).of("")
+def _reader_of(schema: str) -> Reader:
+    return Readers(types_of(schema)).of("")
 
 
-def decode(schema: str, data: bytes, *, text: Callable[[bytes], str] = strict_text) -> tuple[Values, int]:
+def decode(schema: str, data: bytes) -> tuple[Values, int]:
     """Decode a message of a recorded type, and the number of bytes left after it; ValueError if it is damaged."""
     if data[:4] != HEADER:
         raise ValueError(f"a message with the encapsulation {data[:4].hex() or 'of no bytes'}, not 00010000")
-    return read_whole(_reader_of(schema, text), memoryview(data)[4:])
+    return read_whole(_reader_of(schema), memoryview(data)[4:])

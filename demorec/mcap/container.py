@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from mcap.opcode import Opcode
-from mcap.records import Attachment, AttachmentIndex, Channel, ChunkIndex, Footer, Metadata, MetadataIndex, Statistics
+from mcap.records import Channel, ChunkIndex, Footer, Metadata, MetadataIndex, Statistics
 
 from demorec.core.errors import RecordingError, ResourceError, describe_error, resource_error
 from demorec.core.files import MCAP_MAGIC, open_regular
@@ -59,7 +59,7 @@ class Container:
         channels: topic -> channel.
         schemas: number -> schema.
         counts: topic -> number of messages.
-        metadata_index, attachments: name -> position in the file.
+        metadata_index: name -> position in the file.
 
     Raises:
         RecordingError: The file does not exist, is not MCAP, is truncated, or has a wrong checksum.
@@ -110,7 +110,6 @@ class Container:
         self.schemas = {0: NO_SCHEMA}
         self._chunks: list[ChunkIndex] = []
         self.metadata_index: dict[str, MetadataIndex] = {}
-        self.attachments: dict[str, AttachmentIndex] = {}
         counts: dict[int, int] = {}
         for opcode, start, end in records_in(summary, "the file's index"):
             content = summary[start:end]
@@ -125,9 +124,6 @@ class Container:
             elif opcode == Opcode.METADATA_INDEX:
                 metadata = read_record(content, MetadataIndex)
                 self.metadata_index[metadata.name] = metadata
-            elif opcode == Opcode.ATTACHMENT_INDEX:
-                attachment = read_record(content, AttachmentIndex)
-                self.attachments[attachment.name] = attachment
             elif opcode == Opcode.STATISTICS:
                 counts = dict(read_record(content, Statistics).channel_message_counts)
         self._chunks.sort(key=lambda chunk: chunk.chunk_start_offset)
@@ -163,16 +159,6 @@ class Container:
         with damage_as_recording_error(self.path):
             record = read_record(self._content_at(index.offset, index.length, Opcode.METADATA), Metadata)
             return dict(record.metadata)
-
-    def attachment(self, name: str) -> bytes:
-        """Read the bytes of an attachment; KeyError if it does not exist."""
-        index = self.attachments[name]
-        with damage_as_recording_error(self.path):
-            content = self._content_at(index.offset, index.length, Opcode.ATTACHMENT)
-            stored = int.from_bytes(content[-4:], "little")
-            if stored and zlib.crc32(content[:-4]) != stored:
-                raise ValueError(f"the attachment {name!r} fails its checksum")
-            return bytes(read_record(content, Attachment).data)
 
     def messages(self, topics: Collection[str]) -> Iterator[tuple[str, int, bytes]]:
         """Yield (topic, time in ns, bytes) of the messages of some topics; those of one topic in order."""

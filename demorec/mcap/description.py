@@ -42,8 +42,7 @@ _Primitive = tuple[Literal["box", "sphere", "cylinder"], tuple[float, ...], Pose
 def robot_description(urdf: str, scale: float) -> str:
     """Replace every mesh of a robot by its bounding box, and remove masses and collision shapes.
 
-    Raises:
-        SceneError: The URDF or one of its meshes cannot be read.
+    SceneError if the URDF or one of its meshes cannot be read.
     """
     path = asset_path(urdf)
     return self_contained(path.read_text(), path.parent, scale=scale)

@@ -1,4 +1,4 @@
-"""A recording's numbers as frames, as a pandas table, and a recording in one line."""
+"""A recording's numbers as frames, and as a pandas table."""
 
 from __future__ import annotations
 
@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import MissingDependencyError
 from demorec.core.geometry import Array, Pose
-from demorec.core.text import printable
-from demorec.episode.episode import Action, Event, Frame, JointSample, Observation, Outcome, Table, Trajectory
+from demorec.episode.episode import Action, Event, Frame, JointSample, Observation, Table, Trajectory
 from demorec.episode.info import EpisodeInfo
-from demorec.episode.simulated import simulation_facts
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -88,22 +86,6 @@ def _samples_before_frames(samples: Iterable[JointSample], times: list[int]) -> 
         else:
             waiting.append(sample)
     return result
-
-
-def summary_line(info: EpisodeInfo, outcome: Outcome | None, num_frames: int) -> str:
-    """Summarise a recording in one line, without control characters."""
-    if outcome is None:
-        result = "unknown: recovered after a crash"
-    elif outcome.success is False:
-        phase = f" in phase {outcome.failure_phase}" if outcome.failure_phase else ""
-        result = f"{outcome.failure_reason}{phase}"
-    else:
-        result = "success" if outcome.success else "unknown"
-    task = simulation_facts(info).get("task", info.instruction)
-    return printable(
-        f"{num_frames} frames ({num_frames / info.fps:.1f} s at {info.fps} Hz), task {task} with {info.robot_name}, "
-        f"episode {info.episode_index}, attempt {info.attempt}, outcome {result}"
-    )
 
 
 def pandas_table(info: EpisodeInfo, numbers: Table | Trajectory) -> pd.DataFrame:

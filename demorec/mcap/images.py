@@ -28,15 +28,10 @@ _MOST_PIXELS = 1 << 50
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class PixelStatistics:
-    """Histograms of a camera's images.
+    """Histograms of a camera's images."""
 
-    Attributes:
-        counts: (3, 256) int64: number of pixels with each value, for red, green and blue.
-        num_images: Number of images counted.
-    """
-
-    counts: NDArray[np.int64]
-    num_images: int
+    counts: NDArray[np.int64]  # (3, 256) number of pixels with each value, for red, green and blue
+    num_images: int  # number of images counted
 
 
 class PixelCounter:
@@ -96,10 +91,6 @@ class CameraWriter:
     Args:
         video: Encoding of colour images, unless they arrive encoded.
         beside: Streams of images that accompany each colour image: "depth", "segmentation".
-
-    Attributes:
-        num_ready: Number of images that have left the encoder.
-        last_ns: Timestamp of the last image.
     """
 
     def __init__(self, camera: Camera, video: VideoConfig, fps: int, *, beside: Sequence[str] = ()) -> None:
@@ -116,7 +107,9 @@ class CameraWriter:
         self._frame_id = camera_frame(camera.name)
         self._waiting: list[tuple[int, list[Message]]] = []
         self._packets: list[bytes] = []
-        self._num_images = self.num_ready = self.last_ns = 0
+        self._num_images = 0
+        self.num_ready = 0  # images that have left the encoder
+        self.last_ns = 0  # timestamp of the last image
 
     def add(self, stamp_ns: int, data: NDArray[Any] | bytes, **beside: NDArray[Any] | None) -> int:
         """Add the next image: pixels, distances, or an encoded packet; return its number."""

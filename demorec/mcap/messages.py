@@ -93,11 +93,6 @@ def image(time_ns: int, frame_id: str, encoding: str, size: tuple[int, int], dat
     return _stamped(head, time_ns, data)
 
 
-def read_image(data: bytes) -> bytes:
-    """Decode the pixels of an `image`; ValueError if it is truncated."""
-    return bytes(decode(IMAGE, data)[0]["data"])
-
-
 def read_compressed_image(data: bytes) -> bytes:
     """Decode the encoded image of a `compressed_image`."""
     start = _compressed_image_start(data)
@@ -110,7 +105,9 @@ def read_compressed_image(data: bytes) -> bytes:
 
 def packet_reader(codec: str) -> Callable[[bytes], bytes]:
     """Return the function that extracts a camera's packet from its message."""
-    return {"av1": read_protobuf_video, "32FC1": read_image}.get(codec, read_compressed_image)
+    if codec == "32FC1":
+        return lambda data: bytes(decode(IMAGE, data)[0]["data"])
+    return read_protobuf_video if codec == "av1" else read_compressed_image
 
 
 def _compressed_image_start(data: bytes) -> int:
@@ -127,7 +124,9 @@ def _compressed_image_start(data: bytes) -> int:
 def coded_images(block: Block, codec: str) -> Block:
     """Extract the encoded images from the messages of a camera; ValueError if one is not an image."""
     if codec == "av1":
-        return _one_by_one(block, read_protobuf_video)
+        images = [read_protobuf_video(message) for message in block.messages()]
+        lengths = np.array([len(image) for image in images], dtype=np.int64)
+        return replace(block, content=b"".join(images), starts=np.cumsum(lengths) - lengths, lengths=lengths)
     if not len(block):
         return block
     start = _compressed_image_start(next(iter(block.messages())))
@@ -135,17 +134,11 @@ def coded_images(block: Block, codec: str) -> Block:
     constant = np.ones(start, dtype=np.bool_)
     constant[4:12] = constant[-4:] = False  # timestamp, length of the image
     if not (heads[:, constant] == heads[0, constant]).all():
-        return _one_by_one(block, read_compressed_image)
+        raise ValueError("images in different formats")
     lengths = np.ascontiguousarray(heads[:, -4:]).view("<u4").reshape(-1).astype(np.int64)
     if (lengths > block.lengths - start).any():
         raise ValueError("a truncated image")
     return replace(block, starts=block.starts + start, lengths=lengths)
-
-
-def _one_by_one(block: Block, read: Callable[[bytes], bytes]) -> Block:
-    images = [read(message) for message in block.messages()]
-    lengths = np.array([len(image) for image in images], dtype=np.int64)
-    return Block(content=b"".join(images), time_ns=block.time_ns, starts=np.cumsum(lengths) - lengths, lengths=lengths)
 
 
 def protobuf_video(time_ns: int, frame_id: str, video_format: str, data: bytes) -> bytes:
@@ -234,14 +227,10 @@ def message_fields(schema: str, data: bytes) -> dict[str, Value]:
         return dict(protobuf_fields(data))
     if schema not in DEFINITIONS:
         raise ValueError(f"recordings have no messages of the type {schema!r}")
-    values, num_left = decode(schema, data, text=_any_text)
+    values, num_left = decode(schema, data)
     if num_left:
         raise ValueError(f"a message with {num_left} excess bytes")
     return dict(_leaves("", values))
-
-
-def _any_text(raw: bytes) -> str:
-    return raw.decode(errors="backslashreplace").removesuffix("\0")
 
 
 def _leaves(path: str, value: Any) -> Iterator[tuple[str, Value]]:

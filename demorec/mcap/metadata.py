@@ -28,10 +28,7 @@ _CHECKSUM = "crc32"
 
 @dataclass(frozen=True, kw_only=True)
 class CameraStreams:
-    """The recorded streams of one camera: the coding of its images, and whether depth and segmentation were recorded.
-
-    The images of a depth camera are its depth.
-    """
+    """The recorded streams of one camera; the images of a depth camera are its depth."""
 
     video: VideoSettings
     depth: bool = False
@@ -69,8 +66,7 @@ def outcome_metadata(outcome: Outcome) -> dict[str, str]:
 def read_episode_metadata(metadata: Mapping[str, str]) -> tuple[EpisodeInfo, dict[str, CameraStreams], str]:
     """Parse the record of `episode_metadata`: info without URDF, cameras, and the URDF's SHA-256.
 
-    Raises:
-        RecordingError: The record is damaged, or has another format version.
+    RecordingError if the record is damaged, or has another format version.
     """
     check_seal(EPISODE, metadata)
     version = metadata.get("format_version", "")
@@ -92,15 +88,12 @@ def _check_cameras(info: EpisodeInfo, cameras: Mapping[str, CameraStreams]) -> N
     if cameras and cameras.keys() != {camera.name for camera in info.cameras}:
         raise ValueError("the recorded cameras differ from the description")
     for camera in info.cameras if cameras else ():
-        video = cameras[camera.name].video
-        if (video.width, video.height, video.fps) != (camera.width, camera.height, info.fps):
-            raise ValueError(f"the video of the camera {camera.name!r} differs in size or rate from the description")
-        if not camera.kept and video.gop < 1:
-            raise ValueError(f"the video of the camera {camera.name!r} has a GOP of {video.gop}")
-        if camera.kept and video.codec != camera.kept:
-            raise ValueError(f"the video of the camera {camera.name!r} is {video.codec}, not {camera.kept}")
-        if camera.kept and cameras[camera.name].depth != camera.is_depth:
-            raise ValueError(f"the camera {camera.name!r} is not a depth camera, contrary to its streams")
+        streams, video = cameras[camera.name], cameras[camera.name].video
+        is_as_described = (video.width, video.height, video.fps) == (camera.width, camera.height, info.fps)
+        if camera.kept:
+            is_as_described = is_as_described and (video.codec, streams.depth) == (camera.kept, camera.is_depth)
+        if not is_as_described or (not camera.kept and video.gop < 1):
+            raise ValueError(f"the images of the camera {camera.name!r} differ from the description")
 
 
 def read_outcome_metadata(metadata: Mapping[str, str]) -> Outcome:

@@ -1,4 +1,4 @@
-"""A recording: numbers as columns, images as packets or decoded, and the sequence of its frames."""
+"""A recording: numbers as columns, images as packets or decoded, and its frames."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import fields, replace
 from functools import cached_property
-from itertools import islice, repeat
+from itertools import repeat
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +26,7 @@ from demorec.episode.validity import find_problems
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.columns import TimedMessages, read_columns
 from demorec.mcap.container import Container, damage_as_recording_error
-from demorec.mcap.frames import frames_of, pandas_table, pose_of, summary_line
+from demorec.mcap.frames import frames_of, pandas_table, pose_of
 from demorec.mcap.images import PixelCounter, PixelStatistics, read_pixel_statistics
 from demorec.mcap.lossless import LabelDecoder, decode_distances, from_labels
 from demorec.mcap.metadata import CameraStreams
@@ -41,11 +41,11 @@ if TYPE_CHECKING:
 
 
 class Recording(Closing):
-    """Context manager over one recording, and the sequence of its frames; one chunk is in memory at a time.
+    """Context manager over one recording; one chunk is in memory at a time.
 
-    `for frame in recording` yields numbers and images together; `recording[120]` and `recording[-1]` select a frame;
-    `table` and `trajectory` return all numbers at once, which is much faster if images are not needed. Frames exist
-    only for simulations: other episodes have just a `table`.
+    `for frame in recording` yields numbers and images together; `table` and `trajectory` return all numbers at once,
+    which is much faster if images are not needed. Frames exist only for simulations: other episodes have just a
+    `table`.
 
     Attributes:
         path: Path of the file.
@@ -227,10 +227,7 @@ class Recording(Closing):
         return next(self._images(camera, [number]))
 
     def _images(self, camera: str, numbers: Sequence[int]) -> Iterator[Rgb]:
-        """Yield some decoded images, in increasing order, each decoded from the preceding keyframe on.
-
-        They are read in one pass; only the packets since the last keyframe are in memory.
-        """
+        """Yield some decoded images, in increasing order, in one pass, each decoded from the keyframe before it."""
         waiting, group = list(numbers), list[VideoPacket]()
         for number, packet in enumerate(self.packets(camera)):
             if not waiting:
@@ -263,11 +260,7 @@ class Recording(Closing):
         return simulated_table(self._numbers, self.info) if isinstance(self._numbers, Trajectory) else self._numbers
 
     def trajectory(self) -> Trajectory:
-        """Read the simulation, one row per frame, bit-exact.
-
-        Raises:
-            RecordingError: demorec did not simulate this episode.
-        """
+        """Read the simulation, one row per frame, bit-exact; RecordingError for any other episode."""
         if not isinstance(self._numbers, Trajectory):
             raise RecordingError(f"{NOT_SIMULATED}: {self.path}")
         return self._numbers
@@ -391,10 +384,7 @@ class Recording(Closing):
     def image(self, camera: str, frame: int) -> Rgb | None:
         """Decode a frame's image, (H, W, 3) uint8 RGB; None if the frame has no image of this camera.
 
-        Decoding starts at the preceding keyframe.
-
-        Raises:
-            IndexError: The frame does not exist; negative ones count from the end.
+        Negative frames count from the end; IndexError if there is no such frame.
         """
         number = int(self._shown(camera)[range(self.num_frames)[frame]])
         return None if number == NO_IMAGE else self.numbered_image(camera, number)
@@ -415,13 +405,9 @@ class Recording(Closing):
         """Convert all numbers to a table, one row per frame, bit-exact float64; the index is `frame_index`.
 
         Columns are named as in `demorec.episode.episode.Trajectory`, vectors with their component:
-        `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `base_from_tcp.qw`, `wrench.hand.force.z`
-        (N) if recorded, `object_poses.red_cube.z` (m, world frame), `phase`. `time_ns` is simulated time since the
-        episode's start. An external episode has the timestamps of its frames and its features:
-        `observation.state.shoulder`.
-
-        Raises:
-            MissingDependencyError: pandas is not installed.
+        `joint_position.panda_joint1` (rad, fingers m), `base_from_tcp.x` (m), `wrench.hand.force.z` (N),
+        `object_poses.red_cube.z` (m, world frame). An external episode has the timestamps of its frames and its
+        features: `observation.state.shoulder`. MissingDependencyError without pandas.
         """
         return pandas_table(self.info, self._numbers)
 
@@ -429,45 +415,19 @@ class Recording(Closing):
         return self.num_frames
 
     def __iter__(self) -> Iterator[Frame]:
-        images = self._images_from(0, {name: self.images(name) for name in self.cameras})
+        cameras = {name: self._images_of(name) for name in self.cameras}
         for frame in frames_of(self.trajectory(), self.events(), self.joint_samples()):
-            yield replace(frame, images=next(images))
+            yield replace(frame, images={name: next(images) for name, images in cameras.items()})
 
-    def __getitem__(self, index: int) -> Frame:
-        frame = self._frames[index]
-        first = frame.frame_index
-        colors = {name: self.images_at(name, [first]) for name in self.cameras}  # from the preceding keyframe on
-        return replace(frame, images=next(self._images_from(first, colors)))
-
-    @cached_property
-    def _frames(self) -> list[Frame]:
-        """All frames without images, cached at first use."""
-        return list(frames_of(self.trajectory(), self.events(), self.joint_samples()))
-
-    def _images_from(self, first: int, colors: Mapping[str, Iterator[Rgb]]) -> Iterator[Mapping[str, CameraImages]]:
-        """Yield the decoded images of a frame and of those after it, given the colours from that frame on."""
+    def _images_of(self, camera: str) -> Iterator[CameraImages]:
+        """Yield the decoded images of a camera, frame by frame."""
         nothing: Iterator[None] = repeat(None)
-        streams = {
-            name: (
-                color,
-                islice(self.depth(name), first, None) if self.has_depth(name) else nothing,
-                islice(self.segmentation(name), first, None) if self.has_segmentation(name) else nothing,
+        depth = self.depth(camera) if self.has_depth(camera) else nothing
+        labels = self.segmentation(camera) if self.has_segmentation(camera) else nothing
+        for color, pose in zip(self.images(camera), self.trajectory().world_from_camera[camera], strict=True):
+            yield CameraImages(
+                color=color, depth=next(depth), segmentation=next(labels), world_from_camera=pose_of(pose)
             )
-            for name, color in colors.items()
-        }
-        for index in range(first, self.num_frames):
-            yield {
-                name: CameraImages(
-                    color=next(color),
-                    depth=next(depth),
-                    segmentation=next(labels),
-                    world_from_camera=pose_of(self.trajectory().world_from_camera[name][index]),
-                )
-                for name, (color, depth, labels) in streams.items()
-            }
-
-    def __repr__(self) -> str:
-        return f"Recording({str(self.path)!r}: {summary_line(self.info, self.outcome, self.num_frames)})"
 
     def digest(self) -> str:
         """Compute SHA-256 (hex) of the content: metadata, numbers, phases, events, encoded images.
@@ -515,11 +475,7 @@ def open_recording(path: str | Path) -> Recording:
 
 
 def open_simulated(path: str | Path) -> Recording:
-    """Open the recording of an episode simulated by demorec.
-
-    Raises:
-        RecordingError: As `Recording`, or it was recorded by another robot or program.
-    """
+    """Open the recording of an episode that demorec simulated; RecordingError for any other."""
     recording = Recording(path)
     if recording.info.simulation is None:
         recording.close()

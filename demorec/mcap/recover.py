@@ -32,18 +32,12 @@ _KNOWN_TYPES = {*DEFINITIONS, messages.PROTOBUF_VIDEO}
 
 @dataclass(frozen=True, kw_only=True)
 class Recovered:
-    """Result of a recovery.
-
-    Attributes:
-        num_frames: Number of frames kept.
-        is_complete: Whether only the name was missing.
-        reason: Reason why reading stopped; "" if the file was complete.
-    """
+    """Result of a recovery."""
 
     path: Path
-    num_frames: int
-    is_complete: bool
-    reason: str
+    num_frames: int  # number of frames kept
+    is_complete: bool  # whether only the name was missing
+    reason: str  # why reading stopped; "" if the file was complete
 
 
 def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered:
@@ -87,8 +81,9 @@ def recover(source: Path, target: Path, *, overwrite: bool = False) -> Recovered
     except BaseException:
         file.discard()  # everything in it is in the source
         raise
-    is_complete = survey.outcome is not None
-    return Recovered(path=target, num_frames=survey.num_frames, is_complete=is_complete, reason=survey.reason)
+    return Recovered(
+        path=target, num_frames=survey.num_frames, is_complete=survey.outcome is not None, reason=survey.reason
+    )
 
 
 def is_whole(source: Path) -> bool:

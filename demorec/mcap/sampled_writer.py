@@ -83,16 +83,12 @@ MAX_SUBTASK = 1000
 
 
 class SampledFrameCheck:
-    """Validates images and frames in order of arrival, and keeps track of the accepted ones.
-
-    Attributes:
-        image_stamps: Camera -> timestamp of the last accepted image.
-    """
+    """Validates images and frames in order of arrival, and keeps track of the accepted ones."""
 
     def __init__(self, info: EpisodeInfo) -> None:
         self.features = {feature.name: feature for feature in info.features}
         self._cameras = {camera.name: camera for camera in info.cameras}
-        self.image_stamps: dict[str, int] = {}
+        self.image_stamps: dict[str, int] = {}  # camera -> timestamp of the last accepted image
         self._sample_stamps: dict[str, int] = {}
         self._frame_stamp = -1
         self._num_images = dict.fromkeys(self._cameras, 0)

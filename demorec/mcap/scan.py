@@ -12,7 +12,7 @@ import struct
 import zlib
 from array import array
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from io import BytesIO
 from typing import BinaryIO, NamedTuple
@@ -52,22 +52,14 @@ class CutOffError(ValueError):
 
 @dataclass(frozen=True, kw_only=True)
 class ScannedChannel:
-    """Channel of one topic, type and encoding; a bag may have several channels for a topic.
-
-    Attributes:
-        topic, type: "/joint_states", "sensor_msgs/msg/JointState".
-        encoding: Encoding of its messages: cdr, ros1, protobuf, json.
-        schema_encoding: Encoding of the definition: ros2msg, ros2idl, ros1msg, protobuf, jsonschema; "" for none.
-        schema: The definition: data, never code.
-        has_qos: Whether it states a quality of service; in recordings only for latched topics.
-    """
+    """Channel of one topic, type and encoding; a bag may have several channels for a topic."""
 
     topic: str
-    type: str
-    encoding: str
-    schema_encoding: str
-    schema: bytes
-    has_qos: bool = False
+    type: str  # "sensor_msgs/msg/JointState"
+    encoding: str  # of its messages: cdr, ros1, protobuf, json
+    schema_encoding: str  # of the definition: ros2msg, ros2idl, ros1msg, protobuf, jsonschema; "" for none
+    schema: bytes  # the definition: data, never code
+    has_qos: bool = False  # whether it states a quality of service; in recordings only for latched topics
 
 
 class ScannedMessage(NamedTuple):
@@ -100,9 +92,7 @@ def read_schema(content: bytes) -> Schema:
 def scan(file: BinaryIO) -> Iterator[ScannedMessage | Metadata | None]:
     """Yield the messages and metadata of a file, open at its first record, in order, and None at the end of each chunk.
 
-    Raises:
-        CutOffError: The file ends early.
-        Exception: A record is damaged; the parsers' own errors share no other base class.
+    CutOffError if the file ends early; Exception if a record is damaged, since the parsers' errors share no other base.
     """
     schemas = {0: NO_SCHEMA}
     channels: dict[int, ScannedChannel] = {}
@@ -169,8 +159,7 @@ def records_in(content: bytes, where: str = "its chunk") -> Iterator[tuple[int, 
 def chunk_content(record: bytes | memoryview, expected_size: int | None = None) -> bytes:
     """Unpack a chunk's records from the content of its record; a checksum of 0 means none.
 
-    Raises:
-        ValueError, struct.error, zstandard.ZstdError: It is damaged, or has an unexpected size.
+    ValueError, struct.error or zstandard.ZstdError if it is damaged, or has an unexpected size.
     """
     _, _, size, stored_crc, name_bytes = _CHUNK_HEAD.unpack_from(record)
     position = _CHUNK_HEAD.size
@@ -207,17 +196,12 @@ def _unpacked(compression: bytes, stored: memoryview, size: int) -> bytes:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Block:
-    """All messages of one topic, in the order of the file.
+    """All messages of one topic, in the order of the file: time and position in `content` of each of N messages."""
 
-    Attributes:
-        content: The bytes that contain them, shared by topics that were read together.
-        time_ns, starts, lengths: (N,) int64, time and position in `content` of each message.
-    """
-
-    content: bytes
-    time_ns: NDArray[np.int64]
-    starts: NDArray[np.int64]
-    lengths: NDArray[np.int64]
+    content: bytes  # shared by topics that were read together
+    time_ns: NDArray[np.int64]  # (N,)
+    starts: NDArray[np.int64]  # (N,)
+    lengths: NDArray[np.int64]  # (N,)
 
     def __len__(self) -> int:
         return len(self.starts)
@@ -235,12 +219,7 @@ class Block:
 
     def select(self, chosen: NDArray[np.bool_] | NDArray[np.intp]) -> Block:
         """Select some of the messages."""
-        return Block(
-            content=self.content,
-            time_ns=self.time_ns[chosen],
-            starts=self.starts[chosen],
-            lengths=self.lengths[chosen],
-        )
+        return replace(self, time_ns=self.time_ns[chosen], starts=self.starts[chosen], lengths=self.lengths[chosen])
 
     def heads(self, length: int) -> NDArray[np.uint8]:
         """Return (N, length) first bytes of every message; ValueError if one is shorter."""

@@ -47,27 +47,17 @@ Column = tuple[str, str, int | None]
 
 @dataclass(frozen=True, eq=False)
 class FrameStream:
-    """Stream with one message at each frame.
-
-    Attributes:
-        topic: Topic.
-        schema: ROS 2 type.
-        layout: Layout of the messages, with K values each.
-        columns: Columns that the values become, in order; further values become none.
-        values: The K values of a frame (`Frame` of a simulation, `SampledFrame` of any other episode), in parts.
-        dtype: Type of the columns.
-        stamp_ns: Stamp in the header of a frame's message.
-        is_dense: Whether there may be messages between the frames.
-    """
+    """Stream with one message at each frame."""
 
     topic: str
-    schema: str
-    layout: Layout
-    columns: tuple[Column, ...]
+    schema: str  # ROS 2 type
+    layout: Layout  # with K values in each message
+    columns: tuple[Column, ...]  # columns that the values become, in order; further values become none
+    # The K values of a frame (`Frame` of a simulation, `SampledFrame` of any other episode), in parts.
     values: Callable[[Any], Sequence[ArrayLike]]
-    dtype: str = "float64"
-    stamp_ns: Callable[[Any], int] = attrgetter("time_ns")
-    is_dense: bool = False
+    dtype: str = "float64"  # type of the columns
+    stamp_ns: Callable[[Any], int] = attrgetter("time_ns")  # timestamp in the header of a frame's message
+    is_dense: bool = False  # whether there may be messages between the frames
 
     def add_columns(self, values: NDArray[Any], columns: dict[str, Any]) -> None:
         """Split values (T, K) into columns: field -> rows, or field -> key -> rows."""

@@ -34,24 +34,13 @@ def camera_frame(camera: str) -> str:
 
 
 class FrameTree:
-    """Coordinate frames of one episode with a robot description; an unrecorded joint stays at 0.
+    """Coordinate frames of one episode, given the names of the recorded joints; any other joint stays at 0.
 
-    Args:
-        joints: Names of the recorded joints.
-        cameras: Cameras; those with a mount become frames.
-        scene: Pose of the robot, and bodies.
-
-    Attributes:
-        static: Rows that never change.
-        layout: Layout of the messages on `/tf`; None if nothing moves.
+    `layout` is that of the messages on `/tf`, None if nothing moves; `static` has the rows that never change.
     """
 
     def __init__(
-        self,
-        urdf: Urdf,
-        joints: Sequence[str],
-        cameras: Sequence[Camera],
-        scene: Scene | None = None,
+        self, urdf: Urdf, joints: Sequence[str], cameras: Sequence[Camera], scene: Scene | None = None
     ) -> None:
         bodies = () if scene is None else scene.bodies
         self._joints = MovingJoints(urdf, joints)
@@ -79,10 +68,7 @@ class MovingJoints:
     """parent_from_child of the recorded moving joints at once; the others stay at 0.
 
     A revolute joint about axis a from the fixed rotation q0: q0 * (a sin(t/2), cos(t/2)), linear in sine and cosine.
-
-    Attributes:
-        moving: (parent, child) of the moving joints.
-        static: Rows of the others.
+    `moving` has (parent, child) of the moving joints, `static` the rows of the others.
     """
 
     def __init__(self, urdf: Urdf, names: Sequence[str]) -> None:

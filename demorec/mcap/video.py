@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ import av
 import numpy as np
 from av.video.reformatter import VideoReformatter
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
+from PIL import Image
 
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError, describe_error
@@ -46,33 +47,29 @@ _MAX_UNITS = 256
 """Maximum number of units of an encoded image before its first slice."""
 _PIXEL_FORMATS = {"jpeg": "yuvj420p", "16UC1": "gray16le", "32FC1": "grayf32le"}
 """Codec -> FFmpeg's name of the pixel format, for codecs with independent images."""
+_DEEP_GRAY = re.compile(r"gray(9|1\d|f32)")
+"""FFmpeg's single-channel pixel formats over 8 bits."""
+_WITH_CHROMA_FORMAT = frozenset((44, 83, 86, 100, 110, 118, 122, 128, 134, 135, 138, 139, 244))
+"""H.264 profiles whose parameter sets state the chroma format (ITU-T H.264, 7.3.2.1.1)."""
+_SPS_BYTES = 24
+"""Maximum length of the fields before and including the bit depth."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class VideoSettings:
-    """Encoding of one camera's images, as needed by a dataset's metadata and an mp4 file.
+    """Encoding of one camera's images, as needed by a dataset's metadata and an mp4 file."""
 
-    Attributes:
-        codec: Codec of the bit stream; for depth the encoding of its distances.
-        encoder: FFmpeg's name of the encoder, "" for jpeg and for packets that arrived encoded.
-        pix_fmt: FFmpeg's name of the pixel format.
-        gop: Images from one keyframe to the next; 0 if unknown, for packets that arrived encoded.
-        crf, preset: Constant rate factor and preset of the encoder; None and "" for jpeg.
-        options: Further encoder options, as passed to FFmpeg.
-        jpeg_quality: 1..100; None unless the codec is jpeg.
-    """
-
-    codec: Codec
-    encoder: str = ""
+    codec: Codec  # of the bit stream; for depth the encoding of its distances
+    encoder: str = ""  # FFmpeg's name of the encoder, "" for jpeg and for packets that arrived encoded
     width: int
     height: int
     fps: int
-    pix_fmt: str
-    gop: int
-    crf: int | None = None
+    pix_fmt: str  # FFmpeg's name of the pixel format
+    gop: int  # images from one keyframe to the next; 0 if unknown, for packets that arrived encoded
+    crf: int | None = None  # constant rate factor; None for jpeg
     preset: str = ""
-    options: dict[str, str] = field(default_factory=dict)
-    jpeg_quality: int | None = None
+    options: dict[str, str] = field(default_factory=dict)  # further encoder options, as passed to FFmpeg
+    jpeg_quality: int | None = None  # 1..100; None unless the codec is jpeg
 
 
 def settings_of_coded(codec: Codec, width: int, height: int, fps: int) -> VideoSettings:
@@ -183,8 +180,7 @@ Encoder = _JpegEncoder | _StreamEncoder
 
 def make_encoder(video: VideoConfig, width: int, height: int, fps: int) -> Encoder:
     """Make an encoder as configured; RecordingError if this build of FFmpeg lacks the codec."""
-    made = _JpegEncoder if video.codec == "jpeg" else _StreamEncoder
-    return made(video, width, height, fps)
+    return (_JpegEncoder if video.codec == "jpeg" else _StreamEncoder)(video, width, height, fps)
 
 
 def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
@@ -199,8 +195,7 @@ def _bare(packets: Iterable[av.Packet]) -> list[bytes]:
 def decode(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Iterator[Rgb]:
     """Decode packets in order, starting at a keyframe: (H, W, 3) uint8 RGB, one per packet.
 
-    Raises:
-        RecordingError: A packet cannot be decoded, has another size, or images are missing at the end.
+    RecordingError if a packet cannot be decoded, has another size, or images are missing at the end.
     """
     shape = (settings.height, settings.width, 3)
     images = _decode_jpeg(settings, packets) if settings.codec == "jpeg" else _decode_stream(settings, packets)
@@ -220,8 +215,6 @@ def _decode_jpeg(settings: VideoSettings, packets: Iterable[VideoPacket]) -> Ite
                 if image.width * image.height > settings.width * settings.height:  # before anything is unpacked
                     raise OSError(f"{image.width}x{image.height} pixels")
                 yield np.asarray(image.convert("RGB"))
-        except UnidentifiedImageError as error:
-            raise RecordingError(f"The image of frame {packet.frame_index} is not a JPEG.") from error
         except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:
             reason = describe_error(error)
             raise RecordingError(f"The image of frame {packet.frame_index} is not a valid JPEG ({reason}).") from error
@@ -278,6 +271,35 @@ def nal_units(codec: str, data: bytes) -> Iterator[tuple[int, int]]:
         if kind in (1, 5) if codec == "h264" else kind < 32:
             return
         position = data.find(b"\x00\x00\x01", position + 3)
+
+
+def deep_gray(codec: str, pixel_format: str, parameters: bytes) -> str:
+    """Name the pixel format of a video that holds a measurement; "" for colour.
+
+    FFmpeg's `pixel_format` is a colour format for H.264 without chroma, so the video's parameter sets are read too, as
+    in an access unit or in an mp4 file.
+    """
+    if codec == "h264" and (depth := _luma_bits_without_chroma(parameters)) > 8:
+        return f"gray{depth}le"
+    return pixel_format if _DEEP_GRAY.match(pixel_format) else ""
+
+
+def _luma_bits_without_chroma(parameters: bytes) -> int:
+    """Bits per pixel of H.264 without chroma; 0 for colour, or without a sequence parameter set."""
+    is_mp4 = parameters[:1] == b"\x01"  # one set follows its length (ISO/IEC 14496-15, 5.3.3.1)
+    begins = [8] if is_mp4 else [place + 3 for kind, place in nal_units("h264", parameters) if kind == 7]
+    sps = parameters[begins[0] :][:_SPS_BYTES] if begins else b""
+    if len(sps) < _SPS_BYTES // 2 or sps[1] not in _WITH_CHROMA_FORMAT:
+        return 0
+    bits = "".join(f"{byte:08b}" for byte in sps[4:].replace(b"\0\0\3", b"\0\0"))
+    values: list[int] = []  # identifier, chroma format, luma bits over 8, as Exp-Golomb codes
+    while len(values) < 3:
+        zeros = len(bits) - len(bits.lstrip("0"))
+        if 2 * zeros >= len(bits):
+            return 0
+        values.append(int(bits[: 2 * zeros + 1], 2) - 1)
+        bits = bits[2 * zeros + 1 :]
+    return values[2] + 8 if values[1] == 0 else 0
 
 
 def obu_units(data: bytes) -> Iterator[tuple[int, int, int]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
@@ -21,7 +21,7 @@ from demorec.generate.run import generate
 
 NUM_EPISODES = 4
 """Eight attempts in total; with two at a time the executor is asked for its capacity about thirty times."""
-MOMENTS = [[*range(0, 12, 2), 44], pytest.param(range(45), marks=[pytest.mark.slow, pytest.mark.long])]
+MOMENTS = [*range(0, 12, 2), 44]
 InFlight = Literal["lost", "stuck", "finished"]
 
 
@@ -88,13 +88,12 @@ def run_on(executor: Executor, out: Path, monkeypatch: pytest.MonkeyPatch, heard
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("moments", MOMENTS)
 @pytest.mark.parametrize("in_flight", ["lost", "stuck", "finished"])
 def test_lost_workers_end_the_run_with_an_error(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: str, in_flight: InFlight, moments: Sequence[int]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: str, in_flight: InFlight
 ) -> None:
     lost = 0
-    for moment in moments:
+    for moment in MOMENTS:
         out, heard, ended = tmp_path / str(moment), Remembers(), ""
         executor = Waning(out, moment, in_flight=in_flight)
         with monkeypatch.context() as patch:
@@ -109,23 +108,17 @@ def test_lost_workers_end_the_run_with_an_error(
             assert f"{done} of {NUM_EPISODES} episodes are complete and kept" in ended
             assert sum("no room for any worker now" in line for line in heard.said) == 1
         assert run_fake(out, num_episodes=NUM_EPISODES).run.digest == reference
-    assert 1 < lost < len(moments), "some must lose the workers, and some have ended before"
+    assert 1 < lost < len(MOMENTS), "some must lose the workers, and some have ended before"
 
 
-@pytest.mark.parametrize("moments", MOMENTS)
 @pytest.mark.parametrize("in_flight", ["lost", "stuck", "finished"])
 @pytest.mark.parametrize("back_after", [1, 7])
 def test_returning_workers_make_the_same_run(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    reference: str,
-    in_flight: InFlight,
-    back_after: int,
-    moments: Sequence[int],
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: str, in_flight: InFlight, back_after: int
 ) -> None:
     monkeypatch.setattr(executing, "CAPACITY_WAIT_S", 60.0)
     lost = 0
-    for moment in moments:
+    for moment in MOMENTS:
         executor = Waning(tmp_path / str(moment), moment, back_after, in_flight)
         assert run_on(executor, executor.folder, monkeypatch, Remembers()).run.digest == reference
         lost += executor.now >= moment

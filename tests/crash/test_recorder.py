@@ -1,7 +1,7 @@
-"""A program that records with `Recorder`: killed, out of disk, surprised, interrupted twice, run twice at once.
+"""A program that records with `Recorder`: killed, out of disk, interrupted twice.
 
-It records until there are three episodes. Finished episodes never change, one that was cut off is completed when the
-program runs again, and no other file is overwritten.
+It records until there are three episodes. Finished episodes never change, and one that was cut off is completed when
+the program runs again.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support.crash import Ended, Running, SmallDisk, on_small_disk, run_command
+from support.crash import Ended, SmallDisk, on_small_disk, run_command
 from support.export import files_of
 
 from demorec import Recorder
@@ -22,8 +22,6 @@ from demorec.core.errors import DemorecError
 from demorec.mcap import Recording
 
 NUM_EPISODES, NUM_FRAMES, FPS = 3, 30, 10
-MINE = "years of work"
-
 pytestmark = [
     pytest.mark.slow,
     pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning"),
@@ -137,47 +135,3 @@ def test_a_full_file_system(tmp_path: Path, num_changes: int) -> None:
 
     (tmp_path / "disk").mkdir()
     on_small_disk(tmp_path / "disk", work)
-
-
-def test_a_file_that_appears_meanwhile_stays(tmp_path: Path, num_changes: int) -> None:
-    """It takes the name of the episode that is being recorded."""
-    folder = tmp_path / "appears"
-    folder.mkdir()
-
-    taken: list[str] = []
-
-    def write(number: int) -> None:
-        parts = list(folder.glob("run/episodes/*.part"))
-        if parts and not taken:
-            taken.append(parts[0].name)  # before writing, which is a change as well
-            parts[0].with_suffix("").write_text(MINE)
-
-    ended = run(folder, at=num_changes // 2, act=write)
-    (part,) = folder.glob("run/episodes/*.part")
-    assert ended.code == 2
-    assert str(part) in ended.said[0]
-    assert part.with_suffix("").read_text() == MINE
-    assert len(finished(folder)) == int(part.name[8:14]) + 1
-    assert num_frames(part) == NUM_FRAMES
-
-
-def test_two_at_once(tmp_path: Path, num_changes: int) -> None:
-    folder = tmp_path / "two"
-    folder.mkdir()
-    reached, go_on = os.pipe(), os.pipe()
-
-    def wait(number: int) -> None:
-        if number == 0:
-            os.write(reached[1], b"x")
-            os.read(go_on[0], 1)
-
-    first = Running(["run"], folder, program=record, at=num_changes // 2, act=wait)
-    assert os.read(reached[0], 1) == b"x"
-    second = run(folder)
-    os.write(go_on[1], b"x")
-    assert (first.wait().code, second.code) == (0, 2)
-    assert "Another run is writing here" in second.said[0]
-    for name in finished(tmp_path / "undisturbed"):
-        assert num_frames(folder / "run/episodes" / name) == NUM_FRAMES
-    for descriptor in (*reached, *go_on):
-        os.close(descriptor)

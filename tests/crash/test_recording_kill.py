@@ -26,7 +26,6 @@ from demorec.mcap import EpisodeWriter, Recording, recover
 
 FPS = 30
 MOST_FRAMES = 300
-LONG = [pytest.mark.slow, pytest.mark.long]
 
 
 def write_until_killed(path: Path, info: EpisodeInfo, frames: list[Frame], video: VideoConfig, notes: int) -> None:
@@ -65,12 +64,12 @@ def kill_while(write: Callable[[int], None], *, after: int, seconds: float) -> i
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("codec", "kills"), [("h264", 5), pytest.param("av1", 20, marks=LONG)])
-def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys: pytest.CaptureFixture[str]) -> None:
-    rng = random.Random(5)
+@pytest.mark.parametrize("codec", ["h264", pytest.param("av1", marks=pytest.mark.long)])
+def test_kill_at_random_moments(tmp_path: Path, codec: Codec) -> None:
+    rng, kills = random.Random(5), 5
     info, frames, _ = make_episode(num_frames=2 * MOST_FRAMES, fps=FPS)
     write_episode(tmp_path / "warm.mcap", num_frames=2)  # compile and load libraries first
-    lost, kept_nothing, written_total = [], 0, 0
+    kept_nothing = written_total = 0
     for number in range(kills):
         part = tmp_path / f"{number}.mcap.part"
         written = kill_while(
@@ -99,11 +98,5 @@ def test_kill_at_random_moments(tmp_path: Path, codec: Codec, kills: int, capsys
         # The frame that was being written when the signal came may be in the file without having been noted.
         assert kept <= written + 1
         assert written - kept <= FPS, f"{written} frames written, {kept} kept"
-        lost.append(max(0, written - kept))
-    with capsys.disabled():
-        print(
-            f"\n{codec}: {kills} kills, {written_total} frames written, lost at most {max(lost)} of {FPS} frames a "
-            f"second (mean {sum(lost) / kills:.1f}); {kept_nothing} within the first second"
-        )
     assert written_total > kills * FPS  # most were killed in the middle, not before the beginning
     assert kept_nothing < kills / 2

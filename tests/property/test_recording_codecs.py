@@ -1,4 +1,4 @@
-"""Depth, labels, CDR layouts and shapes: lossless inverses, and covers without gaps."""
+"""Depth, labels, messages and shapes: lossless inverses, and covers without gaps."""
 
 from __future__ import annotations
 
@@ -15,16 +15,14 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
-from mcap_ros2._dynamic import generate_dynamic
 from PIL import Image
 
 from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Body, Shape
-from demorec.mcap.cdr import Slot, decode, layout
+from demorec.mcap.cdr import decode
 from demorec.mcap.description import body_description, robot_description
 from demorec.mcap.lossless import LabelDecoder, decode_millimetres, encode_depth, encode_labels
-from demorec.mcap.messages import JOINT_STATE
 from demorec.mcap.ros2 import DEFINITIONS
 from demorec.robots.assets import asset_path
 
@@ -76,34 +74,6 @@ def test_labels(bodies: np.ndarray[Any, Any], links: np.ndarray[Any, Any]) -> No
 def test_too_many_bodies_for_labels() -> None:
     with pytest.raises(RecordingError, match="limited to 255 bodies"):
         encode_labels(np.array([[255]], dtype=np.int32))
-
-
-finite = st.floats(allow_nan=False, width=64)
-
-
-@pytest.mark.slow
-@settings(max_examples=40)
-@given(st.lists(st.text(max_size=9).filter(lambda text: "\0" not in text), max_size=5), st.data())
-def test_layouts_give_what_another_decoder_reads(names: list[str], data: st.DataObject) -> None:
-    """Joint states with names of any length, decoded by mcap-ros2-support."""
-    count = data.draw(st.integers(1, 4))
-    rows = data.draw(hnp.arrays(np.float64, (count, 3 * len(names)), elements=finite))
-    times = np.array(
-        data.draw(st.lists(st.integers(0, 2**31 * 10**9 - 1), min_size=count, max_size=count)), dtype=np.int64
-    )
-    slots = (Slot.VALUE,) * len(names)
-    joints = layout(JOINT_STATE, (Slot.TIME, "frame é"), tuple(names), slots, slots, slots)
-    messages = joints.encode(times, rows)
-    decode = generate_dynamic(JOINT_STATE, DEFINITIONS[JOINT_STATE])[JOINT_STATE]
-    for time, row, message in zip(times.tolist(), rows, messages, strict=True):
-        read = decode(message)
-        assert read.header.frame_id == "frame é"
-        assert (read.header.stamp.sec, read.header.stamp.nanosec) == divmod(time, 10**9)
-        assert list(read.name) == names
-        assert [*read.position, *read.velocity, *read.effort] == row.tolist()
-    assert (
-        joints.decode(np.stack([np.frombuffer(message, np.uint8) for message in messages])).tobytes() == rows.tobytes()
-    )
 
 
 @settings(max_examples=100)

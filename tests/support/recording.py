@@ -27,38 +27,15 @@ from demorec.episode.episode import (
     frame_time_ns,
 )
 from demorec.episode.info import EpisodeInfo, Simulation
-from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, SceneCamera, Shape
+from demorec.episode.scene import Body, Goal, Physics, RobotPlacement, Scene, SceneCamera, Shape
 from demorec.episode.simulated import simulated_info
 from demorec.mcap import EpisodeWriter
-from demorec.robots.robot import ParallelGripper, RobotSpec
+from demorec.robots.panda import PANDA
 from demorec.sim.sensors import SENSORS
 
 Codec = Literal["h264", "av1", "jpeg"]
 PHASES = ("approach", "descend", "grasp", "lift", "transport", "place", "retreat")
 HOME = (0.0, -0.4, 0.0, -2.2, 0.0, 1.8, 0.785)
-
-PANDA = RobotSpec(
-    name="panda",
-    urdf="franka_panda/panda.urdf",
-    base_link="panda_link0",
-    arm_joints=tuple(f"panda_joint{n}" for n in range(1, 8)),
-    tcp_link="panda_grasptarget",
-    hand_link="panda_hand",
-    home_q=HOME,
-    position_lower=(-2.9671, -1.8326, -2.9671, -3.1416, -2.9671, -0.0873, -2.9671),
-    position_upper=(2.9671, 1.8326, 2.9671, 0.0, 2.9671, 3.8223, 2.9671),
-    velocity_limit=(2.175, 2.175, 2.175, 2.175, 2.61, 2.61, 2.61),
-    acceleration_limit=(15.0, 7.5, 10.0, 12.5, 15.0, 20.0, 20.0),
-    torque_limit=(87.0, 87.0, 87.0, 87.0, 12.0, 12.0, 12.0),
-    gripper=ParallelGripper(
-        joints=("panda_finger_joint1", "panda_finger_joint2"),
-        finger_links=("panda_leftfinger", "panda_rightfinger"),
-        max_width=0.08,
-        force=20.0,
-        finger_depth=0.01,
-        palm_clearance=0.09,
-    ),
-)
 
 
 def make_episode(
@@ -153,8 +130,6 @@ def _camera(name: str, width: int, height: int) -> SceneCamera:
 
 
 def _scene(cameras: tuple[SceneCamera, ...], physics_hz: int) -> Scene:
-    from demorec.episode.scene import Physics
-
     return Scene(
         robot=RobotPlacement(name="panda", world_from_base=Pose(), joint_position=HOME, gripper_width=0.08),
         bodies=(

@@ -59,20 +59,6 @@ def each(change: Callable[[int, SampledFrame], SampledFrame]) -> Callable[[Episo
     return lambda episode: replace(episode, frames=[change(index, frame) for index, frame in enumerate(episode.frames)])
 
 
-def state(value: Callable[[int, Any], Any]) -> Callable[[Episode], Episode]:
-    def change(index: int, frame: SampledFrame) -> SampledFrame:
-        one = frame.samples["observation.state"]
-        vector = np.asarray(value(index, one.vector.copy()), dtype=np.float32)
-        return replace(frame, samples={**frame.samples, "observation.state": replace(one, vector=vector)})
-
-    return each(change)
-
-
-def held(frame: SampledFrame, name: str) -> Sample:
-    """Hold a sample at one value."""
-    return replace(frame.samples[name], vector=np.ones_like(frame.samples[name].vector))
-
-
 def older(name: str, by: int) -> Callable[[Episode], Episode]:
     def change(index: int, frame: SampledFrame) -> SampledFrame:
         one = frame.samples[name]
@@ -85,23 +71,10 @@ FAULTS: dict[str, tuple[Callable[[Episode], Episode], str]] = {
     "a gap": (moved(lambda i: 6 * 10**7 if i >= 20 else 0), "time_gaps"),
     "half the rate": (moved(lambda i: i * 40_000_000), "frame_rate"),
     "a late sensor": (older("observation.force", 3 * 10**8), "sample_age"),
-    "a clock offset": (older("action", 3 * 10**9), "sample_age"),
-    "late images": (
-        lambda e: replace(e, images={**e.images, "top": [(s - 3 * 10**8, p) for s, p in e.images["top"]]}),
-        "sample_age",
-    ),
     "a missing image": (
         each(lambda i, f: replace(f, images={"top": f.images["top"]}) if i == 9 else f), "missing_images"
     ),
-    "a joint beyond its limit": (state(lambda i, v: [v[0] + 3.0, *v[1:]]), "joint_limits"),
-    "a constant sensor": (
-        each(lambda i, f: replace(f, samples={**f.samples, "observation.force": held(f, "observation.force")})),
-        "frozen_sensors",
-    ),
     "drops": (lambda e: replace(e, outcome=replace(e.outcome, drops={"frames": 3})), "recording_losses"),
-    "a black camera": (
-        lambda e: replace(e, images={**e.images, "side": [(s, p * 0) for s, p in e.images["side"]]}), "blank_images"
-    ),
 }  # fmt: skip
 
 

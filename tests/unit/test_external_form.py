@@ -56,7 +56,7 @@ def test_numbers_stamps_and_dtypes_are_read_as_they_were_written(
     [
         ({"fps": 0}, "fps is 0"),
         ({"instruction": " "}, "task text is empty"),
-        ({"features": ()}, "0 features"),
+        ({"features": ()}, "there are no features"),
         ({"features": (STATE, STATE)}, "2 features are called 'observation.state'"),
         ({"features": (replace(STATE, name="tf.x"),)}, "reserved"),
         ({"features": (replace(STATE, name="timestamp"),)}, "reserved"),

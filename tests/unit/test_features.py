@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from support.recording import HOME, PANDA
+from support.recording import HOME
 
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Observations, Trajectory, frame_time_ns
@@ -23,6 +23,7 @@ from demorec.episode.features import (
     pose_from_delta,
 )
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
+from demorec.robots.panda import PANDA
 
 
 def random_pose(rng: np.random.Generator) -> Pose:

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError, RecordingError
 from demorec.episode.episode import NO_IMAGE
 from demorec.episode.info import Camera, Feature
-from demorec.mcap import Recording, SampledWriter
+from demorec.mcap import Recording
 from demorec.mcap.recorder.encoder import BackgroundEncoder
 from demorec.robots.panda import PANDA
 from demorec.runs.run_file import load_any_run_file
@@ -167,26 +166,20 @@ def test_the_end_of_an_episode_is_reported(tmp_path: Path) -> None:
 Act = Callable[[Any], object]
 BAD: dict[str, tuple[Act, str]] = {
     "length": (lambda e: e.write([0.0]), r"of shape \(1,\), it must be float64 of shape \(2,\)"),
-    "text": (lambda e: e.write("hand"), "is <U4 of shape"),
-    "ragged": (lambda e: e.write([[0.0], [1.0, 2.0]]), "different lengths"),
     "matrix": (lambda e: e.write(np.zeros((2, 2))), r"float64 of shape \(2, 2\)"),
     "feature": (lambda e: e.write({"stat": [0.0, 1.0]}), "unknown feature 'observation.stat'.*'observation.state'"),
-    "mixture": (lambda e: e.write({"a": 0.0, "force": [1.0]}), "single numbers \\('a'\\) and others \\('force'\\)"),
+    "mixture": (lambda e: e.write({"a": 0.0, "force": [1.0]}), r"'observation.a' is float64 of shape \(\)"),
     "element": (lambda e: e.write({"a": 0.0, "c": 1.0}), "no element 'c'"),
     "missing element": (lambda e: e.write({"a": 0.0}), "lacks the element 'b'"),
     "action": (lambda e: e.write([0.0, 1.0], [0.0]), "unknown feature 'action'"),
     "camera": (lambda e: e.write([0.0, 1.0], images={"tip": PIXELS}), "Unknown camera 'tip'"),
-    "list": (lambda e: e.write([0.0, 1.0], images={"top": [0]}), "is list, it must be uint8"),
     "tuple": (lambda e: e.write([0.0, 1.0], images={"top": (PIXELS,)}), "must be .pixels, stamp in ns"),
     "still": (lambda e: e.write([0.0, 1.0], time_ns=1_000_000_000), "stamps must not repeat"),
     "stamp": (lambda e: e.write([0.0, 1.0], stamps={"acton": 5}), "unknown feature 'acton'"),
     "nan": (lambda e: e.write([0.0, np.nan]), "is nan in its element 'b'"),
-    "negative time": (lambda e: e.write([0.0, 1.0], time_ns=-1), "the range is 0 to"),
     "float time": (lambda e: e.write([0.0, 1.0], time_ns=1.5), "must be a whole number of nanoseconds"),
     "feature goes back": (lambda e: e.write([0.0, 1.0], stamps={"observation.state": 5}), "the stamp 5 ns"),
     "size": (lambda e: e.write([0.0, 1.0], images={"top": PIXELS[:-1]}), r"uint8 of shape \(47, 64, 3\), it must be"),
-    "float image": (lambda e: e.write([0.0, 1.0], images={"top": PIXELS / 255}), "is float64 of shape"),
-    "bytes": (lambda e: e.write([0.0, 1.0], images={"top": b"x"}), "is bytes, it must be uint8"),
     "image goes back": (lambda e: e.write([0.0, 1.0], images={"top": (PIXELS, 5)}), "has the stamp 5 ns, the one"),
     "after the end": (lambda e: (e.finish(), e.write([0.0, 1.0])), "The episode has ended"),
 }  # fmt: skip
@@ -246,28 +239,6 @@ def test_odd_sizes_are_recorded_by_the_recommended_codec(tmp_path: Path) -> None
     assert export(tmp_path / "run", tmp_path / "d.hdf5", "hdf5").num_frames == 1
 
 
-OPENED = """
-import os, sys
-from demorec import Recorder
-recorder = Recorder(sys.argv[1], robot="arm", cameras={"top": (48, 64)}, fps=50, task="wait")
-recorder.episode()
-os._exit(9)
-"""
-
-
-@pytest.mark.slow
-def test_an_episode_that_was_opened_and_killed_leaves_no_gap(tmp_path: Path) -> None:
-    for _ in range(2):
-        assert subprocess.run([sys.executable, "-c", OPENED, str(tmp_path / "run")], check=False).returncode == 9
-    with recorder(tmp_path / "run", robot="arm", cameras=TOP, fps=50) as run:
-        assert run.recovered == ()
-        with run.episode() as episode, pytest.raises(RecordingError, match="nan"):
-            episode.write([float("nan")])  # nothing was recorded, so there is no episode
-        with run.episode() as episode:
-            episode.write([0.0])
-    assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap"]
-
-
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
     (tmp_path / "photos").mkdir()
     (tmp_path / "photos" / "cat.jpg").write_text("")
@@ -325,24 +296,6 @@ def test_frames_that_the_encoder_cannot_take_are_counted(tmp_path: Path, monkeyp
     with recording_of(tmp_path / "run") as found:
         values = found.table().features["observation.state"][:, 0].tolist()
     assert values == [index for index, there in enumerate(taken) if there]
-
-
-def test_an_error_of_the_encoder_reaches_the_program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def fail(self: SampledWriter) -> None:
-        raise RecordingError("The recording cannot be written (No space left on device)")
-
-    with recorder(tmp_path / "run") as run:
-        episode = run.episode()
-        episode.write([0.0])
-        monkeypatch.setattr(SampledWriter, "flush", fail)
-        with pytest.raises(RecordingError, match="No space left"):  # noqa: PT012
-            for _ in range(2000):
-                episode.write([0.0])
-                time.sleep(0.005)
-        with pytest.raises(RecordingError, match="No space left"):
-            episode.finish()
-        monkeypatch.undo()
-    assert [path.name for path in (tmp_path / "run" / "episodes").iterdir()] == ["episode_000000.mcap.part"]
 
 
 KILLED = """

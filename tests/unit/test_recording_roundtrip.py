@@ -16,7 +16,6 @@ from demorec.episode.episode import Event, Frame, Outcome
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
-from demorec.mcap.container import Container
 
 CODECS = [VideoConfig(), VideoConfig(codec="av1"), VideoConfig(codec="jpeg"), VideoConfig(gop=30, crf=30)]
 
@@ -160,25 +159,3 @@ def test_no_frames_at_all(tmp_path: Path) -> None:
         assert recording.trajectory().joint_position.shape == (0, 9)
         assert recording.cameras == ()
         assert len(recording.digest()) == 64
-
-
-def test_numbers_are_read_without_touching_the_images(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = write_episode(tmp_path / "a.mcap", num_frames=90, width=240, height=180, video=VideoConfig(codec="jpeg"))
-    read: list[int] = []
-    original = Container._read_at
-
-    def remember(container: Container, at: int, size: int) -> bytes:
-        read.append(size)
-        return original(container, at, size)
-
-    monkeypatch.setattr(Container, "_read_at", remember)
-    with Recording(path) as recording:
-        opened = sum(read)
-        recording.trajectory()
-        numbers = sum(read) - opened
-        list(recording.packets("front"))
-        images = sum(read) - opened - numbers
-    size = path.stat().st_size
-    assert opened < 0.1 * size
-    assert numbers < 0.25 * size
-    assert images > 0.6 * size

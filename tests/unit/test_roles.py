@@ -11,8 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.check import edit_json
 from support.commands import exit_code
-from support.conventions import CONVENTIONS, EPISODES, Convention, write_convention
-from support.hdf5 import write_aloha, write_robomimic
+from support.conventions import CONVENTIONS, Convention, write_convention
 
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.layout import DatasetFeature
@@ -143,25 +142,11 @@ def test_an_import_records_what_the_user_names(tmp_path: Path, capsys: Capture) 
     assert "feature measured  state, 4 float32 (unnamed), units unknown" in capsys.readouterr().out
     assert exit_code("info", run) == 0
     assert "action    wanted (4 elements)" in capsys.readouterr().out
-    assert exit_code("import", "lerobot", root, "--out", run) == 2  # another import, since the roles differ
-    assert "Another recording exists already" in capsys.readouterr().err
-
-
-def test_the_users_names_override_recorded_roles(tmp_path: Path, capsys: Capture) -> None:
-    root, run = write_convention(tmp_path / "d", UNKNOWN), tmp_path / "run"
-    assert exit_code("import", "lerobot", root, "--out", run, *NAMED) == 0
-    capsys.readouterr()
     assert exit_code("info", run, "--json", "--state", "wanted", "--action", "measured") == 0
     roles = json.loads(capsys.readouterr().out)["roles"]
     assert (roles["state"], roles["action"]) == (["wanted"], ["measured"])
-
-
-def test_the_gripper_may_be_an_element_of_the_state(tmp_path: Path, capsys: Capture) -> None:
-    root = write_convention(tmp_path / "d", CONVENTIONS["openpi"])
-    assert exit_code("info", root, "--json", "--gripper", "3") == 0
-    assert json.loads(capsys.readouterr().out)["roles"]["grippers"] == ["3"]
-    assert exit_code("info", root, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["roles"]["grippers"] == []
+    assert exit_code("import", "lerobot", root, "--out", run) == 2  # another import, since the roles differ
+    assert "Another recording exists already" in capsys.readouterr().err
 
 
 def test_playback_shows_the_state_first(tmp_path: Path) -> None:
@@ -177,36 +162,11 @@ def test_playback_shows_the_state_first(tmp_path: Path) -> None:
         assert [*episode.curves][:2] == ["zoo", "state"]
 
 
-def test_a_report_draws_state_and_action(tmp_path: Path, capsys: Capture) -> None:
-    root = write_convention(tmp_path / "d", CONVENTIONS["agibot"])
-    assert exit_code("report", root, "--out", tmp_path / "a.html") == 0
-    assert "joint.0" in (tmp_path / "a.html").read_text()
-    root = write_convention(tmp_path / "u", UNKNOWN)
-    assert exit_code("report", root, "--out", tmp_path / "b.html") == 0
-    assert "No state and no action found" in (tmp_path / "b.html").read_text()
-    assert exit_code("report", root, "--out", tmp_path / "c.html", *NAMED) == 0
-    text = (tmp_path / "c.html").read_text()
-    assert "No state and no action found" not in text
-    assert "component 3" in text
-
-
 def test_idle_frames_are_found_in_any_state(tmp_path: Path, capsys: Capture) -> None:
     root = write_convention(tmp_path / "d", CONVENTIONS["openpi droid"])
     assert exit_code("dataset", "trim", root, "--idle", "--dry-run") == 0
     assert exit_code("dataset", "trim", write_convention(tmp_path / "u", UNKNOWN), "--idle", "--dry-run") == 2
     assert "No state was found" in capsys.readouterr().err
-
-
-@pytest.mark.parametrize("write", [write_robomimic, write_aloha])
-def test_third_party_hdf5_has_a_state_and_an_action(write: Any, tmp_path: Path, capsys: Capture) -> None:
-    path = write(tmp_path / "demo.hdf5")
-    exit_code("import", "hdf5", path, "--suggest")
-    mapping = tmp_path / "mapping.toml"
-    mapping.write_text(capsys.readouterr().out)
-    assert exit_code("info", path, "--mapping", mapping, "--json") == 0
-    roles = json.loads(capsys.readouterr().out)["roles"]
-    assert (roles["state"], roles["action"]) == (["observation.state"], ["action"])
-    assert None not in roles["of"].values()
 
 
 EDITS = {"drop": "--episodes 0", "trim": "--head 2", "set-task": "--task wave"}
@@ -223,15 +183,6 @@ def test_edits_write_names_back_in_the_form_they_had(name: str, edit: str, tmp_p
     assert json.dumps(before, sort_keys=True) == json.dumps(after, sort_keys=True)
 
 
-def test_merged_datasets_keep_the_first_ones_names(tmp_path: Path) -> None:
-    a = write_convention(tmp_path / "a", CONVENTIONS["unitree"])
-    b = write_convention(tmp_path / "b", CONVENTIONS["axes"])  # the same elements in another form
-    assert exit_code("dataset", "merge", a, b, "--out", tmp_path / "new") == 0
-    info = json.loads((tmp_path / "new/meta/info.json").read_text())
-    assert info["features"]["action"]["names"] == [["shoulder", "elbow", "wrist", "gripper"]]
-    assert info["total_episodes"] == 2 * EPISODES
-
-
 json_values = st.recursive(
     st.none() | st.booleans() | st.integers(-3, 9) | st.floats(allow_nan=False) | st.text(max_size=4),
     lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=4), inner, max_size=4),
@@ -246,29 +197,6 @@ def test_any_names_are_read_and_written_back_as_they_were(names: Any, count: int
     feature = DatasetFeature.from_json({"dtype": "float32", "shape": [count], "names": names})
     assert json.dumps(feature.to_json()["names"]) == json.dumps(names)
     assert len(feature.elements) == count
-
-
-words = st.sampled_from(
-    ["observation", "state", "states", "action", "actions", "joint", "position", "effector", "x", ""]
-)
-names_of_features = st.lists(words, max_size=4).map(".".join) | st.text(max_size=6)
-columns_of_any_kind = st.builds(
-    lambda dtype, count: Column(dtype, tuple(map(str, range(count)))),
-    st.sampled_from(["float32", "float64", "int64", "bool", "string", "video"]),
-    st.integers(0, 3),
-)
-
-
-@given(st.dictionaries(names_of_features, columns_of_any_kind, max_size=6))
-def test_any_features_get_roles(columns: dict[str, Column]) -> None:
-    roles = find_roles(columns, NamedRoles())
-    parts = [*roles.state, *roles.action]
-    assert len(set(parts)) == len(parts)
-    assert all(columns[part].is_vector for part in parts)
-    assert (
-        len(roles.elements(roles.state)) == len(roles.grippers()) == sum(len(columns[p].elements) for p in roles.state)
-    )
-    assert len(roles.in_state(roles.action)) == len(roles.grippers())
 
 
 @given(st.lists(st.text("abc_", min_size=1, max_size=5), min_size=1, max_size=6, unique=True))

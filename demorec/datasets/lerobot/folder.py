@@ -161,7 +161,7 @@ class LeRobotFolder:
     @cached_property
     def _measurements(self) -> tuple[str, ...]:
         """Sentences about cameras whose video holds a measurement of unknown scale instead of colour."""
-        from demorec.mcap.gray_video import deep_gray
+        from demorec.mcap.video import deep_gray
 
         notes: list[str] = []
         for key in self.info.video_keys:

@@ -21,7 +21,7 @@ from rosbags.typesys.msg import MSGParser
 
 from demorec.core.errors import describe_error
 from demorec.core.plain import MAX_DEPTH, parse_json
-from demorec.mcap.cdr import Readers, Values, lenient_text, read_whole
+from demorec.mcap.cdr import Readers, Values, read_whole
 from demorec.mcap.ros2 import FieldType, Types
 from demorec.mcap.scan import ScannedChannel, ScannedMessage
 
@@ -164,7 +164,7 @@ def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr:
     parts = type_name.split("/")
     name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
     types = _types(name, schema_encoding, schema)
-    readers = [Readers(types, order=order, is_aligned=is_cdr, text=lenient_text).of(name) for order in "><"]
+    readers = [Readers(types, order=order, is_aligned=is_cdr).of(name) for order in "><"]
 
     def decode(data: bytes) -> Values:
         if not is_cdr:

@@ -19,9 +19,8 @@ from demorec.core.config import MAX_PIXELS
 from demorec.core.errors import describe_error
 from demorec.extensions.imports.fields import FieldError, image_bytes, whole
 from demorec.mcap.cdr import Values
-from demorec.mcap.gray_video import deep_gray
 from demorec.mcap.lossless import decode_millimetres
-from demorec.mcap.video import DECODERS, is_keyframe, nal_units
+from demorec.mcap.video import DECODERS, deep_gray, is_keyframe, nal_units
 
 _PIXELS: dict[str, tuple[str, int]] = {
     "rgb8": ("rgb24", 3),

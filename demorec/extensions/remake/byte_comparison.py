@@ -34,7 +34,7 @@ class RemakeDifference:
     """A field of a stream that differs in the remake.
 
     Attributes:
-        stream: A topic, or "metadata NAME", "attachment NAME".
+        stream: A topic, or "metadata NAME".
         field: Message field such as `pose.position.x`, or metadata field such as
         `info.simulation.scene.bodies[1].mass`.
         frames: Frames that differ, ascending; empty outside frames.
@@ -87,8 +87,6 @@ class Contents:
         """Read a whole file; RecordingError if it is damaged."""
         found = cls()
         with closing(Container(path)) as container:
-            for name in container.attachments:
-                found.fixed[f"attachment {name}"] = {"data": container.attachment(name)}
             for name in container.metadata_index:
                 values = dict(_leaves(container.metadata(name) or {}))
                 left_out = _MADE_BY if name == EPISODE else ()

@@ -39,20 +39,14 @@ WaitingImages = Mapping[str, tuple[int, NDArray[np.uint8] | None]]
 class BackgroundEncoder:
     """Thread that opens a writer and feeds it from a queue, in which up to half a second of frames may wait.
 
-    Args:
-        waits: Whether `put` waits for room.
-
-    Attributes:
-        writer: Writer of the episode, once it is open; used only by the thread until `end` returns.
-        error: Error that ended the thread, if any.
-        capacity: Maximum number of waiting frames, which memory limits.
+    With `waits`, `put` waits for room.
     """
 
     def __init__(
         self, open_writer: Callable[[], SampledWriter], *, cameras: Sequence[Camera], fps: int, waits: bool
     ) -> None:
-        self.writer: SampledWriter | None = None
-        self.error: BaseException | None = None
+        self.writer: SampledWriter | None = None  # once it is open; used only by the thread until `end` returns
+        self.error: BaseException | None = None  # the one that ended the thread
         self._waits = waits
         frame_bytes = sum(3 * camera.width * camera.height for camera in cameras)
         most = _MAX_WAITING_BYTES // max(frame_bytes, 1)

@@ -35,7 +35,7 @@ _PREFIX = "observation."
 def named_vectors(observation: Vectors, action: Vectors | None) -> NamedVectors:
     """Convert and copy the data; RecordingError unless it is vectors of numbers, or one mapping of numbers."""
     found: dict[str, tuple[NDArray[Any], tuple[str, ...]]] = {}
-    if isinstance(observation, Mapping) and not _is_of_numbers(STATE, observation):
+    if isinstance(observation, Mapping) and not _is_of_numbers(observation):
         for key, value in observation.items():
             name = key if str(key).startswith(_PREFIX) else f"{_PREFIX}{key}"
             found[name] = _vector(name, value), ()
@@ -46,15 +46,8 @@ def named_vectors(observation: Vectors, action: Vectors | None) -> NamedVectors:
     return found
 
 
-def _is_of_numbers(name: str, mapping: Mapping[str, Any]) -> bool:
-    single = [key for key, value in mapping.items() if _is_number(value)]
-    if single and len(single) != len(mapping):
-        other = next(key for key in mapping if key not in single)
-        raise RecordingError(
-            f"The {name} is a mapping of single numbers ({single[0]!r}) and others ({other!r}): give numbers "
-            "by the names of elements, or vectors by the names of features."
-        )
-    return bool(single)
+def _is_of_numbers(mapping: Mapping[str, Any]) -> bool:
+    return bool(mapping) and all(_is_number(value) for value in mapping.values())
 
 
 def _is_number(value: object) -> bool:
@@ -63,7 +56,7 @@ def _is_number(value: object) -> bool:
 
 def _one_vector(name: str, value: Vectors) -> tuple[NDArray[Any], tuple[str, ...]]:
     if isinstance(value, Mapping):
-        if not _is_of_numbers(name, value):
+        if not _is_of_numbers(value):
             raise RecordingError(f"The {name} is a mapping without numbers: give a vector, or name -> number.")
         return _vector(name, np.array(list(value.values()), dtype=np.float64)), tuple(map(str, value))
     return _vector(name, value), ()
@@ -82,11 +75,7 @@ def _vector(name: str, value: ArrayLike) -> NDArray[Any]:
 
 
 def as_declared(feature: Feature, vector: NDArray[Any], names: tuple[str, ...]) -> NDArray[Any]:
-    """Convert a vector to the feature's type and order of elements, without losing a bit.
-
-    Raises:
-        RecordingError: Elements are missing or unknown, or the feature's type cannot represent the numbers.
-    """
+    """Convert a vector to the feature's type and order of elements; RecordingError if some are missing or unknown."""
     if names and names != feature.names:
         if unknown := [name for name in names if name not in feature.names]:
             raise RecordingError(
