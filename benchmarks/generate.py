@@ -282,25 +282,15 @@ def scaling(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def memory(args: argparse.Namespace) -> dict[str, Any]:
-    """Peak memory of driver and workers, and CPU seconds an episode, for runs of several lengths."""
+    """Peak memory of driver and two workers together, and CPU seconds an episode, for runs of several lengths."""
     rows = {}
     for count in args.memory:
-        with tempfile.TemporaryDirectory(prefix="demorec-bench-") as temporary:
-            (command,) = ours("demorec 2 workers", count, Path(temporary) / "out", args)
-            subprocess.run([*command, "--no-export"], check=True, stdout=subprocess.DEVNULL)
-            run = json.loads((Path(temporary) / "out/run.json").read_text())
-            session = run["sessions"][-1]
-            rows[count] = {
-                "driver_mb": session["peak_driver_bytes"] / 1e6,
-                "worker_mb": session["peak_worker_bytes"] / 1e6,
-                "cpu_s_per_episode": sum(line["seconds"] for line in run["episodes"]) / count,
-            }
-            row = rows[count]
-            print(
-                f"{count:6} episodes: driver {row['driver_mb']:.0f} MB, worker {row['worker_mb']:.0f} MB; "
-                f"CPU s an episode: {row['cpu_s_per_episode']:.3f}",
-                flush=True,
-            )
+        sample = run_variant("demorec 2 workers", count, args)
+        row = {"peak_mb": sample.peak_bytes / 1e6, "cpu_s_per_episode": sum(sample.steady) / count}
+        rows[count] = row
+        print(
+            f"{count:6} episodes: {row['peak_mb']:.0f} MB, CPU s an episode: {row['cpu_s_per_episode']:.3f}", flush=True
+        )
     return rows
 
 
@@ -340,9 +330,8 @@ def driver(args: argparse.Namespace) -> dict[str, Any]:
         )
         for count in args.driver:
             plans = (EpisodePlan(config=config, episode_index=index) for index in range(count))
-            run = replace(
-                run.with_generation(num_episodes=count), attempts=tuple(make_nothing(plan, Path()) for plan in plans)
-            )
+            attempts = tuple(make_nothing(plan, Path()) for plan in plans)
+            run = replace(run, num_episodes=count, attempts=attempts)
             start = time.process_time()
             save_run_file(run, Path(temporary))
             saved = time.process_time()

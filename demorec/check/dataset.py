@@ -42,17 +42,10 @@ _OF_THE_PLACE = ("episode_index", "source", "content_digest")
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class DescribedEpisode:
-    """A simulated episode of a dataset, with its row of the sidecar.
-
-    Attributes:
-        number: Its `episode_index`.
-        rows: Feature -> (T, D).
-        kept: Its row of the sidecar.
-        info: Metadata known before its first frame.
-    """
+    """A simulated episode of a dataset, with its row of the sidecar, `kept`."""
 
     number: int
-    rows: Rows
+    rows: Rows  # feature -> (T, D)
     kept: dict[str, Any]
     info: EpisodeInfo
 

@@ -44,25 +44,17 @@ _STAMP_OFFSET = 4
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class TopicScan:
-    """Messages of one topic, in file order.
-
-    Attributes:
-        schema: Its message type.
-        time_ns: (N,) time of each message.
-        stamp_ns: (N,) timestamp inside each message; None for types without one.
-    """
+    """Messages of one topic, in file order."""
 
     schema: str
-    time_ns: NDArray[np.int64]
-    stamp_ns: NDArray[np.int64] | None
+    time_ns: NDArray[np.int64]  # (N,)
+    stamp_ns: NDArray[np.int64] | None  # (N,) timestamp inside each message; None for types without one
 
 
 class CheckedEpisode(ExitStack):
     """One recording, closed at the end of a `with`. Properties raise RecordingError for missing data.
 
-    Args:
-        path: The recording.
-        colours: Whether the image check decodes colour images.
+    The image check decodes colour images, too, unless `colours` is false.
     """
 
     def __init__(self, path: Path, *, colours: bool = True) -> None:

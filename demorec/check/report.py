@@ -167,11 +167,6 @@ class Proof:
 
 
 def prove(paths: Sequence[Path], allowed: Sequence[str] = ()) -> Iterator[Proof]:
-    """Yield the proofs of recordings; none without an extension for it.
-
-    Args:
-        paths: The recordings.
-        allowed: The user's modules that may be imported if the recordings name them.
-    """
+    """Yield the proofs of recordings; none without an extension for it. They may import the `allowed` modules."""
     for _, target in rows_of("proofs"):
         yield from pkgutil.resolve_name(target)(paths, allowed)

@@ -13,7 +13,7 @@ from demorec.core.files import sha256_of
 from demorec.core.plain import to_plain
 from demorec.episode.info import EpisodeInfo
 from demorec.runs.recorded import recorded_line
-from demorec.runs.run_file import EPISODES, FAILED, Attempt, RunFile, is_external_run, load_any_run_file
+from demorec.runs.run_file import EPISODES, FAILED, Attempt, GeneratedRun, RunFile, is_external_run, load_any_run_file
 
 run_check = partial(
     check,
@@ -28,11 +28,7 @@ _NOT_RECORDED = ("file", "seconds")
 
 
 class CheckedRun:
-    """A run on disk, read from its own files.
-
-    Args:
-        path: The folder with run.json.
-    """
+    """A run on disk, read from its own files."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -50,8 +46,7 @@ class CheckedRun:
     @property
     def attempts(self) -> list[Attempt]:
         """Attempts that have a recording."""
-        run = self.run
-        return [attempt for attempt in (run.attempts if run.generation is None else run.known) if attempt.file]
+        return [attempt for attempt in self.run.known if attempt.file]
 
     @property
     def recordings(self) -> list[Path]:
@@ -64,9 +59,8 @@ def run_files(run: CheckedRun) -> Iterator[Fault]:
     """Compare the recordings with those that run.json lists, and their SHA-256."""
     recorded = {attempt.file: attempt.sha256 for attempt in run.attempts}
     there = {str(path.relative_to(run.path)) for path in run.recordings}
-    hint = "" if run.run.is_complete else " yet; the command that began the run adds it and continues"
     wrong = [f"{file} is missing" for file in sorted(recorded.keys() - there)]
-    wrong += [f"{file} is not in run.json{hint}" for file in sorted(there - recorded.keys())]
+    wrong += [f"{file} is not in run.json" for file in sorted(there - recorded.keys())]
     for file in sorted(there & recorded.keys()):
         try:
             if sha256_of(run.path / file) != recorded[file]:
@@ -104,11 +98,11 @@ def _contradictions(run: CheckedRun, attempt: Attempt) -> Iterator[str]:
     for name, value in asdict(recorded).items():
         if name not in _NOT_RECORDED and listed[name] != value:
             yield f"{name} of {attempt.file} is {str(value)[:40]!r}, run.json has {str(listed[name])[:40]!r}"
-    if run.form == "run":
+    if isinstance(run.run, GeneratedRun):
         yield from (f"{name} of {attempt.file} differs from the run's" for name in _other_config(run.run, info))
 
 
-def _other_config(run: RunFile, info: EpisodeInfo) -> Iterator[str]:
+def _other_config(run: GeneratedRun, info: EpisodeInfo) -> Iterator[str]:
     """Names of config values in a recording that differ from the run's, and "versions"."""
     config = to_plain(run.config)
     yield from (

@@ -27,7 +27,7 @@ from demorec.core.registry import Registry, nearest_match
 class Command(Protocol):
     """A dataclass whose fields are the flags and whose docstring is the help; or a group (`subcommands_of`).
 
-    A class variable `rare_flags` names the fields, also those of dataclasses in it, that only --help-all shows.
+    Only --help-all shows the fields that are `Rare` (`demorec.core.options`).
     A classmethod `defaults(args)`, where there is one, returns the instance whose values are the flags' defaults.
     """
 
@@ -36,9 +36,6 @@ class Command(Protocol):
 
 
 COMMANDS: Registry[type[Command]] = Registry(kind="command", rows=targets_of("commands"))
-
-_LONGEST = 4000
-"""Maximum characters of an error message."""
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -105,7 +102,7 @@ def _reported(prog: str, run: Callable[[], int]) -> int:
     try:
         return run()
     except DemorecError as error:
-        tell(f"{prog}: {_shortened(error.of_flag() if isinstance(error, OptionError) else str(error))}")
+        tell(f"{prog}: {error.of_flag() if isinstance(error, OptionError) else error}")
         return error.exit_code
     except KeyboardInterrupt:
         tell(f"{prog}: interrupted.")
@@ -116,7 +113,7 @@ def _reported(prog: str, run: Callable[[], int]) -> int:
         lack = resource_error(error) or _missing_package(error)  # any line may run out of memory or file descriptors
         if lack is None and (line := own_line(error)):
             kind = f"{type(error).__name__}: {error}".rstrip(": ")
-            tell(f"{prog}: {_shortened(kind)} (the traceback is in {_keep_traceback()}); raised at {line}")
+            tell(f"{prog}: {kind} (the traceback is in {_keep_traceback()}); raised at {line}")
             return 1
         if lack is None:
             tell(f"{prog}: unexpected {type(error).__name__}, please report it with this file: {_keep_traceback()}")
@@ -141,11 +138,6 @@ def _missing_package(error: Exception) -> DemorecError | None:
     name = error.name.partition(".")[0]
     package = _DISTRIBUTIONS.get(name, name)
     return MissingDependencyError("This command", package, f"pip install {package}")
-
-
-def _shortened(text: str) -> str:
-    """Shorten a sentence in the middle if it quotes a file at great length."""
-    return text if len(text) <= _LONGEST else f"{text[: _LONGEST * 3 // 4]} ... {text[-_LONGEST // 4 :]}"
 
 
 def _keep_traceback() -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Any, ClassVar
+from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 from tyro.constructors import MISSING_NONPROP
@@ -12,6 +12,7 @@ from tyro.constructors import MISSING_NONPROP
 from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.cli.shared.paths import MappingFile, Readable, reading, refuse_inside, tell_incomplete
 from demorec.core.errors import ConfigError
+from demorec.core.options import Rare
 from demorec.core.replacing import Target
 from demorec.core.tables import EXPORTERS
 from demorec.datasets.options import CommonOptions, ExportReport
@@ -32,30 +33,11 @@ class Export:
       demorec export hdf5 recordings/cubes --out cubes.hdf5 --action ee_delta
     """
 
-    rare_flags: ClassVar[frozenset[str]] = frozenset(
-        {
-            "mapping",
-            "corrected_only",
-            "allow_duplicates",
-            "workers",
-            "license",
-            "data_files_mb",
-            "video_files_mb",
-            "files_per_chunk",
-            "calibration",
-            "motor_units",
-            "intervention",
-            "public",
-            "boxes",
-            "progress",
-            "depth",
-        }
-    )
     format: Annotated[Positional[str], arg(metavar="FORMAT", help=f"One of: {', '.join(EXPORTERS.names())}.")]
     sources: Readable
     out: Target
     """Folder or file to create."""
-    mapping: MappingFile = None
+    mapping: Rare[MappingFile] = None
     options: Annotated[CommonOptions, arg(name="")] = field(default_factory=CommonOptions)
     """Options of the export."""
 

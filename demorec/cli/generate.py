@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import dataclasses
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import arg
 
@@ -18,15 +17,15 @@ from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import GenerateConfig, read_toml
 from demorec.core.errors import ConfigError
 from demorec.core.files import Closing
-from demorec.core.plain import from_plain, to_plain
+from demorec.core.options import Rare
+from demorec.core.plain import from_plain, plain_differences, to_plain
 from demorec.core.registry import nearest_match
-from demorec.episode.variation import Ranges
 from demorec.generate.options import RunObserver, RunOptions
 from demorec.runs.run_file import RUN_NAME
 
 if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
-    from demorec.runs.run_file import Attempt, RunFile
+    from demorec.runs.run_file import Attempt, GeneratedRun
 
 
 _PLACED = re.compile(r"(?:^|(?<=; ))(.*?) @ [\w.]*?(\w+)(?=$|; )")
@@ -49,50 +48,17 @@ class Generate:
       generate-dataset --config cubes/run.json --out again   (compares bit for bit)
     """
 
-    rare_flags: ClassVar[frozenset[str]] = frozenset(
-        {
-            *(each.name for each in dataclasses.fields(Ranges)),
-            "deep_every",
-            "check",
-            "address",
-            "cpus_per_worker",
-            "gpus_per_worker",
-            "recycle_after",
-            "repo_id",
-            "export",
-            "fixed",
-            "physics_hz",
-            "fps",
-            "renderer",
-            "antialias",
-            "depth",
-            "segmentation",
-            "object_split",
-            "split",
-            "sampling",
-            "sampling_block",
-            "joint_rate",
-            "max_attempts",
-            "max_episode_seconds",
-            "gop",
-            "crf",
-            "preset",
-            "jpeg_quality",
-            "allow",
-        }
-    )
     config: Path | None = None
-    """TOML file of options (num_episodes = 50); or a run's run.json, a dataset's folder or a recording, whose run is
-    made again and compared with it."""
-    allow: Allow = ()
-    """Module or package of your own that may be imported for tasks, robots and cameras named by --config's run, dataset
-    or recording.
+    """TOML file of options (num_episodes = 50); or the run.json of a run, or a recording, to make again and compare."""
+    allow: Rare[Allow] = ()
+    """Module or package of your own that may be imported for tasks, robots and cameras named by --config's run or
+    recording.
     """
     options: Annotated[RunOptions, arg(name="run")] = field(default_factory=RunOptions)
     """Options of execution; they do not affect the data."""
-    check: bool = True
+    check: Rare[bool] = True
     """Check run, recordings and dataset at the end, without decoding images (see demorec check)."""
-    deep_every: int = 50
+    deep_every: Rare[int] = 50
     """At the end, generate the first episode and one in N again from config and seed, and compare every number and
     image with the recording (demorec check --deep: all episodes); 0: none.
     """
@@ -139,11 +105,7 @@ class Generate:
             return 130
         export, report, checked = None, None, None
         with RunProgress() as progress, terminate_as_interrupt():
-            if original is not None and original.export is not None:
-                from demorec.generate.reproduce import export_as_original
-
-                export_as_original(original, result)
-            elif options.export and result.run.successes:
+            if options.export and result.run.successes:
                 from demorec.generate.export_step import export_run
 
                 assert options.repo_id is not None
@@ -163,7 +125,7 @@ class Generate:
         return 1 if result.run.given_up or has_failed else 0
 
     def _original(self) -> Original | None:
-        """Read the run, dataset or recording that --config names; None without one.
+        """Read the run or recording that --config names; None without one.
 
         Raises:
             ConfigError: It cannot be generated again, or flags ask for other episodes or allow unneeded modules.
@@ -171,9 +133,8 @@ class Generate:
         """
         if self.config is None or not _is_original(self.config):
             if self.allow:
-                raise ConfigError("--allow is for a --config that names a run, dataset or recording: leave it out.")
+                raise ConfigError("--allow is for a --config that names a run or recording: leave it out.")
             return None
-        from demorec.core.own_versions import plain_differences
         from demorec.generate.reproduce import read_original
 
         asked = {**to_plain(self.episodes), "num_episodes": self.options.num_episodes}
@@ -189,7 +150,7 @@ class Generate:
 
 
 def _is_original(path: Path) -> bool:
-    """Check whether --config names a run, dataset or recording and not a TOML file of options."""
+    """Check whether --config names a run or recording and not a TOML file of options."""
     return path.is_dir() or path.name == RUN_NAME or path.suffix == ".mcap"
 
 
@@ -224,17 +185,17 @@ class RunProgress(RunObserver, Closing):
         """Show the verification of existing recordings."""
         self.show("verifying", done, total)
 
-    def show(self, title: str, done: int, total: int, *, unit: str = "episode", at_once: int = 1) -> None:
+    def show(self, title: str, done: int, total: int, *, unit: str = "episode") -> None:
         """Show the state of an activity; another one than before gets a new bar."""
         if self._bar is None or title != self._title:
             self.close()
             self._title = title
-            self._bar = ProgressBar(title, total=total, done=done, unit=unit, at_once=at_once)
+            self._bar = ProgressBar(title, total=total, done=done, unit=unit)
         self._bar.set(done)
 
-    def started(self, run: RunFile, workers: int) -> None:
+    def started(self, run: GeneratedRun, workers: int) -> None:
         """Show that the work begins."""
-        self.show("generating", len(run.successes), run.num_episodes, at_once=workers)
+        self.show("generating", len(run.successes), run.num_episodes)
 
     def ended(self, attempt: Attempt) -> None:
         """Show that an attempt has ended."""

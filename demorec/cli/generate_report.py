@@ -14,7 +14,7 @@ from demorec.cli.shared.output import aligned, counted, say, size_in_words, tell
 from demorec.core.processes import available_cores
 from demorec.core.replacing import shown
 from demorec.generate.options import RunResult
-from demorec.runs.run_file import DATASET, EPISODES, UNFINISHED, ExportRecord, RunFile
+from demorec.runs.run_file import DATASET, EPISODES, UNFINISHED, ExportRecord, GeneratedRun
 
 if TYPE_CHECKING:
     from demorec.generate.reproduce import Original
@@ -22,15 +22,9 @@ if TYPE_CHECKING:
 
 def check_run(result: RunResult, *, deep_every: int = 0, progress: Callable[[int, int], None]) -> tuple[str, list[str]]:
     """Run every check of the run, its recordings and its dataset that needs no decoded images, for the requested
-    episodes.
+    episodes; make the first and one in `deep_every` again and compare.
 
-    Args:
-        result: Result of the run.
-        deep_every: Interval N at which episodes are generated again, starting with the first; 0 for none.
-        progress: Called with the number of finished items and the total.
-
-    Returns:
-        The entry for the closing table, and one line for each failed check.
+    Returns the entry for the closing table, and one line for each failed check.
     """
     from demorec.check.report import CheckOptions, check_subjects, find_subjects, prove, useful_workers
 
@@ -141,7 +135,7 @@ def _program(name: str) -> str:
     return name if shutil.which(name) else str(Path(sys.executable).with_name(name))
 
 
-def _failures(run: RunFile) -> str:
+def _failures(run: GeneratedRun) -> str:
     causes = Counter(f"{a.phase}: {a.reason}" for a in run.failures)
     if not causes:
         return ""

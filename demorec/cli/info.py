@@ -10,20 +10,27 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demorec.cli.shared.output import aligned, counted, say, say_json, size_in_words
-from demorec.cli.shared.paths import MappingFile, NamedByFlags, Readable, RoleFlags, need_paths, reading
+from demorec.cli.shared.paths import (
+    MappingFile,
+    NamedByFlags,
+    Readable,
+    RoleFlags,
+    need_paths,
+    reading,
+    tell_unfinished,
+)
 from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.core.extension import reader_rows
 from demorec.datasets.lerobot.paths import INFO_PATH
 from demorec.episode.element_names import is_numbered
 from demorec.episode.features import IMAGE_PREFIX
-from demorec.episode.simulated import simulation_facts
-from demorec.runs.find import Found, expect, find
+from demorec.runs.find import expect, find
 from demorec.runs.foreign import dropped_by_import
 
 if TYPE_CHECKING:
     from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.episode.roles import NamedRoles, Roles
-    from demorec.runs.run_file import RunFile
+    from demorec.runs.run_file import GeneratedRun, RunFile
 
 Described = tuple[dict[str, Any], list[str]]
 """Plain data for --json, and lines for the terminal."""
@@ -53,12 +60,14 @@ class Info:
     def run(self) -> int:
         """Read and print; 1 if one of several paths cannot be read."""
         need_paths(self.paths, "info")
+        tell_unfinished(self.paths)
         named = self.roles.named
-        described = {} if self.mapping is not None or named else _described(self.paths)
-        others = [path for path in self.paths if path not in described]
+        paths = [file for path in self.paths for file in _files_in(path)]
+        described = {} if self.mapping is not None or named else _described(paths)
+        others = [path for path in paths if path not in described]
         with reading(others, self.mapping) as read:
             described |= {path: _describe(place, named) for path, place in zip(others, read, strict=True)}
-            found = [described[path] for path in self.paths]
+            found = [described[path] for path in paths]
             if self.json:
                 plain = [item for item, _ in found]
                 say_json(plain[0] if len(plain) == 1 else plain)
@@ -66,6 +75,12 @@ class Info:
                 for number, (_, lines) in enumerate(found):
                     say(*([""] if number else []), *lines)
         return 0
+
+
+def _files_in(path: Path) -> Sequence[Path]:
+    """Recordings of a folder that has no description of its own; the path itself for anything else."""
+    found = find(path)
+    return (*found.recordings, *found.failed) if found.kind in ("recordings", "evaluation") else (path,)
 
 
 def _described(paths: Sequence[Path]) -> dict[Path, Described]:
@@ -76,15 +91,9 @@ def _described(paths: Sequence[Path]) -> dict[Path, Described]:
 
 
 def _describe(path: Path, named: NamedRoles) -> Described:
-    found = expect(path, "recording", "run", "dataset", "recordings", "evaluation")
-    describe = {"recording": _recording, "run": _run, "dataset": _dataset}.get(found.kind)
-    if describe is None and named:
-        raise ConfigError(f"--state, --action and --gripper are for a recording, a run or a dataset: {path}")
-    plain, lines = _folder(found) if describe is None else describe(path, named)
-    if found.unfinished:
-        plain["unfinished"] = [str(file) for file in found.unfinished]
-        lines += ["", f"Left out: {found.left}."]
-    return plain, lines
+    kind = expect(path, "recording", "run", "dataset").kind
+    describe = {"recording": _recording, "run": _run, "dataset": _dataset}[kind]
+    return describe(path, named)
 
 
 def _recording(path: Path, named: NamedRoles) -> Described:
@@ -185,13 +194,13 @@ def _elements_in_words(names: Sequence[str]) -> str:
 
 def _run(path: Path, named: NamedRoles) -> Described:
     from demorec.episode.roles import SIMULATED_ROLES
-    from demorec.runs.run_file import load_any_run_file
+    from demorec.runs.run_file import GeneratedRun, load_any_run_file
 
     run = load_any_run_file(path)
     plain: dict[str, Any] = {"path": str(path), **run.plain(), "complete": run.is_complete, "digest": run.digest}
     left_out: list[dict[str, Any]] = []
     state = "complete" if run.is_complete else "unfinished"
-    if run.generation is None:
+    if not isinstance(run, GeneratedRun):
         state = f"external, {state}"
         roles, left_out = _roles_of_run(path, run, named), dropped_by_import(path)
         plain |= {"kind": "external run", "roles": _plain_roles(roles), "left_out": left_out}
@@ -201,7 +210,8 @@ def _run(path: Path, named: NamedRoles) -> Described:
     else:
         plain |= {"kind": "run", "config_digest": run.config_digest}
         content = _generated_facts(path, run)
-    frames, fps = sum(attempt.num_frames for attempt in run.attempts), run.fps or run.config.fps
+    frames = sum(attempt.num_frames for attempt in run.attempts)
+    fps = run.config.fps if isinstance(run, GeneratedRun) else run.fps
     facts = [
         ("run", f"{path} ({state})"),
         ("frames", f"{frames} ({frames / fps:.1f} s at {fps} Hz)"),
@@ -222,7 +232,7 @@ def _run(path: Path, named: NamedRoles) -> Described:
     return plain, lines
 
 
-def _generated_facts(path: Path, run: RunFile) -> Iterator[tuple[str, str]]:
+def _generated_facts(path: Path, run: GeneratedRun) -> Iterator[tuple[str, str]]:
     config = run.config
     yield "task", f"{config.task} with {config.robot}, seed {config.seed}"
     failed = f", {counted(len(run.failures), 'failed attempt')}" if run.failures else ""
@@ -366,22 +376,3 @@ def _feature_rows(folder: LeRobotFolder | None, info: Mapping[str, Any]) -> list
         unit = ", ".join(dict.fromkeys(filter(None, units.get(name, ())))) or unknown
         rows.append((role or _NO_ROLE, name, *types[name], _elements_in_words(column.elements), unit))
     return rows + [("", name, *kind, "", "") for name, kind in types.items() if name not in roles.of]
-
-
-def _folder(found: Found) -> Described:
-    from demorec.mcap import open_recording
-
-    rows = [("file", "task", "seed", "episode", "outcome", "frames", "size")]
-    items = []
-    for file in (*found.recordings, *found.failed):
-        with open_recording(file) as recording:
-            info, outcome = recording.info, recording.outcome
-            facts = simulation_facts(info)
-            task, seed = facts.get("task", "(external)"), str(facts.get("root_seed", ""))
-            success, frames = None if outcome is None else outcome.success, recording.num_frames
-        items.append({"path": str(file), "task": task, "success": success, "frames": frames})
-        word = "recovered" if outcome is None else _SUCCESS_WORDS[success]
-        numbers = str(info.episode_index), word, str(frames), size_in_words(file.stat().st_size)
-        rows.append((str(file.relative_to(found.path)), task, seed, *numbers))
-    plain = {"kind": "folder", "path": str(found.path), "recordings": items}
-    return plain, [f"{counted(len(items), 'recording')} in {found.path}", "", *aligned(rows)]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,9 +24,9 @@ from demorec.cli.shared.paths import (
     tell_incomplete,
     tell_unfinished,
 )
-from demorec.core.atomic import atomic_write, atomic_write_all
+from demorec.core.atomic import atomic_write
 from demorec.core.errors import ConfigError, check_option
-from demorec.core.replacing import IMAGE, RERUN_FILE, OptionalTarget, check_replaceable
+from demorec.core.replacing import IMAGE, RERUN_FILE, OptionalTarget
 from demorec.core.tables import RANKINGS
 from demorec.robots.assets import allow_models
 from demorec.runs.find import expect
@@ -110,12 +110,12 @@ class View:
             tell(f"Showing the first {_MOST} of {len(sources)} episodes; --episodes chooses others.")
             sources = sources[:_MOST]
         targets = [] if self.save is None else _numbered(self.save, len(sources))
-        self._check_targets(targets)
-        if targets:
-            self._save(sources, targets)
-            if self.screenshot is None:
-                return 0
+        refuse_inside(target for target in (*targets, self.screenshot) if target is not None)
         with self._image() as image, tempfile.TemporaryDirectory(prefix="demorec-view-") as folder:
+            if targets:
+                self._save(sources, targets)
+                if image is None:
+                    return 0
             shown = sources if image is None else sources[:1]
             return self._show(save_each(shown, Path(folder)), sources, image)
 
@@ -124,7 +124,9 @@ class View:
         from demorec.view.scene import save
 
         read = places_read(self.paths)
-        with atomic_write_all(targets, RERUN_FILE, overwrite=self.overwrite, sources=read) as parts:
+        with ExitStack() as stack:
+            writes = [atomic_write(target, RERUN_FILE, overwrite=self.overwrite, sources=read) for target in targets]
+            parts = [stack.enter_context(write) for write in writes]
             for source, part in zip(sources, parts, strict=True):
                 save(source, part)
         for source, target in zip(sources, targets, strict=True):
@@ -170,13 +172,6 @@ class View:
             if not target.absolute().parent.is_dir():
                 raise ConfigError(f"{flag}: folder {target.parent} is missing.")
 
-    def _check_targets(self, saved: Sequence[Path]) -> None:
-        """Refuse impossible targets before any work; those of --save are checked when they are opened."""
-        if self.screenshot is not None:
-            read = places_read(self.paths)
-            check_replaceable(self.screenshot, IMAGE, overwrite=self.overwrite, sources=read)
-        refuse_inside([*saved, *([] if self.screenshot is None else [self.screenshot])])
-
     def _show_rrd(self) -> int:
         others = [path for path in self.paths if path.suffix != ".rrd"]
         if others:
@@ -185,7 +180,7 @@ class View:
             raise ConfigError("An .rrd file is shown unchanged: --save and --episodes are for recordings.")
         for path in self.paths:
             expect(path, "rrd")
-        self._check_targets(())
+        refuse_inside([] if self.screenshot is None else [self.screenshot])
         with self._image() as image:
             return self._show(self.paths, (), image)
 

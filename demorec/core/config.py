@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from demorec.core.errors import ConfigError, OptionError, check_option, check_seed
+from demorec.core.options import Rare
 from demorec.core.plain import from_plain
 from demorec.core.registry import is_foreign, modules_of
 from demorec.episode.variation import PRESET_NAMES, Preset, Ranges
@@ -40,13 +41,13 @@ class VideoConfig:
 
     codec: Literal["h264", "av1", "jpeg"] = "h264"
     """h264: plays everywhere; av1: LeRobot's default, more CPU, larger with a short GOP; jpeg: single images."""
-    gop: int = 2
+    gop: Rare[int] = 2
     """Frames from one keyframe to the next; 2 is LeRobot's convention for fast random access."""
-    crf: int | None = None
+    crf: Rare[int | None] = None
     """Constant rate factor, lower is better (auto: 23 for h264, 30 for av1)."""
-    preset: str | None = None
+    preset: Rare[str | None] = None
     """Encoder preset (auto: veryfast for h264, 12 for av1); x264's names, or a number from 0 to 13 for av1."""
-    jpeg_quality: int = 90
+    jpeg_quality: Rare[int] = 90
     """Quality for --codec jpeg, 1 to 100, higher is better."""
 
     def validate(self) -> None:
@@ -66,15 +67,15 @@ class GenerateConfig:
 
     task: str = "pick_place"
     """Task of the robot: a name from `demorec list tasks`, or my_package.my_module:MyTask."""
-    fixed: bool = False
+    fixed: Rare[bool] = False
     """Use the task's single fixed layout instead of random ones, if it has one (tutorial)."""
     robot: str = "panda"
     """Robot arm: a name from `demorec list robots`, or my_package.my_module:MY_ARM."""
     seed: int = 0
     """Root seed of all randomness."""
-    fps: int = 30
+    fps: Rare[int] = 30
     """Frames (control steps) per second; must divide the physics rate."""
-    physics_hz: int = 240
+    physics_hz: Rare[int] = 240
     """Physics steps per second."""
     cameras: tuple[str, ...] = ("front", "wrist")
     """Names from `demorec list cameras`, or my_package.my_module:MY_CAMERA; or "none"."""
@@ -82,36 +83,36 @@ class GenerateConfig:
     """Image width in pixels; even."""
     height: int = 224
     """Image height in pixels; even."""
-    renderer: str = "raster"
+    renderer: Rare[str] = "raster"
     """A name from `demorec list renderers`."""
-    antialias: bool = True
+    antialias: Rare[bool] = True
     """Smooth edges (raster only)."""
-    depth: bool = False
+    depth: Rare[bool] = False
     """Record depth images as well."""
-    segmentation: bool = False
+    segmentation: Rare[bool] = False
     """Record segmentation images as well."""
     video: VideoConfig = field(default_factory=VideoConfig)
     """Video encoding."""
     variation: Preset = "mild"
     """How much episodes vary besides their layout: none; mild (action noise with clean labels); full (everything)."""
-    ranges: Ranges = field(default_factory=Ranges)
+    ranges: Rare[Ranges] = field(default_factory=Ranges)
     """Single ranges that override those of --variation (auto: those of --variation)."""
     objects: tuple[str, ...] = ()
     """Shelves to draw objects from: names from `demorec list objects`, my_module:MY_SHELF, or a folder of .obj and .stl
     files in metres, with a slash: ./my_meshes (auto: the task's own)."""
-    object_split: Literal["all", "train", "eval"] = "all"
+    object_split: Rare[Literal["all", "train", "eval"]] = "all"
     """train leaves out one shape in five of each kind; eval has only those."""
-    sampling: Literal["random", "sobol", "lhs"] = "random"
+    sampling: Rare[Literal["random", "sobol", "lhs"]] = "random"
     """How layouts cover the table: independently at random, or evenly by a Sobol sequence or Latin hypercubes."""
-    sampling_block: int = 50
+    sampling_block: Rare[int] = 50
     """Episodes per Latin hypercube."""
-    split: Literal["all", "train", "eval"] = "all"
+    split: Rare[Literal["all", "train", "eval"]] = "all"
     """train excludes a region and all seeds of eval; eval starts in that region."""
-    joint_rate: Literal["control", "physics"] = "control"
+    joint_rate: Rare[Literal["control", "physics"]] = "control"
     """Record joint states once per frame, or at every physics step."""
-    max_attempts: int = 3
+    max_attempts: Rare[int] = 3
     """Maximum number of scenes to try for an episode."""
-    max_episode_seconds: float = 60.0
+    max_episode_seconds: Rare[float] = 60.0
     """Simulated seconds after which an episode counts as failed."""
 
     def __post_init__(self) -> None:

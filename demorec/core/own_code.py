@@ -4,17 +4,12 @@ from __future__ import annotations
 
 import functools
 import linecache
-import re
 import sysconfig
 import traceback
 from pathlib import Path
 
 from demorec.core.errors import error_chain
 
-_FRAME = re.compile(r'^  File "([^"]+)", line (\d+), in ', re.MULTILINE)
-"""Frame in the text of a traceback, which is all that another process passes on."""
-_REMOTE = ("_RemoteTraceback", "RemoteTraceback")
-"""Errors of concurrent.futures and multiprocessing that hold such text."""
 _MAX_CODE = 120
 """Maximum characters of the line that are shown."""
 
@@ -29,8 +24,6 @@ def own_line(error: BaseException) -> str:
         if isinstance(cause, SyntaxError) and cause.filename and _is_own(cause.filename):
             return _shown(cause.filename, cause.lineno or 0)
         frames = [(frame.filename, frame.lineno or 0) for frame in traceback.extract_tb(cause.__traceback__)]
-        if type(cause).__name__ in _REMOTE:
-            frames += [(file, int(number)) for file, number in _FRAME.findall(str(cause))]
         for file, number in reversed(frames):
             if _is_own(file):
                 return _shown(file, number)

@@ -12,7 +12,6 @@ import importlib.metadata
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError
 from demorec.core.registry import import_root, is_allowed, is_foreign, module_file
@@ -58,45 +57,6 @@ def version_differences(there: Mapping[str, str], here: Mapping[str, str]) -> tu
         else:
             lines.append(f"version of {name} is {old} there and {new} here")
     return tuple(lines)
-
-
-def differences(
-    there: Mapping[str, Any],
-    there_versions: Mapping[str, str],
-    here: Mapping[str, Any],
-    here_versions: Mapping[str, str],
-) -> tuple[str, ...]:
-    """One line per difference between two configs, as plain data, and their versions."""
-    return (*plain_differences(there, here), *version_differences(there_versions, here_versions))
-
-
-def plain_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:
-    """One line per difference between two configs as plain data."""
-    old, new = _flat(there), _flat(here)
-    return tuple(
-        f"{key} is {_spelt(old, key)} there and {_spelt(new, key)} here"
-        for key in dict.fromkeys((*old, *new))
-        if _spelt(old, key) != _spelt(new, key)
-    )
-
-
-def _flat(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, value in plain.items():
-        if isinstance(value, Mapping):
-            flat.update(_flat(value, f"{prefix}{key} "))
-        else:
-            flat[prefix + key] = value
-    return flat
-
-
-def _spelt(values: Mapping[str, Any], key: str) -> str:
-    if key not in values:
-        return "nothing"
-    value = values[key]
-    if isinstance(value, list | tuple):
-        return " ".join(str(item) for item in value) or "none"
-    return str(value)
 
 
 def changed_sources(versions: Mapping[str, str], allowed: Collection[str]) -> tuple[str, ...]:

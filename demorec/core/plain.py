@@ -177,3 +177,32 @@ def from_json[T](text: str, cls: type[T]) -> T:
 def digest(value: object) -> str:
     """First 16 hex digits of the SHA-256 of the canonical JSON."""
     return hashlib.sha256(to_json(value).encode()).hexdigest()[:16]
+
+
+def plain_differences(there: Mapping[str, Any], here: Mapping[str, Any]) -> tuple[str, ...]:
+    """One line per difference between two configs as plain data."""
+    old, new = _flat(there), _flat(here)
+    return tuple(
+        f"{key} is {_spelt(old, key)} there and {_spelt(new, key)} here"
+        for key in dict.fromkeys((*old, *new))
+        if _spelt(old, key) != _spelt(new, key)
+    )
+
+
+def _flat(plain: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in plain.items():
+        if isinstance(value, Mapping):
+            flat.update(_flat(value, f"{prefix}{key} "))
+        else:
+            flat[prefix + key] = value
+    return flat
+
+
+def _spelt(values: Mapping[str, Any], key: str) -> str:
+    if key not in values:
+        return "nothing"
+    value = values[key]
+    if isinstance(value, list | tuple):
+        return " ".join(str(item) for item in value) or "none"
+    return str(value)

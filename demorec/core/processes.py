@@ -21,8 +21,6 @@ from typing import Any, NoReturn
 from demorec.core.limited import end_with_parent, remove_limits
 from demorec.core.streams import drop_output
 
-_LATER_S = 0.02
-"""Delay before repeating an interrupt that arrived where no exception can be raised."""
 _hiding = threading.Lock()
 _starting = threading.Lock()
 
@@ -50,7 +48,6 @@ class _Process(SpawnProcess):
         try:
             signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
             threading.Thread(target=_end_with_parent, daemon=True).start()
-            sys.unraisablehook = _interrupt_again
             super().run()
         except KeyboardInterrupt:  # Ctrl-C reaches the whole process group; the parent reports it
             os._exit(130)
@@ -160,16 +157,6 @@ def start_program(command: Sequence[str], **options: Any) -> subprocess.Popen[An
 
     parent = os.getpid()
     return subprocess.Popen(command, stdin=subprocess.DEVNULL, preexec_fn=prepare, **options)  # noqa: PLW1509 (two system calls)
-
-
-def _interrupt_again(args: sys.UnraisableHookArgs) -> None:
-    """Python prints and ignores a Ctrl-C inside a destructor or a callback: repeat it afterwards."""
-    if issubclass(args.exc_type, KeyboardInterrupt):
-        again = threading.Timer(_LATER_S, os.kill, (os.getpid(), signal.SIGINT))
-        again.daemon = True
-        again.start()
-    else:
-        sys.__unraisablehook__(args)
 
 
 def _end_with_parent() -> None:

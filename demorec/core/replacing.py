@@ -2,8 +2,8 @@
 
 A command replaces only a file or folder that it recognises, by its content, as the kind that it makes, and only if the
 user asks for it. It never replaces one of its sources, a folder that a person lives or works in, or a folder with
-foreign content. The old content stays complete until the new one is complete (`demorec.core.atomic`); the parts of a
-run are moved aside first and deleted last.
+foreign content. The old content stays complete until the new one is complete (`demorec.core.atomic`), except that of a
+run or an evaluation, which is deleted before the new one begins.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ import errno
 import os
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, get_args, get_type_hints
@@ -23,11 +22,6 @@ from demorec.core.files import MCAP_MAGIC, RERUN_MAGICS, read_json_limited
 
 _SHOWN = 5
 """Maximum foreign files in an error message."""
-_ASIDE = ".demorec-replaced"
-_MARK = "what-this-is.txt"
-_MARK_TEXT = (
-    "Content that --overwrite replaces. demorec deletes this folder once the new content is complete, or restores it.\n"
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -162,77 +156,16 @@ def json_object(path: Path) -> dict[str, Any]:
     return found if isinstance(found, dict) else {}
 
 
-@contextmanager
-def replaced_parts(folder: Path, names: Sequence[str]) -> Iterator[None]:
-    """Move parts of a folder aside while their replacements are made; delete them at the end.
-
-    An error restores them. A crash leaves them in a separate folder, for `settle_parts`.
-
-    Args:
-        folder: Folder of the parts.
-        names: Names of files and folders, existing or not. The presence of the first one means that the replacements
-        are complete: it is moved away first and restored last.
-
-    Raises:
-        DemorecError: The folder cannot be written to.
-    """
-    aside = folder / _ASIDE
+def delete_parts(folder: Path, names: Sequence[str]) -> None:
+    """Delete parts of a folder, existing or not, in this order; DemorecError if one cannot be deleted."""
     try:
-        aside.mkdir()
-        (aside / _MARK).write_text(_MARK_TEXT)
+        for part in (folder / name for name in names):
+            if part.is_dir() and not part.is_symlink():
+                shutil.rmtree(part)
+            else:
+                part.unlink(missing_ok=True)
     except OSError as error:
-        _settle(folder, (), is_new_complete=False)
         raise resource_error(error) or write_error("The folder", error, folder, DemorecError) from error
-    try:
-        for name in names:
-            if os.path.lexists(folder / name):
-                (folder / name).rename(aside / name)
-        yield
-    except BaseException:
-        _settle(folder, names, is_new_complete=False)
-        raise
-    _settle(folder, names, is_new_complete=True)
-
-
-def check_unsettled_parts(folder: Path, names: Sequence[str]) -> bool:
-    """Whether a crash within `replaced_parts` left a marked folder for `settle_parts`.
-
-    Raises:
-        ConfigError: A folder with that name has no mark of demorec.
-    """
-    aside = folder / _ASIDE
-    if not os.path.lexists(aside):
-        return False
-    found = {path.name for path in aside.iterdir()} if aside.is_dir() and not aside.is_symlink() else {"no folder"}
-    if not found <= {_MARK, *names} or (found and not (aside / _MARK).is_file()):
-        raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {aside}")
-    return bool(found)
-
-
-def settle_parts(folder: Path, names: Sequence[str]) -> None:
-    """Finish `replaced_parts` after a crash: restore the old parts, or delete them if the new ones are complete."""
-    check_unsettled_parts(folder, names)
-    _settle(folder, names, is_new_complete=os.path.lexists(folder / names[0]))
-
-
-def _settle(folder: Path, names: Sequence[str], *, is_new_complete: bool) -> None:
-    """Delete the old parts or restore them, the first one last; then remove the folder that held them."""
-    aside = folder / _ASIDE
-    for name in reversed(names):
-        old = aside / name
-        if not os.path.lexists(old):
-            continue
-        if not is_new_complete:
-            if _is_empty(folder / name):
-                (folder / name).rmdir()
-            old.rename(folder / name)
-        elif old.is_dir() and not old.is_symlink():
-            shutil.rmtree(old)
-        else:
-            old.unlink()
-    if aside.is_dir():
-        (aside / _MARK).unlink(missing_ok=True)  # last: it marks the folder as demorec's
-        aside.rmdir()
 
 
 _TARGET = object()

@@ -33,19 +33,6 @@ def markdown(text: str) -> str:
     return _MARKS.sub(r"\\\g<0>", printable(text)).translate(_ENTITIES)
 
 
-def display_width(text: str) -> int:
-    """Terminal columns of a printable text: wide characters (CJK) take two, combining marks none."""
-    if text.isascii():
-        return len(text)
-    return sum(_columns(character) for character in text)
-
-
-def _columns(character: str) -> int:
-    if unicodedata.category(character) in ("Mn", "Me"):
-        return 0
-    return 2 if unicodedata.east_asian_width(character) in "WF" else 1
-
-
 def _spelt(character: str) -> str:
     if unicodedata.category(character) not in _INVISIBLE_KINDS:
         return character

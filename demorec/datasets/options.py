@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from demorec.core.errors import ConfigError, OptionError
+from demorec.core.options import Rare
 from demorec.episode.features import ACTION, STATE, ActionKind
 
 ProgressCallback = Callable[[int, int], None]
@@ -21,7 +22,7 @@ class CommonOptions:
 
     episodes: str = ""
     """Episodes of each run to export, by number: 0:100, ::2, 3,5,8:10; all by default."""
-    corrected_only: bool = False
+    corrected_only: Rare[bool] = False
     """Among episodes that a policy began, export only those that the expert corrected (demorec correct); demonstrations
     are always exported.
     """
@@ -38,7 +39,7 @@ class CommonOptions:
     always included. Fewer features make training faster. Simulated episodes have optional ones: command, and sensor
     values such as observation.effort (docs/dataset-format.md).
     """
-    depth: bool = False
+    depth: Rare[bool] = False
     """Add depth images if the recordings have them."""
     fps: int | None = None
     """Frames per second of the dataset; must divide the recordings' rate; frames in between are left out."""

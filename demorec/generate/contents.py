@@ -15,10 +15,10 @@ from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, RecordingError, describe_error, resource_error, without_path
 from demorec.core.files import free_name, open_locked, sha256_of, sync_path
-from demorec.core.own_versions import differences
-from demorec.core.plain import to_plain
+from demorec.core.own_versions import version_differences
+from demorec.core.plain import plain_differences, to_plain
 from demorec.core.replacing import RECORDING, ReplaceableKind, files_below, json_object
-from demorec.datasets.lerobot.paths import DATASET, is_dataset_file
+from demorec.datasets.lerobot.paths import DATASET
 from demorec.datasets.lerobot.sidecar import CONFIGS_PATH
 from demorec.runs.run_file import DATASET as DATASET_FOLDER
 from demorec.runs.run_file import (
@@ -27,23 +27,18 @@ from demorec.runs.run_file import (
     RUN_NAME,
     UNFINISHED,
     Attempt,
-    RunFile,
+    GeneratedRun,
     recording_name,
 )
 
-PARTS = (RUN_NAME, EPISODES, FAILED, UNFINISHED, DATASET_FOLDER)
-"""All entries that a run writes; anything else in its folder is never touched."""
+PARTS = (DATASET_FOLDER, FAILED, EPISODES, RUN_NAME)
+"""Entries of a run that --overwrite deletes, run.json, which the others are recognised by, last."""
 
-_NAME = r"episode_\d{6,}(\.attempt_\d+)?\.mcap"
-_RECORDING = re.compile(_NAME)
+_RECORDING = re.compile(r"episode_\d{6,}(\.attempt_\d+)?\.mcap")
 _SCRATCH = re.compile(r".+-\d+-\d+")  # worker folder: host, process, number
-_PART = re.compile(rf"[^/]+-\d+-\d+/{_NAME}(\.part)?")
-_RECORDING_ASIDE = re.compile(rf"{_NAME}(\.\d+)?")  # damaged, or of another run
-_REPORT = re.compile(r"error_episode_\d+\.txt")
-_SET_ASIDE_DATASET = re.compile(rf"({DATASET_FOLDER}(?:\.\d+)?)/(.*)")
 
 
-def clear_scratch(folder: Path, run: RunFile) -> None:
+def clear_scratch(folder: Path, run: GeneratedRun) -> None:
     """Remove the remains of lost workers' attempts that have been made since.
 
     Anything else in unfinished/, or being written, stays.
@@ -96,16 +91,8 @@ def is_dataset_of_run(dataset: Path, config_digest: str) -> bool:
     )
 
 
-def check_dataset_place(folder: Path, run: RunFile) -> None:
-    """Raise if a run's dataset cannot be put into its place. Only reads.
-
-    Args:
-        folder: Folder of the run.
-        run: Known state of the run; without a dataset record if run.json was lost.
-
-    Raises:
-        ConfigError: A dataset that the run did not make, or a broken link, exists there.
-    """
+def check_dataset_place(folder: Path, run: GeneratedRun) -> None:
+    """Raise ConfigError if a dataset that the run did not make, or a broken link, is in its dataset's place."""
     dataset = folder / DATASET_FOLDER
     if not os.path.lexists(dataset):
         return
@@ -144,22 +131,11 @@ def _strangers(folder: Path) -> list[str]:
         for place in (EPISODES, FAILED)
         for name in foreign_recordings(folder, place, known=known, is_ours=_may_be_generated)
     ]
-    if (folder / UNFINISHED).is_symlink():
-        found.append(UNFINISHED)
-    else:
-        found += [f"{UNFINISHED}/{name}" for name in files_below(folder / UNFINISHED) if not _is_unfinished(name)]
     dataset = folder / DATASET_FOLDER
     if os.path.lexists(dataset) and not is_dataset_of_run(dataset, str(run.get("config_digest"))):
         inside = () if dataset.is_symlink() else DATASET.strangers(dataset)
         found += [f"{DATASET_FOLDER}/{name}" for name in inside] or [DATASET_FOLDER]
     return found
-
-
-def _is_unfinished(name: str) -> bool:
-    dataset = _SET_ASIDE_DATASET.fullmatch(name)
-    if dataset:
-        return is_dataset_file(dataset[2])
-    return any(pattern.fullmatch(name) for pattern in (_PART, _RECORDING_ASIDE, _REPORT))
 
 
 RUN = ReplaceableKind(name="a run of generate-dataset", is_folder=True, recognises=_recognises, strangers=_strangers)
@@ -174,19 +150,13 @@ def recordings_of(folder: Path) -> list[Path]:
 
 
 def survey(
-    folder: Path, run: RunFile, *, inspect: Inspector, progress: Callable[[int, int], None]
+    folder: Path, run: GeneratedRun, *, inspect: Inspector, progress: Callable[[int, int], None]
 ) -> tuple[list[Attempt], dict[str, str]]:
     """Verify every recording of a folder against run.json, or read it in full if run.json does not list it.
 
     Damaged or unfinished recordings, those of other runs and other entries are moved to unfinished/; nothing is
-    deleted.
-
-    Returns:
-        The attempts with intact recordings, and failed ones without a recording; and file -> reason why it was moved to
-        unfinished/.
-
-    Raises:
-        ResourceError: This machine cannot read one of them now; nothing is moved.
+    deleted. Returns the attempts with intact recordings, and failed ones without a recording; and file -> reason why it
+    was moved. Raises ResourceError, and moves nothing, if this machine cannot read one of them now.
     """
     known = {a.file: a for a in run.known if a.file}
     kept = [a for a in run.known if not a.file]
@@ -211,12 +181,13 @@ def survey(
     return kept, set_aside
 
 
-def _adopt(path: Path, run: RunFile, inspect: Inspector) -> Attempt:
+def _adopt(path: Path, run: GeneratedRun, inspect: Inspector) -> Attempt:
     line, config, versions = inspect(path)
     place = EPISODES if line.success else FAILED
     name = recording_name(line.episode_index, line.attempt, success=line.success)
     if (path.parent.name, path.name) != (place, name):
         raise DemorecError(f"it contains episode {line.episode_index}, attempt {line.attempt}")
-    if different := differences(config, versions, to_plain(run.config), run.versions):
+    different = plain_differences(config, to_plain(run.config)) + version_differences(versions, run.versions)
+    if different:
         raise DemorecError(f"it is of another run ({'; '.join(different)})")
     return replace(line, file=f"{place}/{name}")

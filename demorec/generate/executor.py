@@ -24,8 +24,6 @@ from pathlib import Path
 from types import FrameType
 from typing import Protocol, Self
 
-import psutil
-
 from demorec.core.config import EpisodePlan
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, error_chain
 from demorec.core.own_code import own_line
@@ -55,7 +53,6 @@ class Made:
 
     plan: EpisodePlan
     attempt: Attempt
-    peak_bytes: int
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -181,16 +178,7 @@ def attempt_episode(maker: str, plan: EpisodePlan, folder: Path) -> Made | Raise
             exit_code=error.exit_code if isinstance(error, DemorecError) else 0,
             own_line=own_line(error),
         )
-    return Made(plan=plan, attempt=attempt, peak_bytes=peak_memory())
-
-
-def peak_memory() -> int:
-    """Return the largest resident size of this process, bytes (the current one if the system does not store it)."""
-    with suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmHWM:"):
-                return int(line.split()[1]) * 1024
-    return int(psutil.Process().memory_info().rss)
+    return Made(plan=plan, attempt=attempt)
 
 
 class _Interrupted(BaseException):
@@ -206,14 +194,7 @@ class _Worker:
 
 
 class LocalExecutor(Executor):
-    """A fixed number of worker processes, started on demand, replaced when they die or reach their number of attempts.
-
-    Args:
-        maker: Function that runs a plan, as "module:function".
-        folder: Folder of the run.
-        workers: Number of processes.
-        recycle_after: Attempts after which a worker is replaced.
-    """
+    """A fixed number of processes, started on demand, replaced when they die or after `recycle_after` attempts."""
 
     def __init__(self, maker: str, folder: Path, *, workers: int, recycle_after: int) -> None:
         self._maker = maker

@@ -19,7 +19,7 @@ from demorec.datasets.lerobot.paths import CARD_PATH
 from demorec.datasets.lerobot.paths import DATASET as DATASET_KIND
 from demorec.datasets.options import ExportReport
 from demorec.generate.contents import check_dataset_place, is_dataset_of_run
-from demorec.runs.run_file import DATASET, UNFINISHED, ExportRecord, RunFile, load_run_file, save_run_file
+from demorec.runs.run_file import DATASET, UNFINISHED, ExportRecord, GeneratedRun, load_run_file, save_run_file
 
 
 def export_run(
@@ -35,14 +35,7 @@ def export_run(
     that it did not make is left alone. One that it made but that is damaged, was changed, or contains other files, is
     moved to unfinished/ and made again. So is an edited card.
 
-    Args:
-        folder: Folder of the run.
-        repo_id: Name of the dataset.
-        progress: Called after every recording.
-        says: Receives messages for the user.
-
-    Returns:
-        The dataset's record in run.json, and the export's report if it was made now.
+    Returns the dataset's record in run.json, and the export's report if it was made now.
 
     Raises:
         ConfigError: A foreign dataset, or a broken link, is in the way.
@@ -64,7 +57,7 @@ def export_run(
             says(f"{DATASET}/ is missing; it is made again.")
         record = ExportRecord(run_digest=run.digest, repo_id=repo_id)
         # Saved first: after a crash in between, the dataset is known to be ours.
-        save_run_file(run.with_generation(export=record), folder)
+        save_run_file(replace(run, export=record), folder)
         start = time.process_time()
         wanted = f":{run.num_episodes}" if run.beyond else ""
         report = export_lerobot(
@@ -74,11 +67,11 @@ def export_run(
             progress=progress,
         )
         record = replace(record, dataset_digest=report.digest, seconds=round(time.process_time() - start, 3))
-        save_run_file(run.with_generation(export=record), folder)
+        save_run_file(replace(run, export=record), folder)
         return record, report
 
 
-def _is_as_made(dataset: Path, record: ExportRecord, run: RunFile) -> bool:
+def _is_as_made(dataset: Path, record: ExportRecord, run: GeneratedRun) -> bool:
     """Check that a dataset is complete and matches the run's record, by reading all its files."""
     if not record.dataset_digest:  # the export was killed, before or after the dataset took its place
         return is_dataset_of_run(dataset, run.config_digest)

@@ -6,7 +6,7 @@ import os
 import platform
 import time
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,19 +20,11 @@ from demorec.core.errors import (
     write_error,
 )
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
-from demorec.core.own_versions import differences
-from demorec.core.plain import from_plain, to_plain
+from demorec.core.own_versions import version_differences
+from demorec.core.plain import from_plain, plain_differences, to_plain
 from demorec.core.processes import available_cores
-from demorec.core.replacing import (
-    check_replaceable,
-    check_unsettled_parts,
-    files_below,
-    obstacle,
-    replaced_parts,
-    settle_parts,
-)
+from demorec.core.replacing import check_replaceable, delete_parts, files_below, obstacle
 from demorec.generate.contents import PARTS, RUN, Inspector, check_dataset_place, clear_scratch, recordings_of, survey
-from demorec.generate.executor import peak_memory
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.runs.run_file import (
     EPISODES,
@@ -41,8 +33,7 @@ from demorec.runs.run_file import (
     UNFINISHED,
     Attempt,
     DamagedRunFileError,
-    Generation,
-    RunFile,
+    GeneratedRun,
     RunSession,
     load_run_file,
     refuse_strangers,
@@ -62,21 +53,14 @@ def _machine() -> dict[str, str]:
 
 
 class RunFolder:
-    """An opened run. Lines are saved at intervals; one lost in a crash is read back from its recording.
+    """An opened run. Lines are saved at intervals; one lost in a crash is read back from its recording."""
 
-    Attributes:
-        path: Path of the folder.
-        run: Known state of the run.
-        lost_workers: Workers lost in this session.
-    """
-
-    def __init__(self, path: Path, run: RunFile) -> None:
+    def __init__(self, path: Path, run: GeneratedRun) -> None:
         self.path = path
         self.run = run
         self.lost_workers = 0
         self._attempts = {(a.episode_index, a.attempt): a for a in run.known}
         self._made: list[Attempt] = []
-        self._peak_worker_bytes = 0
         self._earlier = run.sessions
         self._session = RunSession(started=utc_now(), machine=_machine())
         self._has_session = False
@@ -96,11 +80,10 @@ class RunFolder:
         self._session = replace(self._session, executor=executor, workers=workers)
         self.save()
 
-    def add(self, attempt: Attempt, *, peak_worker_bytes: int) -> None:
+    def add(self, attempt: Attempt) -> None:
         """Add a line; saves if the last save is old enough to cost little."""
         self._attempts[attempt.episode_index, attempt.attempt] = attempt
         self._made.append(attempt)
-        self._peak_worker_bytes = max(self._peak_worker_bytes, peak_worker_bytes)
         if time.monotonic() - self._saved_at > max(1.0, 50 * self._save_seconds):
             self.save()
 
@@ -116,13 +99,8 @@ class RunFolder:
     def save(self) -> None:
         """Write run.json; GenerationError if that fails."""
         start = time.monotonic()
-        self._session = replace(
-            self._session,
-            wall_seconds=round(start - self._started, 3),
-            lost_workers=self.lost_workers,
-            peak_worker_bytes=self._peak_worker_bytes,
-            peak_driver_bytes=peak_memory(),
-        )
+        wall_seconds = round(start - self._started, 3)
+        self._session = replace(self._session, wall_seconds=wall_seconds, lost_workers=self.lost_workers)
         sessions = (*self._earlier, self._session) if self._has_session else self._earlier
         self.run = replace(self.run, sessions=sessions).with_attempts(self._attempts.values())
         try:
@@ -163,30 +141,25 @@ def open_run(
     """
     assert options.out is not None
     path = options.out.absolute()
-    asked = RunFile(
-        generation=Generation(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
-    )
+    asked = GeneratedRun(config=config, versions=deciding_versions(config), num_episodes=options.num_episodes)
     with _told_as_unusable(path):
-        if not check_unsettled_parts(path, PARTS):
-            _check_request(path, asked, options, inspect=inspect)
+        _check_request(path, asked, options, inspect=inspect)
     make_folder(path)
     with run_lock(path):  # from here on no other process changes it, so it is examined again
-        settle_parts(path, PARTS)
-        replaces = _check_request(path, asked, options, inspect=inspect)
-        # Overwritten files are deleted once the new run's run.json exists, and restored if it cannot be made.
-        with replaced_parts(path, PARTS) if replaces else nullcontext():
-            folder = _begin_or_continue(path, asked, progress=progress, inspect=inspect)
+        if _check_request(path, asked, options, inspect=inspect):
+            delete_parts(path, PARTS)
+        folder = _begin_or_continue(path, asked, progress=progress, inspect=inspect)
         yield folder
         clear_scratch(path, folder.run)
 
 
-def _check_request(path: Path, asked: RunFile, options: RunOptions, *, inspect: Inspector) -> bool:
+def _check_request(path: Path, asked: GeneratedRun, options: RunOptions, *, inspect: Inspector) -> bool:
     """Reject a request that does not fit the folder; return whether to replace its run. Only reads."""
     if options.overwrite and _would_replace(path):
         check_replaceable(path, RUN, overwrite=True)
         return True
     if path.is_dir() and not (path / RUN_NAME).exists() and not recordings_of(path):
-        refuse_strangers(path, (*PARTS, LOCK_NAME))
+        refuse_strangers(path, (*PARTS, UNFINISHED, LOCK_NAME))
     run, _ = _known_run(path, asked, inspect=inspect)
     if options.export:
         check_dataset_place(path, run)
@@ -199,14 +172,14 @@ def _would_replace(path: Path) -> bool:
     return any(not part.is_dir() or any(files_below(part)) for part in parts)
 
 
-def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, inspect: Inspector) -> RunFolder:
+def _begin_or_continue(path: Path, asked: GeneratedRun, *, progress: RunObserver, inspect: Inspector) -> RunFolder:
     """Update the folder and its run.json to the known state."""
     run, damage = _known_run(path, asked, inspect=inspect)
     if damage:
         kept = free_name(path / f"{RUN_NAME}.damaged")
         (path / RUN_NAME).rename(kept)
         progress.says(f"{damage}. It is kept as {kept.name}; the recordings are read instead.")
-    run = run.with_generation(num_episodes=asked.num_episodes)
+    run = replace(run, num_episodes=asked.num_episodes)
     with _told_as_unusable(path):
         for name in (EPISODES, FAILED, UNFINISHED):
             (path / name).mkdir(exist_ok=True)
@@ -225,7 +198,7 @@ def _begin_or_continue(path: Path, asked: RunFile, *, progress: RunObserver, ins
     return folder
 
 
-def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFile, str]:
+def _known_run(path: Path, asked: GeneratedRun, *, inspect: Inspector) -> tuple[GeneratedRun, str]:
     """Find the folder's run, if it is the requested one, and the problem of its run.json ("" if none).
 
     Only reads. A run without episodes is replaced by the requested one.
@@ -243,7 +216,8 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     recordings = recordings_of(path)
     if run is asked and recordings:
         run = _run_of_recordings(recordings, asked, inspect)
-    different = differences(to_plain(run.config), run.versions, to_plain(asked.config), asked.versions)
+    different = plain_differences(to_plain(run.config), to_plain(asked.config))
+    different += version_differences(run.versions, asked.versions)
     if different and not recordings and not any(line.file for line in run.known):
         return asked, damage
     if different:
@@ -255,7 +229,7 @@ def _known_run(path: Path, asked: RunFile, *, inspect: Inspector) -> tuple[RunFi
     return run, damage
 
 
-def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Inspector) -> RunFile:
+def _run_of_recordings(recordings: Iterable[Path], asked: GeneratedRun, inspect: Inspector) -> GeneratedRun:
     """Identify the run of the first readable recording; the survey examines each of them."""
     strange: NotGeneratedError | None = None
     for file in recordings:
@@ -269,7 +243,7 @@ def _run_of_recordings(recordings: Iterable[Path], asked: RunFile, inspect: Insp
             if (lack := resource_error(error, file)) is not None:
                 raise lack from error
             continue
-        return asked.with_generation(config=config, versions=versions)
+        return replace(asked, config=config, versions=versions)
     if strange is not None:
         raise ConfigError(f"Nothing in the output folder was generated; choose another --out: {strange}")
     return asked

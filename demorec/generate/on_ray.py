@@ -41,13 +41,8 @@ _RECOUNT_S = 5.0
 class RayExecutor(Executor):
     """Attempts as Ray tasks on the cluster of `connected`.
 
-    The number of running attempts is bounded by the size of the cluster, which may change during the run.
-
-    Args:
-        maker: Function that runs a plan, as "module:function".
-        folder: Folder of the run; the workers must see it under the same path.
-        options: Number of simultaneous attempts, resources reserved by each, and number of attempts after which Ray
-            replaces a worker process.
+    The number of running attempts is bounded by the size of the cluster, which may change during the run. The workers
+    must see the run's folder under the same path.
 
     Raises:
         ConfigError: The cluster has no room for a worker.
@@ -164,15 +159,10 @@ def _attempt(maker: str, plan: EpisodePlan, folder: str) -> Report:
 
 @contextmanager
 def connected(address: str, workers: int | None) -> Iterator[None]:
-    """Connect to a cluster unless this process is connected, and disconnect at exit (which ends a cluster started
-    here).
+    """Connect to a cluster unless this process is connected, and disconnect at exit.
 
-    Args:
-        address: Address of the cluster; "local" starts one on this machine.
-        workers: CPUs of a local cluster; None: every core.
-
-    Raises:
-        ConfigError: The cluster cannot be reached.
+    "local" starts a cluster on this machine with `workers` CPUs (None: every core), and ends it. Raises ConfigError if
+    the cluster cannot be reached.
     """
     if ray.is_initialized():
         yield

@@ -10,9 +10,10 @@ from pathlib import Path
 from typing import Literal
 
 from demorec.core.errors import ConfigError, check_option
+from demorec.core.options import Rare
 from demorec.core.replacing import OptionalTarget
 from demorec.datasets.lerobot.options import check_repo_id
-from demorec.runs.run_file import MAX_EPISODES, Attempt, RunFile
+from demorec.runs.run_file import MAX_EPISODES, Attempt, GeneratedRun
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,17 +28,17 @@ class RunOptions:
     """Number of simulating processes (auto: one per core; with Ray, as many as the cluster has room for)."""
     executor: Literal["local", "ray"] = "local"
     """Processes on this machine, or tasks on a Ray cluster."""
-    address: str = "local"
+    address: Rare[str] = "local"
     """Ray: address of the cluster, such as auto (that of this machine) or HOST:6379; local: only this machine."""
-    cpus_per_worker: float = 1.0
+    cpus_per_worker: Rare[float] = 1.0
     """Ray: CPUs that each worker reserves."""
-    gpus_per_worker: float = 0.0
+    gpus_per_worker: Rare[float] = 0.0
     """Ray: GPUs that each worker reserves (for --renderer egl)."""
-    recycle_after: int = 500
+    recycle_after: Rare[int] = 500
     """Replace a worker process after this many episodes."""
-    export: bool = True
+    export: Rare[bool] = True
     """Export the successful episodes to a LeRobot dataset in OUT/dataset."""
-    repo_id: str | None = None
+    repo_id: Rare[str | None] = None
     """Name of the dataset, OWNER/NAME (auto: local/TASK)."""
     overwrite: bool = False
     """Delete the run in the output folder and start again."""
@@ -65,7 +66,7 @@ class RunObserver:
     def verifying(self, done: int, total: int) -> None:
         """Handle the verification of recordings from an earlier session."""
 
-    def started(self, run: RunFile, workers: int) -> None:
+    def started(self, run: GeneratedRun, workers: int) -> None:
         """Handle the start of the work; `run` contains everything already made."""
 
     def ended(self, attempt: Attempt) -> None:
@@ -87,6 +88,6 @@ class RunResult:
     """
 
     folder: Path
-    run: RunFile
+    run: GeneratedRun
     made: tuple[Attempt, ...]
     interrupted: bool

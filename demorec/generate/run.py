@@ -26,7 +26,7 @@ from demorec.generate.folder import RunFolder, open_run
 from demorec.generate.options import RunObserver, RunOptions, RunResult
 from demorec.robots.assets import allow_models
 from demorec.runs.recorded import inspect_recording
-from demorec.runs.run_file import UNFINISHED, Attempt, RunFile
+from demorec.runs.run_file import UNFINISHED, Attempt, GeneratedRun
 
 MAX_LOSSES = 5
 """Number of workers that one attempt may lose before the run stops: chance takes few, too little memory takes all."""
@@ -116,7 +116,7 @@ def _check_code(config: GenerateConfig) -> None:
         check_robot(load_robot(config.robot, config.modules), uses_workspace=split_name(config.task) is None)
 
 
-def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -> Executor:
+def make_executor(options: RunOptions, folder: Path, run: GeneratedRun, maker: str) -> Executor:
     """Create the executor named by the options; a context manager."""
     if options.executor == "ray":
         from demorec.generate.on_ray import RayExecutor
@@ -130,14 +130,11 @@ def make_executor(options: RunOptions, folder: Path, run: RunFile, maker: str) -
 class Schedule:
     """Due attempts and their order, determined only by the run's config and its known attempts.
 
-    An episode's attempts are sequential (attempt n + 1 if n failed); episodes do not wait for each other.
-
-    Args:
-        run: Known state of the run.
-        episodes: Order in which episodes are begun; the result does not depend on it.
+    An episode's attempts are sequential (attempt n + 1 if n failed); episodes do not wait for each other. The result
+    does not depend on the order of `episodes`, in which they are begun.
     """
 
-    def __init__(self, run: RunFile, *, episodes: Iterable[int] | None = None) -> None:
+    def __init__(self, run: GeneratedRun, *, episodes: Iterable[int] | None = None) -> None:
         self._run = run
         self._known = {(a.episode_index, a.attempt): a.success for a in run.attempts}
         self._success = {a.episode_index: a.attempt for a in run.successes}
@@ -221,7 +218,7 @@ class _Driver:
 
     def _made(self, report: Made) -> None:
         self._schedule.report(report.attempt)
-        self._folder.add(report.attempt, peak_worker_bytes=report.peak_bytes)
+        self._folder.add(report.attempt)
         self._progress.ended(report.attempt)
 
     def _again(self, plan: EpisodePlan, reason: str, advice: str) -> None:

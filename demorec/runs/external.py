@@ -15,6 +15,7 @@ from pathlib import Path
 
 from demorec.core.errors import ConfigError, RecordingError, resource_error
 from demorec.core.files import LOCK_NAME, free_name, make_folder, run_lock
+from demorec.core.plain import plain_differences
 from demorec.core.replacing import RECORDING, json_object
 from demorec.episode.info import EpisodeInfo
 from demorec.mcap import Recording, recover
@@ -243,26 +244,13 @@ def external_line(file: Path) -> Attempt:
     return replace(recorded_line(file)[0], file=f"{EPISODES}/{file.name}")
 
 
-def differences(there: EpisodeInfo, new: EpisodeInfo) -> list[str]:
+def differences(there: EpisodeInfo, new: EpisodeInfo) -> tuple[str, ...]:
     """Describe the differences between two episodes in properties that a run or dataset must share."""
-    traits = [("robot", there.robot_name, new.robot_name), ("fps", str(there.fps), str(new.fps))]
-    for kind, old_ones, new_ones in (
-        ("feature", _features(there), _features(new)),
-        ("camera", _cameras(there), _cameras(new)),
-    ):
-        for name in dict.fromkeys([*old_ones, *new_ones]):
-            traits.append((f"{kind} {name}", old_ones.get(name, "missing"), new_ones.get(name, "missing")))
-    traits.append(("URDF", _short(there.urdf), _short(new.urdf)))
-    return [f"{what} is {asked} instead of {found}" for what, found, asked in traits if found != asked]
+    return plain_differences(_traits(there), _traits(new))
 
 
-def _features(info: EpisodeInfo) -> dict[str, str]:
-    return {one.name: f"{one.dtype} of {', '.join(one.names)}" for one in info.features}
-
-
-def _cameras(info: EpisodeInfo) -> dict[str, str]:
-    return {one.name: f"{one.width}x{one.height} {one.kept}".strip() for one in info.cameras}
-
-
-def _short(urdf: str) -> str:
-    return f"one of digest {sha256(urdf.encode()).hexdigest()[:8]}" if urdf else "none"
+def _traits(info: EpisodeInfo) -> dict[str, str]:
+    urdf = f"one of digest {sha256(info.urdf.encode()).hexdigest()[:8]}" if info.urdf else "none"
+    features = {f"feature {one.name}": f"{one.dtype} of {', '.join(one.names)}" for one in info.features}
+    cameras = {f"camera {one.name}": f"{one.width}x{one.height} {one.kept}".strip() for one in info.cameras}
+    return {"robot": info.robot_name, "fps": str(info.fps), **features, **cameras, "URDF": urdf}

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import pkgutil
 import shlex
-import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -31,9 +30,6 @@ class ImportResult(Protocol):
 
     def left_out_lines(self) -> Iterator[str]:
         """Describe the data left out of the run."""
-
-
-_MB = 1e6
 
 
 def imported_kinds() -> tuple[PathKind, ...]:
@@ -60,7 +56,7 @@ def opened(paths: Sequence[Path], mapping: Path | None, *, imports_datasets: boo
         tell: Called with one line for each part left out and each mapping used.
 
     Raises:
-        ConfigError: A mapping is missing, impossible or given without need, or the disk is too small.
+        ConfigError: A mapping is missing, impossible or given without need.
         DemorecError: As in the importers.
     """
     by_kind = reader_rows()
@@ -70,7 +66,6 @@ def opened(paths: Sequence[Path], mapping: Path | None, *, imports_datasets: boo
         mapped = " and ".join(form.plural for form in by_kind.values() if form.suggester)
         raise ConfigError(f"Only {mapped} are read by a mapping: leave --mapping out: {paths[0]}")
     with tempfile.TemporaryDirectory(prefix="demorec-reading-", ignore_cleanup_errors=True) as folder:
-        _check_space([*forms], Path(folder))
         found = []
         for number, path in enumerate(paths):
             if path not in forms:
@@ -100,17 +95,6 @@ def import_kind(path: Path, imports_datasets: bool) -> PathKind | None:
     """Return the kind under which a path is imported; None if it is read directly, or by no command."""
     kind = find(path).kind
     return kind if kind in imported_kinds() or (imports_datasets and kind == "dataset") else None
-
-
-def _check_space(paths: Sequence[Path], folder: Path) -> None:
-    """Raise ConfigError unless there is enough space: encoded images keep their size, raw pixels become smaller."""
-    files = [file for path in paths for file in ([path] if path.is_file() else path.rglob("*")) if file.is_file()]
-    needed, free = sum(file.stat().st_size for file in files), shutil.disk_usage(folder).free
-    if needed > free:
-        raise ConfigError(
-            f"Reading this takes up to {needed / _MB:,.0f} MB in {folder.parent}, where {free / _MB:,.0f} MB are free: "
-            f"set TMPDIR to a folder on a larger disk: {paths[0]}"
-        )
 
 
 def _suggested(path: Path, form: ReaderRow, target: Path, tell: Tell) -> Path:

@@ -1,8 +1,7 @@
 """run.json: identity, options and progress of a run; one line per episode, replaced atomically.
 
 The recordings are authoritative, and this file is their index: a line lost in a crash is restored from its recording.
-Options that decide the data (config, versions) are separate from those that do not (machine, times). A run of external
-episodes has no `Generation`.
+Options that decide the data (config, versions) are separate from those that do not (machine, times).
 """
 
 from __future__ import annotations
@@ -59,11 +58,11 @@ class Attempt:
     attempt: int = 0
     seed: int = 0
     success: bool | None
-    file: str
-    sha256: str
-    digest: str
-    num_frames: int
-    num_bytes: int
+    file: str = ""
+    sha256: str = ""
+    digest: str = ""
+    num_frames: int = 0
+    num_bytes: int = 0
     phase: str = ""
     reason: str = ""
     seconds: float = 0.0
@@ -90,8 +89,6 @@ class RunSession:
     workers: int = 0
     wall_seconds: float = 0.0
     lost_workers: int = 0
-    peak_worker_bytes: int = 0
-    peak_driver_bytes: int = 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -105,8 +102,74 @@ class ExportRecord:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Generation:
-    """Options, versions and extent of a run that demorec generates.
+class RunFile:
+    """Content of run.json; this class describes a run of external episodes, `GeneratedRun` one that demorec generates.
+
+    Attributes:
+        robot, fps: Name of the robot and nominal frames per second, of external episodes.
+        planned: Names of bags or dataset episodes that the last import was given and has not imported yet.
+        attempts: Every finished attempt at the requested episodes, ordered by episode and attempt.
+        sessions: Every start of the command or of a program that added episodes.
+    """
+
+    robot: str = ""
+    fps: int = 0
+    planned: tuple[str, ...] = ()
+    attempts: tuple[Attempt, ...] = ()
+    sessions: tuple[RunSession, ...] = ()
+
+    @property
+    def successes(self) -> tuple[Attempt, ...]:
+        """Attempts that produced an episode."""
+        return tuple(a for a in self.attempts if a.success)
+
+    @property
+    def failures(self) -> tuple[Attempt, ...]:
+        """Attempts that failed."""
+        return tuple(a for a in self.attempts if not a.success)
+
+    @property
+    def known(self) -> tuple[Attempt, ...]:
+        """Every finished attempt, including those beyond the requested episodes."""
+        return self.attempts
+
+    @property
+    def num_missing(self) -> int:
+        """Number of requested episodes neither finished nor given up."""
+        return len(self.planned)
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether nothing is missing."""
+        return not self.num_missing
+
+    @property
+    def unfinished(self) -> str:
+        """Missing episodes, as a sentence without its end; "" for a complete run."""
+        if self.is_complete:
+            return ""
+        return f"The run is unfinished, {self._missing}; the command that began it continues it"
+
+    @property
+    def _missing(self) -> str:
+        return f"{shown(self.planned)} {'is' if self.num_missing == 1 else 'are'} not imported yet"
+
+    @property
+    def digest(self) -> str:
+        """Content digest of the run: config and attempts in order, but not times, machines or versions."""
+        return _digest_of(f"{a.episode_index} {a.success} {a.digest}" for a in self.attempts)
+
+    def plain(self) -> dict[str, Any]:
+        """The content as plain data."""
+        plain = to_plain(self)
+        about = {key: plain[key] for key in ("robot", "fps", "planned")}
+        sessions = [{key: session[key] for key in ("started", "ended")} for session in plain["sessions"]]
+        return {**about, "sessions": sessions, "episodes": _lines(self.attempts, _EXTERNAL_LINE)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class GeneratedRun(RunFile):
+    """A run that demorec generates.
 
     Attributes:
         config: Options that decide the data.
@@ -123,76 +186,10 @@ class Generation:
     beyond: tuple[Attempt, ...] = ()
     export: ExportRecord | None = None
 
-
-@dataclass(frozen=True, kw_only=True)
-class RunFile:
-    """Content of run.json.
-
-    Attributes:
-        generation: None for a run of external episodes; reading its values then raises ConfigError.
-        robot, fps: Name of the robot and nominal frames per second, of external episodes.
-        planned: Names of bags or dataset episodes that the last import was given and has not imported yet.
-        attempts: Every finished attempt at the requested episodes, ordered by episode and attempt.
-        sessions: Every start of the command or of a program that added episodes.
-    """
-
-    generation: Generation | None = None
-    robot: str = ""
-    fps: int = 0
-    planned: tuple[str, ...] = ()
-    attempts: tuple[Attempt, ...] = ()
-    sessions: tuple[RunSession, ...] = ()
-
-    @property
-    def generated(self) -> Generation:
-        """The generation; ConfigError for a run of external episodes."""
-        if self.generation is None:
-            raise ConfigError("The episodes of this run were recorded by another robot or program, not generated.")
-        return self.generation
-
-    @property
-    def config(self) -> GenerateConfig:
-        """Configuration of the generation."""
-        return self.generated.config
-
-    @property
-    def versions(self) -> Mapping[str, str]:
-        """Versions of the generation."""
-        return self.generated.versions
-
-    @property
-    def num_episodes(self) -> int:
-        """Number of successes last requested."""
-        return self.generated.num_episodes
-
-    @property
-    def beyond(self) -> tuple[Attempt, ...]:
-        """Attempts at episodes beyond the requested ones."""
-        return self.generated.beyond
-
-    @property
-    def export(self) -> ExportRecord | None:
-        """Dataset exported from the run."""
-        return self.generated.export
-
-    def with_generation(self, **changes: Any) -> RunFile:
-        """Return the run with changed values of its generation, which must exist."""
-        return replace(self, generation=replace(self.generated, **changes))
-
     @property
     def config_digest(self) -> str:
         """Digest of the config: equal digests and versions give equal episodes."""
         return digest(self.config)
-
-    @property
-    def successes(self) -> tuple[Attempt, ...]:
-        """Attempts that produced an episode."""
-        return tuple(a for a in self.attempts if a.success)
-
-    @property
-    def failures(self) -> tuple[Attempt, ...]:
-        """Attempts that failed."""
-        return tuple(a for a in self.attempts if not a.success)
 
     @property
     def given_up(self) -> tuple[int, ...]:
@@ -203,60 +200,39 @@ class RunFile:
 
     @property
     def num_missing(self) -> int:
-        """Number of requested episodes neither finished nor given up; for external episodes, the number planned."""
-        if self.generation is None:
-            return len(self.planned)
+        """Number of requested episodes neither finished nor given up."""
         return max(0, self.num_episodes - len(self.successes) - len(self.given_up))
 
     @property
-    def is_complete(self) -> bool:
-        """Whether nothing is missing."""
-        return not self.num_missing
-
-    @property
-    def unfinished(self) -> str:
-        """Missing episodes, as a sentence without its end; "" for a complete run."""
-        if self.is_complete:
-            return ""
-        if self.generation is None:
-            missing = f"{shown(self.planned)} {'is' if self.num_missing == 1 else 'are'} not imported yet"
-        else:
-            missing = f"{self.num_missing} of {self.num_episodes} episodes are missing"
-        return f"The run is unfinished, {missing}; the command that began it continues it"
+    def _missing(self) -> str:
+        return f"{self.num_missing} of {self.num_episodes} episodes are missing"
 
     @property
     def digest(self) -> str:
         """Content digest of the run: config and attempts in order, but not times, machines or versions."""
-        if self.generation is None:
-            lines = [f"{a.episode_index} {a.success} {a.digest}" for a in self.attempts]
-        else:
-            lines = [self.config_digest]
-            lines += [f"{a.episode_index} {a.attempt} {int(bool(a.success))} {a.digest}" for a in self.attempts]
-        return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
+        lines = [f"{a.episode_index} {a.attempt} {int(bool(a.success))} {a.digest}" for a in self.attempts]
+        return _digest_of([self.config_digest, *lines])
 
     @property
     def known(self) -> tuple[Attempt, ...]:
         """Every finished attempt, including those beyond the requested episodes."""
         return self.attempts + self.beyond
 
-    def with_attempts(self, attempts: Iterable[Attempt]) -> RunFile:
+    def with_attempts(self, attempts: Iterable[Attempt]) -> GeneratedRun:
         """Return the run with these attempts, in order; those beyond the requested episodes are `beyond`."""
         ordered = sorted(attempts, key=lambda a: (a.episode_index, a.attempt))
         within = tuple(a for a in ordered if a.episode_index < self.num_episodes)
-        beyond = tuple(a for a in ordered if a.episode_index >= self.num_episodes)
-        return replace(self.with_generation(beyond=beyond), attempts=within)
+        return replace(self, attempts=within, beyond=tuple(ordered[len(within) :]))
 
     def plain(self) -> dict[str, Any]:
         """The content as plain data."""
-        plain: dict[str, Any] = to_plain(self)
-        if self.generation is None:
-            about = {key: plain[key] for key in ("robot", "fps", "planned")}
-            sessions = [{key: session[key] for key in ("started", "ended")} for session in plain["sessions"]]
-            return {**about, "sessions": sessions, "episodes": _lines(self.attempts, _EXTERNAL_LINE)}
-        generation = {key: value for key, value in plain["generation"].items() if key not in ("beyond", "export")}
-        about = {"sessions": plain["sessions"], "export": plain["generation"]["export"]}
-        lines = {"attempts": _lines(self.attempts, _LINE), "beyond": _lines(self.beyond, _LINE)}
-        return {**generation, **about, **lines}
+        plain = to_plain(self)
+        about = {key: plain[key] for key in ("config", "versions", "num_episodes", "sessions", "export")}
+        return {**about, "attempts": _lines(self.attempts, _LINE), "beyond": _lines(self.beyond, _LINE)}
+
+
+def _digest_of(lines: Iterable[str]) -> str:
+    return hashlib.sha256("\n".join(lines).encode()).hexdigest()[:16]
 
 
 def _lines(attempts: Iterable[Attempt], keys: Iterable[str]) -> list[dict[str, Any]]:
@@ -266,12 +242,13 @@ def _lines(attempts: Iterable[Attempt], keys: Iterable[str]) -> list[dict[str, A
 def save_run_file(run: RunFile, folder: Path) -> None:
     """Replace run.json atomically: a reader sees the old or the new file, also after a crash."""
     plain, head = run.plain(), dict[str, Any](format=RUN_FORMAT)
-    if run.generation is None:
-        lines = plain.pop("episodes")
-        head |= {"kind": _EXTERNAL, "digest": run.digest, "complete": run.is_complete, **plain}
+    if isinstance(run, GeneratedRun):
+        lines = plain.pop("attempts") + plain.pop("beyond")
+        head["config_digest"] = run.config_digest
     else:
-        lines = _episode_lines(run, plain.pop("attempts") + plain.pop("beyond"))
-        head |= {"config_digest": run.config_digest, "digest": run.digest, "complete": run.is_complete, **plain}
+        lines = plain.pop("episodes")
+        head["kind"] = _EXTERNAL
+    head |= {"digest": run.digest, "complete": run.is_complete, **plain}
     text = json.dumps(head, indent=2, allow_nan=False)[:-2]
     text += ',\n  "episodes": [\n' + ",\n".join("    " + json.dumps(line, allow_nan=False) for line in lines)
     text += "\n  ]\n}\n"
@@ -284,7 +261,7 @@ def is_external_run(folder: Path) -> bool:
     return json_object(folder / RUN_NAME).get("kind") == _EXTERNAL
 
 
-def load_run_file(folder: Path) -> RunFile:
+def load_run_file(folder: Path) -> GeneratedRun:
     """Read run.json of a run that demorec generated.
 
     Raises:
@@ -292,7 +269,7 @@ def load_run_file(folder: Path) -> RunFile:
         DamagedRunFileError: It is not a valid run file.
     """
     run = load_any_run_file(folder)
-    if run.generation is None:
+    if not isinstance(run, GeneratedRun):
         raise ConfigError(
             f"The episodes of this run were recorded by another robot or program, not generated: {folder}"
         )
@@ -310,14 +287,14 @@ def load_any_run_file(folder: Path) -> RunFile:
             raise ConfigError(f"run.json has format {str(version)[:40]}, this demorec knows up to {RUN_FORMAT}: {path}")
         lines, sessions = plain.pop("episodes"), plain.pop("sessions", [])
         del plain["digest"], plain["complete"]
+        plain |= {"attempts": lines, "sessions": sessions}
         if plain.pop("kind", "") == _EXTERNAL:
-            external = from_plain({**plain, "attempts": lines, "sessions": sessions}, RunFile)
+            external = from_plain(plain, RunFile)
             if not external.robot or external.fps < 1:
                 raise ValueError("robot or fps is missing")
             return external
-        attempts = [line for line in lines if line.pop("state") != "planned"]
         del plain["config_digest"]
-        run = from_plain({"generation": plain, "attempts": attempts, "sessions": sessions}, RunFile)
+        run = from_plain(plain, GeneratedRun)
         _refuse_impossible(run)
         return run.with_attempts(run.attempts)
     except FileNotFoundError as error:
@@ -347,7 +324,7 @@ def refuse_strangers(folder: Path, own: Collection[str]) -> None:
         )
 
 
-def _refuse_impossible(run: RunFile) -> None:
+def _refuse_impossible(run: GeneratedRun) -> None:
     """Raise ValueError for numbers that generate-dataset never writes; larger ones would cause endless loops."""
     if not 1 <= run.num_episodes <= MAX_EPISODES:
         raise ValueError(f"num_episodes is {run.num_episodes}, allowed are 1 to {MAX_EPISODES:,}")
@@ -363,17 +340,3 @@ def _refuse_impossible(run: RunFile) -> None:
         place = f"{EPISODES if line.success else FAILED}/{name}"
         if line.file != place and (line.file or line.success):
             raise ValueError(f"the line of {which} has the file {line.file!r} instead of {place}")
-
-
-def _episode_lines(run: RunFile, attempts: list[dict[str, Any]]) -> Iterable[dict[str, Any]]:
-    """Yield one line per attempt, and one for each episode without an attempt."""
-    tried: set[int] = set()
-    given_up = set(run.given_up)
-    for line in attempts:
-        index = line["episode_index"]
-        tried.add(index)
-        state = "done" if line["success"] else ("given up" if index in given_up else "failed")
-        yield {"state": state, **line}
-    for index in range(run.num_episodes):
-        if index not in tried:
-            yield {"state": "planned", "episode_index": index, "seed": run.config.seed}

@@ -26,7 +26,7 @@ def evaluation(tmp_path: Path) -> Path:
 @pytest.mark.parametrize(
     ("command", "told"),
     [
-        ("info", "2 recordings"),
+        ("info", "failure"),
         ("check --no-images", "2 episodes, 24 frames"),
         ("view --save NEW.rrd", "kB"),
         ("report --no-checks --out NEW.html", "2 episodes"),

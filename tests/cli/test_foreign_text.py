@@ -21,7 +21,7 @@ from support.recording import write_episode
 from demorec.cli import COMMANDS, main, run_command
 from demorec.mcap import Recording
 from demorec.runs.recorded import inspect_recording
-from demorec.runs.run_file import Generation, RunFile, save_run_file
+from demorec.runs.run_file import GeneratedRun, save_run_file
 
 HOSTILE = "\x1b[2Jx\n\u202ey\x9b31m"
 NAME = "\x1b[31mred\u202e.mcap"
@@ -101,12 +101,12 @@ def hostile(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
     attempt = replace(inspect_recording(good)[0], file="episodes/episode_000000.mcap")
     config = GenerateConfig(cameras=())
-    save_run_file(RunFile(generation=Generation(config=config, versions={}, num_episodes=1), attempts=(attempt,)), run)
+    save_run_file(GeneratedRun(config=config, versions={}, num_episodes=1, attempts=(attempt,)), run)
     file = run / "run.json"
     plain = json.loads(file.read_text())
     plain["versions"] = {HOSTILE: HOSTILE}
     plain["config"]["task"] += HOSTILE
-    plain["episodes"].append({**plain["episodes"][0], "episode_index": 1, "success": False, "state": "failed",
+    plain["episodes"].append({**plain["episodes"][0], "episode_index": 1, "success": False,
                               "file": HOSTILE, "phase": HOSTILE, "reason": HOSTILE})  # fmt: skip
     file.write_text(json.dumps(plain))
 

@@ -25,19 +25,12 @@ def run(capsys: pytest.CaptureFixture[str], *args: str) -> tuple[int, str, str]:
         (["--cameras", "frnt"], "Unknown camera 'frnt'. Did you mean 'front'?"),
         (["--cameras", "front", "front"], "A camera is named twice"),
         (["--cameras", "none", "front"], "--cameras none excludes other cameras"),
-        (["--robot", "pandas"], "Unknown robot 'pandas'. Did you mean 'panda'?"),
-        (["--renderer", "rastr"], "Unknown renderer 'rastr'. Did you mean 'raster'?"),
         (["--num-episodes", "0"], "--num-episodes is 0, allowed are 1 to 10,000,000."),
-        (["--num_episodes", "-3"], "--num-episodes is -3"),
         (
             ["--fps", "31"],
             "--fps is 31, which does not divide the physics rate of 240 Hz: use 30 or 40, or --physics-hz 248.",
         ),
         (["--width", "225"], "--width is 225, but yuv420p video needs even sizes: use 224 or 226."),
-        (["--height", "8"], "--height is 8, allowed are 16 to 8,192."),
-        (["--crf", "52"], "--crf is 52, allowed are 0 to 51."),
-        (["--seed", "-1"], "--seed is -1"),
-        (["--workers", "0"], "--workers is 0"),
         (["--repo-id", "cubes"], "--repo-id is 'cubes', but must be OWNER/NAME"),
         (["--cube-mass", "0.5", "0.2"], "--cube-mass is from 0.5 to 0.2; it must be within"),
         (["--address", "auto"], "--address is for Ray"),
@@ -60,7 +53,6 @@ def test_impossible_requests_are_one_sentence_and_leave_nothing(
         (["--num-epsodes", "3"], ["Unrecognized options: --num-epsodes", "Perhaps you meant", "--num-episodes INT"]),
         (["--width", "wide"], ["Error parsing --width"]),
         (["--cube-mass", "0.1"], ["Error parsing --cube-mass: two numbers are needed, LOW HIGH, or auto"]),
-        (["--cube-mass", "0.1", "0.2", "0.3"], ["Error parsing --cube-mass"]),
         (["--executor", "slurm"], ["invalid choice 'slurm'", "local", "ray"]),
     ],
 )
@@ -85,7 +77,6 @@ def test_unknown_options_name_the_nearest(
         ("num_episods = 3", "unknown key 'num_episods'. Did you mean 'num_episodes'?"),
         ("width = 224.5", "width: 224.5 is not a whole number"),
         ('depth = "false"', "depth: 'false' is not a boolean"),
-        ('codec = "h265"', "codec"),
         ("seed = ", "is not valid TOML"),
         ("fps = 7", "fps is 7, which does not divide"),
         ('out = "x"\ntempo = 1\nwidht = 3', "an unknown key 'widht'. Did you mean 'width'?"),
@@ -167,19 +158,3 @@ def test_list_describes_every_row_in_one_line(capsys: pytest.CaptureFixture[str]
     assert any(line.startswith(names + " ") for line in lines)
     assert all(re.match(r"\S+\s+\S+", line) for line in lines), "a row without a summary"
     assert len({line.split(maxsplit=1)[1] for line in lines}) == len(lines), "two rows that read the same"
-
-
-def test_every_check_is_listed_within_80_columns_and_explained(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code("list", "checks") == 0
-    lines = capsys.readouterr().out.splitlines()
-    names = [line.split()[0] for line in lines]
-    assert {"opens", "action_lag", "frozen_images"} <= set(names)
-    assert len(set(names)) == len(names)
-    assert all(len(line) <= 80 and re.match(r"\S+\s+\S+", line) for line in lines)
-    for name in names:
-        assert exit_code("explain", name) == 0
-        page = capsys.readouterr().out
-        assert page.startswith(f"{name}\n")
-        assert {"finds", "needs", "unit", "why", "do"} <= {
-            line.split()[0] for line in page.splitlines() if line.strip()
-        }

@@ -86,14 +86,3 @@ def test_every_flag_is_described(
     for number in flags:
         below = next(iter(rows[number + 1 :]), "-")
         assert "  " in rows[number] or not below.startswith("-"), rows[number]
-
-
-@pytest.mark.parametrize("name", DatasetCommand.commands.names())
-def test_a_command_of_dataset_has_its_own_flags_and_an_example(
-    name: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = "\n".join(help_of(f"demorec dataset {name}", 80, capsys, monkeypatch))
-    assert f"\n  demorec dataset {name} " in text
-    assert ("--idle-threshold" in text) == (name == "trim")
-    assert ("--where" in text) == (name in ("select", "drop", "set-task"))
-    assert ("--out" in text) == (name != "diff")

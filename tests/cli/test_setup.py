@@ -76,16 +76,3 @@ def test_a_compiler_is_required_for_compiling_pybullet(checkout: Path) -> None:
     assert "install g++ or clang, or use PYBULLET=wheel" in done.stderr
     assert "allowed are source and wheel" in make(checkout, "setup", "PYBULLET=gcc").stderr
     assert not (checkout / "asked").exists()
-
-
-@pytest.mark.slow
-def test_the_official_package_is_the_default_and_another_choice_sets_up_again(checkout: Path) -> None:
-    (checkout / "programs" / "c++").symlink_to("bash")
-    for choice, last in ((), "pybullet-arm64"), (("PYBULLET=wheel",), "pybullet"), ((), None):
-        done = make(checkout, "setup", *choice)
-        assert done.returncode == 0, done.stderr
-        if last is None:  # the existing environment is kept
-            assert "Nothing to be done" in done.stdout
-        else:
-            assert (checkout / "asked").read_text().splitlines()[-3].endswith(f" {last}")
-    assert [path.name for path in (checkout / ".venv").glob(".stamp*")] == [".stamp-wheel"]

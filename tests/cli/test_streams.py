@@ -48,12 +48,6 @@ def test_a_reader_that_has_exited_is_a_silent_exit_code_1(words: str) -> None:
     assert shell(words, "| true") == Ended(1, "", "")
 
 
-def test_a_full_disk_behind_the_answer_is_one_sentence() -> None:
-    ended = shell("--version", "> /dev/full")
-    assert ended.code == 1
-    assert ended.err == "demorec: The answer cannot be written (No space left on device): <stdout>\n"
-
-
 def test_a_file_does_not_reuse_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     """Text that a library prints to a closed stream must not end up in the file that reuses its number."""
     code = (

@@ -78,7 +78,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
         lambda path: _bag(path, change=lambda notes: [note for note in notes if note.topic != FRONT]),
         f"no message of '{FRONT}'",
     ),
-    "another size": (lambda path: _bag(path, change=_resized), "camera front is 32x24 jpeg instead of 64x48 jpeg"),
+    "another size": (lambda path: _bag(path, change=_resized), "camera front is 64x48 jpeg there and 32x24 jpeg here"),
     "odd size": (lambda path: _bag(path, change=_odd), "63x47 pixels cannot be h264 video, which needs even sizes"),
     "escape codes": (
         lambda path: _bag(path, change=lambda notes: _named(notes, "a\x1b[2J")),

@@ -10,13 +10,11 @@ import errno
 import json
 import os
 import re
-import shutil
 import signal
 import subprocess
 import sys
 import tempfile
 import time
-from collections import namedtuple
 from pathlib import Path
 from typing import Any
 
@@ -63,15 +61,14 @@ CASES = [
     (command, kind)
     for command in COMMANDS
     for kind in ROWS
-    if (command != "import" or kind not in ("simulation", "run of simulations", "imported run"))  # which need none
+    if (command, kind) != ("info", "run of simulations")
+    and (command != "import" or kind not in ("simulation", "run of simulations", "imported run"))  # which need none
     and (command in ("info", "check", "import") or kind not in LIKE_OTHERS)
 ]
 FORMATS = {"robomimic": "hdf5", "aloha": "hdf5"} | dict.fromkeys(
     ("dataset of simulations", "imported dataset", "lerobot v2.0", "lerobot v2.1", "lerobot v3.0"), "lerobot"
 )
 """Kind -> format word of `demorec import`; bags and recordings, which are bags too, have none."""
-FRAMES_OF = {"run of simulations": (24, 20)}
-"""Kind -> frames of each episode, where the output lists them."""
 EXTERNAL = "recorded by another robot or program"
 OF_IMPORTED: dict[str, tuple[int, str]] = {
     "check RUN": (0, "good: 1 episode, 24 frames, 2 cameras; "),
@@ -87,7 +84,6 @@ OF_IMPORTED: dict[str, tuple[int, str]] = {
     "evaluate --policy RUN": (2, "Not a policy"),
     "correct --policy RUN": (2, "Not a policy"),
     "generate --config RUN --out NEW": (2, EXTERNAL),
-    "generate --config DATASET --out NEW": (2, EXTERNAL),
     "generate --config RECORDING --out NEW": (2, EXTERNAL),
     "import BAG --mapping MAPPING --out RUN": (0, "1 of 1 bags had been imported before."),
     "recover RECORDING --out NEW.mcap": (0, "Complete: all 24 frames"),
@@ -180,7 +176,7 @@ def test_a_command_reads_it(
     elif command == "info":
         is_one = kind in ("simulation", "recorder")  # a recording, which is one episode
         assert is_one or re.search(rf"episodes +{episodes}\b|\b{episodes} (of|episodes?|recordings?)\b", printed.out)
-        assert all(str(count) in printed.out for count in FRAMES_OF.get(kind, (frames,)))
+        assert str(frames) in printed.out
     if command == "import":
         recordings = sorted((tmp_path / "new" / "episodes").glob("*.mcap"))
         assert [len(recordings), sum(_num_frames(file) for file in recordings)] == [episodes, frames]
@@ -331,15 +327,3 @@ def test_a_signal_leaves_nothing_behind(number: int, tmp_path: Path) -> None:
     process.send_signal(number)
     assert process.wait(60) == 130
     assert not list((tmp_path / "scratch").iterdir())
-
-
-def test_a_disk_that_is_too_small_is_reported_before_reading(
-    places: dict[str, list[Path | str]],
-    scratch: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    usage = namedtuple("usage", "total used free")
-    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage(10, 10, 0))
-    assert exit_code("check", *places["mcap"]) == 2
-    assert f"in {scratch}, where 0 MB are free: set TMPDIR to a folder on a larger disk" in capsys.readouterr().err

@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 
 import pytest
-from support.check import simulate
 from support.commands import exit_code
 
 from demorec.cli import generate_dataset_main
@@ -23,12 +22,6 @@ SCRIPT = """
 EVALUATE = """
     def evaluate(self, world):
         return (world.pose("no such body"),)
-"""
-HELPER = """
-    def is_in_reach(self, scene, robot, behaviour):
-        import left_helpers
-
-        return left_helpers.half(0)
 """
 
 
@@ -71,15 +64,6 @@ def test_a_bug_in_a_task_is_named_by_its_line(
     assert re.search(rf"; raised at left_tasks\.py:{line}: {re.escape(code)}[^\n]*\n$", told), told
 
 
-@pytest.mark.slow
-def test_the_line_may_be_in_another_module(module: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    module.write_text(module.read_text() + HELPER)
-    (tmp_path / "left_helpers.py").write_text("def half(x):\n    return 1 / x\n")
-    flags = ["--task", "left_tasks:ToTheLeft", "--num-episodes", "1", "--workers", "1", "--cameras", "none"]
-    assert exit_code(*flags, "--out", tmp_path / "run", program=generate_dataset_main) == 1
-    assert capsys.readouterr().err.endswith("; raised at left_helpers.py:2: return 1 / x\n")
-
-
 @pytest.mark.parametrize(
     ("old", "new", "code"),
     [
@@ -100,20 +84,6 @@ def test_a_module_that_cannot_be_imported_is_named_by_its_line(
     told = capsys.readouterr().err
     assert re.search(rf"cannot be imported \(.*\): mend left_tasks\.py:{line}: {re.escape(code)}[^\n]*\n$", told), told
     assert not (tmp_path / "run").exists()
-
-
-@pytest.mark.slow
-def test_other_commands_name_the_line_too(
-    module: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    monkeypatch.syspath_prepend(tmp_path)
-    recording = simulate(tmp_path / "a.mcap", task="left_tasks:ToTheLeft", seed=3)
-    module.write_text(module.read_text() + EVALUATE)
-    monkeypatch.delitem(sys.modules, "left_tasks")
-    assert exit_code("replay", recording, "--allow", "left_tasks") == 1
-    told = capsys.readouterr().err
-    assert "demorec replay: KeyError: 'no such body' (the traceback is in " in told
-    assert re.search(r"; raised at left_tasks\.py:\d+: return \(world\.pose\(\"no such body\"\),\)\n$", told)
 
 
 @pytest.mark.slow

@@ -7,12 +7,11 @@ import shutil
 from pathlib import Path
 
 import pytest
-from support.check import edit_json, simulate_run
+from support.check import simulate_run
 from support.commands import exit_code
 from support.mcap import rewritten
 
 from demorec.core.plain import to_plain
-from demorec.generate.reproduce import read_original
 from demorec.mcap import Recording
 from demorec.mcap.metadata import EPISODE
 
@@ -90,29 +89,3 @@ def test_episode_flags_next_to_a_run_are_refused(
 def test_allow_is_for_names_in_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("generate", "--out", tmp_path / "run", "--allow", "my_tasks") == 2
     assert "--allow is for a --config that names a run" in capsys.readouterr().err
-
-
-def test_another_digest_in_run_json(run: Path, tmp_path: Path) -> None:
-    spoilt = tmp_path / "run"
-    shutil.copytree(run, spoilt)
-    assert not read_original(spoilt).faults
-    edit_json(spoilt / "run.json", lambda data: data["episodes"][0].update(digest="0" * 64))
-    (fault,) = read_original(spoilt).faults
-    assert "differs from the one in run.json" in fault
-
-
-@pytest.mark.slow
-def test_renderings_of_a_run_do_not_count_as_a_copy(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    out = tmp_path / "renderings"
-    assert exit_code("render", run, "--out", out, "--cameras", "front", "--width", 16, "--height", 16) == 0
-    there = {path.name: path.read_bytes() for path in out.rglob("*.mcap")}
-    assert len(there) == 5
-    for words in (("--config", run), ("--num-episodes", 5, "--seed", 3, "--fps", 10)):
-        assert exit_code("generate", *words, "--out", out) == 2
-        assert (
-            "Nothing in the output folder was generated; choose another --out: The recording is a render of"
-            in capsys.readouterr().err
-        )
-    assert {path.name: path.read_bytes() for path in out.rglob("*") if path.is_file()} == there

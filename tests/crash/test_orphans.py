@@ -16,7 +16,7 @@ from support.export import make_run
 
 pytestmark = pytest.mark.slow
 
-COMMANDS = ["export", "import", *(pytest.param(name, marks=pytest.mark.long) for name in ("check", "render"))]
+COMMANDS = ["export", "import"]
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +33,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def command(run: Path, out: Path, name: str) -> list[str]:
     arguments = {
         "export": ["export", "lerobot", run, "--out", out / "d"],
-        "check": ["check", run],
         "import": ["import", run.with_name("bags"), "--mapping", run.with_name("robot.toml"), "--out", out / "i"],
-        "render": ["render", run, "--out", out / "r"],
     }[name]
     return [sys.executable, "-c", "from demorec.cli import main; main()", *map(str, arguments), "--workers", "2"]
 

@@ -14,11 +14,10 @@ from typing import Any
 
 import psutil
 import pytest
-from support.generate import inspect, num_finished, run_fake
-from support.kills import generation, made_of, run_killed
+from support.generate import inspect, num_finished
 
 from demorec.core.config import GenerateConfig
-from demorec.core.errors import ConfigError, GenerationError
+from demorec.core.errors import ConfigError
 from demorec.generate import on_ray
 from demorec.generate.options import RunOptions, RunResult
 from demorec.generate.run import generate
@@ -37,12 +36,6 @@ def run_on_ray(out: Path, *, maker: str, **options: Any) -> RunResult:
         maker=f"support.makers:{maker}",
         inspect=inspect,
     )
-
-
-@pytest.fixture(scope="module")
-def reference(tmp_path_factory: pytest.TempPathFactory) -> str:
-    result = run_fake(tmp_path_factory.mktemp("reference") / "run", num_episodes=NUM_EPISODES)
-    return result.run.digest
 
 
 @pytest.fixture(scope="module")
@@ -145,15 +138,6 @@ class Killer:
                 return
 
 
-def test_two_nodes_make_the_same_run(tmp_path: Path, cluster: object, reference: str) -> None:
-    result = run_on_ray(tmp_path / "run", maker="report_pid")
-    assert result.run.digest == reference
-    assert result.run.sessions[-1].workers == 2
-    seen = [p.name for p in (tmp_path / "run/unfinished").glob("pid-*")]
-    assert len(seen) >= 2, "both nodes must have worked"
-    assert {name.split("-")[2] for name in seen} == {"1"}
-
-
 def test_a_complete_run_is_the_same_for_every_executor(tmp_path: Path, cluster: object) -> None:
     """One worker, and Ray on two nodes with workers and a third node killed."""
     one = generate(REAL, RunOptions(out=tmp_path / "one", num_episodes=NUM_REAL, workers=1))
@@ -167,20 +151,6 @@ def test_a_complete_run_is_the_same_for_every_executor(tmp_path: Path, cluster: 
     assert len(one.run.successes) == NUM_REAL
     assert ray.run.digest == one.run.digest
     assert [a.sha256 for a in ray.run.attempts] == [a.sha256 for a in one.run.attempts]
-
-
-@pytest.mark.long
-def test_one_digest_for_any_workers_ray_and_twelve_kills(tmp_path: Path) -> None:
-    number = 24
-    ways = {"one": 1, "two": 2, "three": 3, "ray": 2}
-    for name, workers in ways.items():
-        more = ("--executor", "ray") if name == "ray" else ()
-        subprocess.run(generation(tmp_path / name, number, *more, workers=workers), check=True)
-    run_killed(tmp_path / "killed", number, num_kills=12)
-    assert len(made_of(tmp_path / "one")[1]) >= number
-    for name in (*ways, "killed"):
-        assert made_of(tmp_path / name) == made_of(tmp_path / "one"), name
-        assert not list((tmp_path / name / "unfinished").iterdir()), name
 
 
 @pytest.mark.long
@@ -214,13 +184,6 @@ def test_a_node_that_ends_on_its_own_machine_ends_the_run_with_an_error(tmp_path
     assert load_run_file(out).digest == one.run.digest
 
 
-def test_a_run_started_on_ray_continues_without_it(tmp_path: Path, cluster: object, reference: str) -> None:
-    out = tmp_path / "run"
-    with pytest.raises(GenerationError, match="the disk is full"):
-        run_on_ray(out, maker="fill_the_disk")
-    assert run_fake(out, num_episodes=NUM_EPISODES).run.digest == reference
-
-
 def test_too_large_workers_are_refused(tmp_path: Path, cluster: object) -> None:
     # Ray may still count a node that an earlier test killed.
     with pytest.raises(ConfigError, match=r"has \d CPUs and 0 GPUs, too few for one worker with 1 CPUs and 1 GPUs"):
@@ -235,10 +198,3 @@ def test_an_unreachable_cluster_is_reported_at_once(address: str, monkeypatch: p
         on_ray.connected(address, 1),
     ):
         pass
-
-
-def test_an_unreachable_cluster_leaves_no_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ray.is_initialized", lambda: False)  # anything that earlier tests began
-    with pytest.raises(ConfigError, match="cannot be reached"):
-        run_on_ray(tmp_path / "run", maker="make", address="127.0.0.1:1")
-    assert list(tmp_path.iterdir()) == []

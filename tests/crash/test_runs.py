@@ -94,15 +94,6 @@ def test_workers_are_other_processes_with_one_thread_each_and_are_recycled(tmp_p
     assert len(seen) >= len(expected_attempts(8)) / 2
 
 
-def test_the_same_command_again_keeps_everything(tmp_path: Path, reference: RunResult) -> None:
-    first = run_fake(tmp_path / "run")
-    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
-    second = run_fake(tmp_path / "run")
-    assert second.made == ()
-    assert first.run.digest == second.run.digest == reference.run.digest
-    assert before == {p: p.stat().st_mtime_ns for p in (tmp_path / "run").rglob("*.mcap")}
-
-
 def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_been(
     tmp_path: Path, reference: RunResult
 ) -> None:
@@ -124,25 +115,15 @@ def test_more_episodes_extend_a_run_and_fewer_are_the_run_that_they_would_have_b
     assert again.run.digest == reference.run.digest
 
 
-@pytest.mark.long
-def test_fewer_episodes_than_an_interrupted_run_wanted_are_enough(tmp_path: Path) -> None:
-    """The first command requested 5000 episodes and made some; the second requests 3."""
-    out = tmp_path / "run"
-    with pytest.raises(GenerationError):
-        run_fake(out, num_episodes=5000, maker="die_always", workers=1)
-    assert 0 < num_finished(out) < 5000
-    result = run_fake(out, num_episodes=3)
-    assert result.run.is_complete
-    assert result.run.digest == run_fake(tmp_path / "alone", num_episodes=3).run.digest
-
-
 def test_overwrite_starts_again_and_keeps_foreign_files(tmp_path: Path) -> None:
     run_fake(tmp_path / "run")
-    (tmp_path / "run/notes.txt").write_text("mine")
+    mine = [tmp_path / "run/notes.txt", tmp_path / "run/unfinished/ideas.txt"]
+    for path in mine:
+        path.write_text("mine")
     result = run_fake(tmp_path / "run", seed=1, num_episodes=2, overwrite=True)
     assert attempts_of(result) == expected_attempts(2, seed=1)
     assert num_finished(tmp_path / "run") == sum(expected_attempts(2, seed=1).values())
-    assert (tmp_path / "run/notes.txt").read_text() == "mine"
+    assert [path.read_text() for path in mine] == ["mine", "mine"]
 
 
 def test_a_foreign_dataset_is_refused_before_any_episode_is_made(tmp_path: Path) -> None:
@@ -156,16 +137,9 @@ def test_a_foreign_dataset_is_refused_before_any_episode_is_made(tmp_path: Path)
     assert info.read_text() == '{"codebase_version": "v3.0"}'
 
 
-@pytest.mark.parametrize("damage", ["flip", "swap"])
-def test_damaged_recordings_are_set_aside_and_made_again(finished: Path, reference: RunResult, damage: str) -> None:
-    files = sorted((finished / "episodes").glob("*"))
-    victim, other = files[1], files[2]
-    good = victim.read_bytes()
-    bad = {
-        "flip": bytes([good[0] ^ 1]) + good[1:],
-        "swap": other.read_bytes(),
-    }[damage]
-    assert bad != good
+def test_damaged_recordings_are_set_aside_and_made_again(finished: Path, reference: RunResult) -> None:
+    victim, other = sorted((finished / "episodes").glob("*"))[1:3]
+    good, bad = victim.read_bytes(), other.read_bytes()
     victim.write_bytes(bad)
     heard = Remembers()
     result = run_fake(finished, progress=heard)
@@ -190,12 +164,6 @@ def test_a_lost_or_damaged_run_json_is_rebuilt_from_the_recordings(
     if content is not None:
         assert (finished / "run.json.damaged").read_bytes() == content
         assert "damaged" in heard.said[0]
-
-
-def test_without_run_json_another_config_is_still_refused(finished: Path) -> None:
-    (finished / "run.json").unlink()
-    with pytest.raises(ConfigError, match="seed is 0 there and 1 here"):
-        run_fake(finished, seed=1)
 
 
 def test_a_recording_of_another_run_is_set_aside(tmp_path: Path, reference: RunResult) -> None:
@@ -232,7 +200,6 @@ def test_a_temporary_file_system_error_is_survived(tmp_path: Path, reference: Ru
     ("maker", "error", "message"),
     [
         ("fill_the_disk", GenerationError, "the disk is full; fix that and run the same command again"),
-        ("write_too_much", GenerationError, r"larger than files may be there \(ulimit -f\); fix that"),
         ("break_the_disk", GenerationError, r"failed to be made 5 times.*Input/output error: check the storage"),
         ("raise_a_bug", GenerationError, r"Episode 2 raised LocalError: the cube is a sphere \(the traceback is in"),
         ("raise_ours", GenerationError, r"Episode \d cannot be made: No OpenGL library was found."),

@@ -34,7 +34,7 @@ from demorec.mcap.part_file import PartFile
 from demorec.mcap.writer import BatchWriter
 from demorec.robots.motors import Motors
 from demorec.runs.recorded import inspect_recording
-from demorec.runs.run_file import Generation, RunFile, save_run_file
+from demorec.runs.run_file import GeneratedRun, save_run_file
 from support.mcap import metadata_of
 
 Images = list[dict[str, CameraImages]]
@@ -68,9 +68,8 @@ def simulate_run(folder: Path, num_episodes: int, **config: Any) -> Path:
         attempts.append(replace(inspect_recording(folder / file)[0], file=file))
         assert attempts[-1].success
     (folder / "failed").mkdir(exist_ok=True)
-    run = RunFile(
-        generation=Generation(config=GenerateConfig(**config), versions={}, num_episodes=num_episodes),
-        attempts=tuple(attempts),
+    run = GeneratedRun(
+        config=GenerateConfig(**config), versions={}, num_episodes=num_episodes, attempts=tuple(attempts)
     )
     save_run_file(run, folder)
     return folder

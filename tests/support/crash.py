@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -42,7 +41,6 @@ class Running:
         program: Takes the command line, and ends by SystemExit.
         at: Number of a change, from 1; 0 for none.
         act: Called in the child before that change with 0, before the next one with 1, and so on.
-        max_bytes: Size that no file may exceed, as on a full disk; 0 for any.
     """
 
     def __init__(
@@ -53,7 +51,6 @@ class Running:
         program: Callable[[list[str]], object] = main,
         at: int = 0,
         act: Callable[[int], object] = lambda number: None,
-        max_bytes: int = 0,
     ) -> None:
         self._said, said = os.pipe()
         self._counted, counted = os.pipe()
@@ -65,10 +62,6 @@ class Running:
                 os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
                 os.dup2(said, 2)
                 sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
-                if max_bytes:
-                    # Python would leave partial bytecode.
-                    sys.dont_write_bytecode, os.environ["PYTHONDONTWRITEBYTECODE"] = True, "1"
-                    resource.setrlimit(resource.RLIMIT_FSIZE, (max_bytes, max_bytes))
                 _count_changes(folder, at, act, counted)
                 program(list(words))
             except SystemExit as ended:

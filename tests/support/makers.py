@@ -9,7 +9,6 @@ import errno
 import hashlib
 import json
 import os
-import resource
 import signal
 import time
 from pathlib import Path
@@ -91,14 +90,6 @@ def fill_the_disk(plan: EpisodePlan, folder: Path) -> Attempt:
             raise OSError(errno.ENOSPC, "No space left on device")
         except OSError as error:
             raise RuntimeError("the writer failed") from error
-    return make(plan, folder)
-
-
-def write_too_much(plan: EpisodePlan, folder: Path) -> Attempt:
-    """Write more at episode 2 than the process's limit of file sizes (ulimit -f) allows."""
-    if plan.episode_index == 2:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000))
-        (folder / "unfinished" / "large.part").write_bytes(bytes(2000))
     return make(plan, folder)
 
 

@@ -23,10 +23,9 @@ PATTERNS = {
 
 
 class OddSentence(NamedTuple):
-    """A sentence with signs, and the line at which its text begins."""
+    """A sentence with signs."""
 
     path: Path
-    line: int
     signs: tuple[str, ...]
     sentence: str
 
@@ -42,34 +41,30 @@ def read(paths: Iterable[Path]) -> tuple[list[OddSentence], int]:
     odd, count = list[OddSentence](), 0
     for path in paths:
         texts = _markdown if path.suffix == ".md" else _python
-        for line, text in texts(path.read_text(encoding="utf-8")):
+        for text in texts(path.read_text(encoding="utf-8")):
             for sentence in _sentences(text):
                 count += 1
                 if signs := signs_of(sentence):
-                    odd.append(OddSentence(path, line, signs, sentence))
+                    odd.append(OddSentence(path, signs, sentence))
     return odd, count
 
 
-def _python(source: str) -> Iterator[tuple[int, str]]:
-    """(line, text) of strings and comments."""
+def _python(source: str) -> Iterator[str]:
+    """Strings and comments."""
     for node in ast.walk(ast.parse(source)):
         if isinstance(node, ast.Constant) and isinstance(node.value, str):
-            yield node.lineno, node.value
+            yield node.value
     for comment in re.finditer(r"(?m)(?:^ *# .*\n)+|(?<=  )# .*", source):
-        yield _line(source, comment), re.sub(r"(?m)^ *# ", "", comment[0])
+        yield re.sub(r"(?m)^ *# ", "", comment[0])
 
 
-def _markdown(source: str) -> Iterator[tuple[int, str]]:
-    """(line, text) of paragraphs, items of lists and table cells, without code."""
+def _markdown(source: str) -> Iterator[str]:
+    """Paragraphs, items of lists and table cells, without code."""
     code = r"(?ms)^ *```.*?^ *```$|^(?: {4}|!\[|<)[^\n]*$"
-    prose = re.sub(code, lambda found: "\n" * found[0].count("\n"), source)
+    prose = re.sub(code, "", source)
     for block in re.finditer(r"(?s)\S.*?(?=\n\s*\n|\n\||\n *[-*] |\n *\d+\. |\Z)", prose):
         for cell in block[0].split("|"):
-            yield _line(prose, block), re.sub(r"`[^`]*`", "X", cell)
-
-
-def _line(source: str, found: re.Match[str]) -> int:
-    return source.count("\n", 0, found.start()) + 1
+            yield re.sub(r"`[^`]*`", "X", cell)
 
 
 def _sentences(text: str) -> Iterator[str]:

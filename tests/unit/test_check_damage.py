@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from support.check import flip_bits
 from support.commands import exit_code
-from support.export import make_run
 from support.recording import write_episode
 
 from demorec.check.report import CheckOptions, Subject, check_subject
@@ -35,19 +34,3 @@ def test_a_flipped_bit_is_one_finding(damaged: Path, capsys: pytest.CaptureFixtu
     assert "inf" not in text
     report = check_subject(Subject(path=damaged, kind="recording"), CheckOptions())
     assert [finding.check for finding in report.findings] == ["checksums"]
-
-
-def test_damaged_parts_are_listed_and_good_ones_are_not(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    folder = make_run(tmp_path / "run", [4, 5, 6], cameras=()) / "episodes"
-    only = ("--only", "opens", "checksums", "missing_numbers", "--no-images")
-    code, out = check(folder, capsys, *only)
-    assert code == 0
-    assert out.splitlines()[1].startswith("good: 3 episodes, 15 frames")
-    damaged = folder / "episode_000001.mcap"
-    damaged.write_bytes(damaged.read_bytes()[:200])
-    code, out = check(folder, capsys, *only)
-    assert code == 1
-    assert out.splitlines()[1] == "broken: 3 episodes, 10 frames; 1 broken, 2 good"
-    assert "episode_000001.mcap" in out
-    assert "episode_000000" not in out
-    assert "good    episode 0" in check(folder, capsys, *only, "--all")[1]

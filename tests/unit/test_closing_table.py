@@ -13,11 +13,11 @@ from support.check import simulate_run
 from demorec.cli.generate_report import check_run, next_commands
 from demorec.core.config import GenerateConfig
 from demorec.generate.options import RunResult
-from demorec.runs.run_file import Generation, RunFile, load_run_file, save_run_file
+from demorec.runs.run_file import GeneratedRun, load_run_file, save_run_file
 
 
 def result_of(folder: Path) -> RunResult:
-    run = RunFile(generation=Generation(config=GenerateConfig(), versions={}, num_episodes=1))
+    run = GeneratedRun(config=GenerateConfig(), versions={}, num_episodes=1)
     return RunResult(folder=folder, run=run, made=(), interrupted=False)
 
 
@@ -32,7 +32,7 @@ def test_a_shell_parses_the_commands_correctly(monkeypatch: pytest.MonkeyPatch, 
 def test_the_users_modules_are_allowed_in_them() -> None:
     config = GenerateConfig(task="mytask:Mine", robot="lab.arms:A1", cameras=("front", "lab.arms:CORNER"))
     result = result_of(Path("/data"))
-    result = replace(result, run=result.run.with_generation(config=config))
+    result = replace(result, run=replace(result.run, config=config))
     for line in next_commands(result):
         assert shlex.split(line)[2:] == ["/data", "--allow", "mytask", "--allow", "lab.arms"]
 
@@ -43,7 +43,7 @@ def test_the_checks_that_warned_are_named(tmp_path: Path) -> None:
     run = load_run_file(folder)
     complete = RunResult(folder=folder, run=run, made=(), interrupted=False)
     assert check_run(complete, progress=lambda done, total: None) == ("none failed, 0 warnings", [])
-    save_run_file(run.with_generation(num_episodes=2), folder)
+    save_run_file(replace(run, num_episodes=2), folder)
     summary, failures = check_run(complete, progress=lambda done, total: None)
     assert summary == "none failed, 1 warning (run_complete)"
     assert failures == []

@@ -19,12 +19,9 @@ from demorec.core.errors import RecordingError, describe_error, resource_error
     ("error", "words"),
     [
         (MemoryError(), "memory"),
-        (OSError(errno.ENOMEM, "Cannot allocate memory"), "memory"),
         (OSError(errno.EMFILE, "Too many open files"), "ulimit -n"),
-        (OSError(errno.ENFILE, "Too many open files in system"), "open on this machine"),
         (ImportError("libtorch_cpu.so: failed to map segment from shared object"), "memory"),
         (ImportError("libz.so: cannot open shared object file: Too many open files"), "ulimit -n"),
-        (OSError("libllvmlite.so: failed to map segment from shared object"), "memory"),
         (OSError(errno.EIO, "Input/output error"), "storage"),
     ],
 )
@@ -73,15 +70,12 @@ def _raised(code: str) -> Exception:
         ("json.loads('{')", "it is not valid JSON, line 1"),
         ("b'\\xff'.decode()", "it is not UTF-8 text"),
         ("struct.unpack('<Q', b'ab')", "it ends within a value"),
-        ("len(5)", "a value is of another kind than expected"),
         ("None.items()", "a value is of another kind than expected"),
         ("[][3]", "it has fewer values than it should"),
         ("1 / 0", "a number is out of range"),
-        ("Path('/nothing/at/all').read_text()", "No such file or directory"),
         ("av.open('/nothing/at/all')", "No such file or directory"),
         ("raise ValueError('two lines are of episode 3.\\nAnd more.')", "two lines are of episode 3"),
         ("raise ValueError", "no reason is given"),
-        ("raise EOFError", "it ends too early"),
     ],
 )
 def test_errors_of_python_are_described_in_words(code: str, words: str) -> None:

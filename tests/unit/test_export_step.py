@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,16 +14,14 @@ from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.inspect import dataset_digest
 from demorec.generate.export_step import export_run
-from demorec.runs.run_file import Generation, RunFile, load_run_file, save_run_file
+from demorec.runs.run_file import GeneratedRun, load_run_file, save_run_file
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of made-up episodes with its dataset, to be copied."""
     folder = make_run(tmp_path_factory.mktemp("run") / "run", (5, 4))
-    save_run_file(
-        RunFile(generation=Generation(config=GenerateConfig(), versions=deciding_versions(), num_episodes=2)), folder
-    )
+    save_run_file(GeneratedRun(config=GenerateConfig(), versions=deciding_versions(), num_episodes=2), folder)
     with pytest.MonkeyPatch.context() as patch:
         without_verification(patch)
         export_run(folder, repo_id="me/cubes")
@@ -107,7 +106,7 @@ def test_a_dataset_with_foreign_files_is_set_aside_when_the_run_has_changed(run:
 @pytest.mark.parametrize("is_known", [True, False])
 def test_an_edited_card_is_kept_when_the_run_has_changed(run: Path, is_known: bool) -> None:
     if not is_known:  # the run file was lost
-        save_run_file(load_run_file(run).with_generation(export=None), run)
+        save_run_file(replace(load_run_file(run), export=None), run)
         configs: dict[str, object] = {load_run_file(run).config_digest: {}}
         (run / "dataset" / "demorec" / "configs.json").write_text(json.dumps(configs))
     with (run / "dataset" / "README.md").open("a") as card:
@@ -136,7 +135,7 @@ def test_a_third_party_dataset_is_left_alone(run: Path) -> None:
 
 
 def test_a_dataset_is_recognised_after_its_run_file_was_lost(run: Path) -> None:
-    lost = load_run_file(run).with_generation(export=None)
+    lost = replace(load_run_file(run), export=None)
     (run / "dataset" / "demorec" / "configs.json").write_text(json.dumps({lost.config_digest: {}}))
     before = files_of(run / "dataset")
     save_run_file(lost, run)
@@ -150,7 +149,7 @@ def test_a_dataset_of_other_episodes_is_left_alone_when_the_run_file_was_lost(ru
     configs = run / "dataset" / "demorec" / "configs.json"
     configs.write_text(json.dumps({**json.loads(configs.read_text()), "0" * 16: {}}))
     before = files_of(run / "dataset")
-    save_run_file(load_run_file(run).with_generation(export=None), run)
+    save_run_file(replace(load_run_file(run), export=None), run)
     with pytest.raises(ConfigError, match="in the way"):
         export_run(run, repo_id="me/cubes")
     assert files_of(run / "dataset") == before

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
@@ -128,11 +127,6 @@ def test_commands_that_render_may_take_more(words: list[str], file: Path) -> Non
 
 
 @pytest.mark.slow
-def test_the_limits_can_be_removed(file: Path) -> None:
-    assert run(FILL, "info", file, environment={"DEMOREC_LIMITS": "off"}).output == "filled\n"
-
-
-@pytest.mark.slow
 def test_too_much_cpu_time_is_one_sentence(file: Path) -> None:
     ended = run(SPIN, "info", file, environment={"TEST_CPU_S": "1"})
     assert ended.code == 1
@@ -170,16 +164,6 @@ def test_the_child_dies_with_its_parent(file: Path) -> None:
     process.wait()
     _, alive = psutil.wait_procs([child], timeout=20)
     assert not alive
-
-
-@pytest.mark.slow
-def test_a_stopped_child_continues(file: Path) -> None:
-    process, child = started(COUNT, "info", file)
-    child.suspend()
-    time.sleep(0.2)
-    assert process.poll() is None
-    child.resume()
-    assert process.wait(20) == 0
 
 
 def test_limits_grow_with_the_named_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

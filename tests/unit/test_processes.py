@@ -11,8 +11,6 @@ from pathlib import Path
 import psutil
 import pytest
 
-from demorec.core.processes import start_program
-
 SCRIPT = """
 import sys
 from concurrent.futures import ProcessPoolExecutor
@@ -44,54 +42,6 @@ def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
     expected = ["[2.0, 3.0]", "child", "end", "script"]
     assert sorted(told("script.py", cwd=tmp_path)) == expected
     assert sorted(told("-m", "script", cwd=tmp_path)) == expected
-
-
-def test_python_itself_would_run_the_script_again(tmp_path: Path) -> None:
-    """Otherwise the test above would prove nothing."""
-    plain = "from multiprocessing import get_context; SPAWN = get_context('spawn')"
-    (tmp_path / "script.py").write_text(SCRIPT.replace("from demorec.core.processes import SPAWN", plain))
-    done = subprocess.run([sys.executable, "script.py"], cwd=tmp_path, capture_output=True, text=True, check=False)
-    assert done.returncode != 0
-    assert "bootstrapping phase" in done.stderr
-
-
-IN_A_CALLBACK = """
-import os, signal, time, weakref
-
-class Thing:
-    pass
-
-def interrupted(_):
-    os.kill(os.getpid(), signal.SIGINT)
-    for _ in range(1000):
-        pass
-
-def work():
-    thing = Thing()
-    kept = weakref.ref(thing, interrupted)
-    del thing
-    for _ in range(6000):
-        time.sleep(0.01)
-    print("it goes on")
-"""
-STARTS_IT = """
-from work import work
-from demorec.core.processes import SPAWN
-
-process = SPAWN.Process(target=work)
-process.start()
-process.join()
-print(process.exitcode)
-"""
-
-
-def test_ctrl_c_in_a_callback_is_handled_and_not_printed(tmp_path: Path) -> None:
-    (tmp_path / "work.py").write_text(IN_A_CALLBACK)
-    (tmp_path / "script.py").write_text(STARTS_IT)
-    done = subprocess.run(
-        [sys.executable, "-c", "import script"], cwd=tmp_path, capture_output=True, text=True, check=False
-    )
-    assert (done.stdout.split(), done.stderr) == (["130"], "")
 
 
 SLEEPS = """
@@ -148,17 +98,6 @@ def test_a_program_ends_with_the_process_that_started_it(tmp_path: Path) -> None
     parent.wait()
     _, alive = psutil.wait_procs(descendants, timeout=20)
     assert not alive
-
-
-def test_a_program_ends_on_request_and_reports_its_exit_code() -> None:
-    command = [sys.executable, "-c", "import time; print('ready', flush=True); time.sleep(600)"]
-    process = start_program(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline() == "ready\n"
-    process.terminate()
-    assert process.wait(20) == -signal.SIGTERM
-    with start_program([sys.executable, "-c", "raise SystemExit(7)"]) as failing:
-        assert failing.wait(20) == 7
 
 
 def test_a_signal_during_exit_prints_no_traceback() -> None:

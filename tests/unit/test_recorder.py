@@ -256,7 +256,7 @@ def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:
             run.episode()
     with recorder(tmp_path / "run", robot="ur5", fps=20) as run:
         episode = run.episode()
-        with pytest.raises(ConfigError, match=r"robot is ur5 instead of so101; fps is 20 instead of 30; feature"):
+        with pytest.raises(ConfigError, match="robot is so101 there and ur5 here; fps is 30 there and 20 "):
             episode.write([0.0, 1.0])
     with recorder(tmp_path / "run", task="") as run, pytest.raises(ConfigError, match="no task text"):
         run.episode()

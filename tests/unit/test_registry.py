@@ -20,16 +20,6 @@ def test_a_name_that_the_module_lacks_gets_the_nearest_match() -> None:
         SHAPES.load("fractions:Fracton", ["fractions"])
 
 
-def test_of_many_names_the_refusal_names_the_command_that_lists_them() -> None:
-    many: Registry[type] = Registry(kind="law", rows={f"law_{number}": "collections:Counter" for number in range(31)})
-    with pytest.raises(ConfigError) as refused:
-        many.load("law_33")
-    assert str(refused.value).endswith("Allowed: those of demorec list laws.")
-    assert "Did you mean 'law_3" in str(refused.value)
-    with pytest.raises(ConfigError, match=r"Allowed: ordered, counter, or"):
-        SHAPES.load("law")
-
-
 @pytest.mark.parametrize("allowed", [(), ("fraction",), ("fractions.sub",), ("decimal",)])
 def test_a_third_party_object_needs_an_allowed_module(allowed: tuple[str, ...]) -> None:
     with pytest.raises(NotAllowedError, match=r"if you trust that module, add --allow fractions\."):

@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, redirect_stderr, redirect_stdout
 from pathlib import Path
 from types import NoneType
-from typing import Annotated, Any, Literal, get_args, get_origin
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
 from tyro.conf import Positional as Positional
@@ -37,6 +37,7 @@ from tyro.constructors import (
 
 from demorec.cli.shared.output import say, tell
 from demorec.core.errors import ConfigError
+from demorec.core.options import RARE
 from demorec.core.registry import is_module_name, split_name
 from demorec.core.replacing import check_targets
 from demorec.core.text import printable
@@ -49,8 +50,8 @@ _NARROWEST = 40
 _UNWRITABLE = ("Cc", "Cs", "Zl", "Zp")
 """Unicode categories of control characters, bytes that are not UTF-8, and line and paragraph separators."""
 _HELP_ALL = "--help-all"
-_left_out: dict[str, bool] = {}
-"""Field that the current command's help leaves out -> whether the command has it."""
+_hidden: set[str] | None = None
+"""Fields that the current help leaves out; None if it shows all."""
 _HINTED = object()
 """Marks a type that tyro's own rule handles."""
 
@@ -70,13 +71,12 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
     # bash does not expand ~ within quotes and in --out=~/new
     args = [_HOME.sub(lambda found: f"{found[1]}{Path.home()}", word) for word in args]
     asks_for_help = bool({"-h", "--help", _HELP_ALL} & set(args))
-    leaves_out = asks_for_help and _HELP_ALL not in args
-    rare: frozenset[str] = getattr(command, "rare_flags", frozenset()) if leaves_out else frozenset()
+    hides = asks_for_help and _HELP_ALL not in args
     # tyro draws its boxes as the encoding allows, but recognises UTF-8 in one spelling only.
     encoding = codecs.lookup(sys.stdout.encoding or "utf-8").name
     out, err = (io.TextIOWrapper(io.BytesIO(), encoding=encoding, errors="backslashreplace") for _ in range(2))
     try:
-        with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err), _leaving_out(rare) as hidden:
+        with FLAG_TYPES, redirect_stdout(out), redirect_stderr(err), _hiding(hides) as hidden:
             parsed = tyro.cli(
                 command,
                 args=["--help"] if asks_for_help else args,  # otherwise usage would lack the preceding words
@@ -89,25 +89,22 @@ def parse(command: type[Any], args: Sequence[str], *, prog: str) -> Any:
         page, write = (err, tell) if end.code else (out, say)
         page.seek(0)
         write(*_laid_out(page.read(), terminal_width()))  # tyro repeats unknown words unescaped
-        if asks_for_help and any(hidden.values()):
-            say(f"{prog} {_HELP_ALL} shows {sum(hidden.values())} more options.")
-        for word in args if end.code else ():
-            if word.startswith("-") and Path(word).exists():
-                tell(f"{prog}: write a path that begins with a dash as ./{word}")
+        if hidden:
+            say(f"{prog} {_HELP_ALL} shows {len(hidden)} more options.")
         raise
     check_targets(parsed)
     return parsed
 
 
 @contextmanager
-def _leaving_out(names: frozenset[str]) -> Iterator[Mapping[str, bool]]:
-    """Leave fields, of a command or of the dataclasses in it, out of the help; report which of them the command has."""
-    global _left_out
-    _left_out = dict.fromkeys(names, False)
+def _hiding(hides: bool) -> Iterator[set[str] | None]:
+    """Leave rare fields, of a command or of the dataclasses in it, out of the help; yield their names."""
+    global _hidden
+    _hidden = set() if hides else None
     try:
-        yield _left_out
+        yield _hidden
     finally:
-        _left_out = {}
+        _hidden = None
 
 
 def _laid_out(page: str, width: int) -> list[str]:
@@ -127,13 +124,16 @@ def _with_hints(info: StructTypeInfo) -> StructConstructorSpec | None:
     spec = ConstructorRegistry.get_struct_spec(dataclasses.replace(info, markers=(*info.markers, _HINTED)))
     if not isinstance(spec, StructConstructorSpec):
         return None
+    hints = {} if _hidden is None else get_type_hints(info.type, include_extras=True)
     fields = []
     for field in spec.fields:
         hint = "(required)" if field.default is MISSING_NONPROP else "" if field.default in (None, "", ()) else None
         kind: Any = field.type if hint is None else Annotated[field.type, tyro.conf.arg(help_behavior_hint=hint)]
-        if field.name in _left_out:
+        if _hidden is not None and RARE in get_args(hints.get(field.name)):
             kind = Annotated[kind, tyro.conf.Suppress]
-            _left_out[field.name] = True
+            inner: Any = get_args(hints[field.name])[0]
+            is_group = dataclasses.is_dataclass(inner)
+            _hidden.update(one.name for one in dataclasses.fields(inner)) if is_group else _hidden.add(field.name)
         text = field.helptext() if callable(field.helptext) else field.helptext
         fields.append(dataclasses.replace(field, type=kind, helptext=" ".join((text or "").split())))
     return dataclasses.replace(spec, fields=tuple(fields))

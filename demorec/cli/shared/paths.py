@@ -124,7 +124,7 @@ def reading(
         imports_datasets: Whether the command reads datasets as recordings.
 
     Raises:
-        DemorecError: A path cannot be read, a mapping is impossible or given without need, or the disk is too small.
+        DemorecError: A path cannot be read, or a mapping is impossible or given without need.
     """
     if mapping is None and not any(import_kind(path, imports_datasets) for path in paths):
         yield tuple(paths)

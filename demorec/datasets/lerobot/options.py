@@ -8,6 +8,7 @@ from pathlib import Path
 
 from demorec.annotate import KINDS, LanguageKind
 from demorec.core.errors import ConfigError, OptionError, check_option
+from demorec.core.options import Rare
 from demorec.datasets.options import CommonOptions, Exporter
 from demorec.episode.features import STATE_KINDS, StateKind
 from demorec.robots.motors import MotorUnits
@@ -25,20 +26,20 @@ class ExportOptions(CommonOptions):
     """Content of observation.state: joint (joint positions, gripper opening), joint_ee (also the TCP's pose, for
     policies that see only this vector, such as LeRobot's ACT).
     """
-    motor_units: MotorUnits | None = None
+    motor_units: Rare[MotorUnits | None] = None
     """For the SO-101: export what lerobot-record writes for the real arm (so101_follower): images, and as state and
     action the joints in degrees, or -100..100 of their ranges (range_m100_100, as LeRobot without use_degrees), and the
     gripper from 0 to 100 (docs/robots.md).
     """
-    calibration: Path | None = None
+    calibration: Rare[Path | None] = None
     """With --motor-units: LeRobot's calibration file of your arm (auto: an arm that matches its URDF)."""
     language: tuple[str, ...] | None = None
     """Add LeRobot's language columns: statements about the robot's actions, derived from the recording. Selected kinds
     (subtask plan memory motion task_aug), or all that the recordings support.
     """
-    progress: bool = False
+    progress: Rare[bool] = False
     """Add the progress of each frame (0 to 1) and the stages of the task, for LeRobot's sample weighting and SARM."""
-    boxes: bool = False
+    boxes: Rare[bool] = False
     """Write bounding boxes of visible objects next to the dataset, in COCO's format (for recordings with
     segmentation).
     """
@@ -46,25 +47,25 @@ class ExportOptions(CommonOptions):
     """Name of the dataset on the Hub, OWNER/NAME; also written into its card."""
     append: bool = False
     """Add the episodes to the existing dataset."""
-    allow_duplicates: bool = False
+    allow_duplicates: Rare[bool] = False
     """With --append: add episodes again that the dataset already contains, instead of refusing them."""
-    intervention: bool = False
+    intervention: Rare[bool] = False
     """Add the column intervention of LeRobot's DAgger: true where the expert acts in an episode that a policy began."""
     verify: bool = True
     """Open the finished dataset with LeRobot, if installed, and compare samples with the recordings."""
-    workers: int = 0
+    workers: Rare[int] = 0
     """Processes that read recordings; 0: as many as are useful."""
     push_to_hub: bool = False
     """Upload the dataset to the Hugging Face Hub as --repo-id."""
-    public: bool = False
+    public: Rare[bool] = False
     """Make an uploaded dataset public."""
-    license: str | None = None
+    license: Rare[str | None] = None
     """Licence in the dataset card (auto: apache-2.0 for simulated episodes, none for others)."""
-    data_files_mb: float = 100
+    data_files_mb: Rare[float] = 100
     """Maximum size of a parquet file in MiB."""
-    video_files_mb: float = 200
+    video_files_mb: Rare[float] = 200
     """Maximum size of an mp4 file in MiB."""
-    files_per_chunk: int = 1000
+    files_per_chunk: Rare[int] = 1000
     """Number of files in a chunk folder."""
 
     @property

@@ -104,7 +104,7 @@ class CheckCommand:
             workers = useful_workers(subjects, images=self.images, cores=available_cores())
         options = CheckOptions(images=self.images, colours=bool(integrity), only=integrity, workers=workers)
         options.validate()
-        with ProgressBar("checking files", total=len(files), unit="item", at_once=workers) as bar:
+        with ProgressBar("checking files", total=len(files), unit="item") as bar:
             reports = []
             for report in check_subjects(files, options):
                 reports.append(report)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from demorec.core.errors import check_option
+from demorec.core.options import Rare
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -17,7 +18,7 @@ class TakeOver:
     """Take over once the TCP that the policy commands is this far from the expert's path in the same scene, or an
     object this far from its place under the expert; 0: never.
     """
-    stray_radians: float = 0.5
+    stray_radians: Rare[float] = 0.5
     """Take over once the hand's direction differs this much from the expert's; 0: never."""
     noise: bool = True
     """Add the exploration noise of demonstrations to the expert's commands; labels stay clean."""

@@ -6,13 +6,14 @@ from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from demorec.cli.shared.flags import Allow, allowed_modules
 from demorec.cli.shared.output import ProgressBar, say, say_json
 from demorec.cli.shared.paths import refuse_inside
 from demorec.core.config import GenerateConfig, VideoConfig
 from demorec.core.errors import ConfigError, check_option
+from demorec.core.options import Rare
 from demorec.core.replacing import OptionalTarget
 from demorec.extensions.policies import TakeOver
 
@@ -29,30 +30,15 @@ _SCENES = ("task", "robot", "objects", "object_split", "split", "seed", "variati
 class RolloutFlags:
     """Policy, scenes and recording options; each command has its own default of `split`."""
 
-    rare_flags: ClassVar[frozenset[str]] = frozenset(
-        {
-            "object_split",
-            "action_steps",
-            "episode_length",
-            "renderer",
-            "allow",
-            "gop",
-            "crf",
-            "preset",
-            "jpeg_quality",
-            "stray_radians",
-            "objects",
-        }
-    )
     policy: Path | None = None
     """Output folder of lerobot-train, or a pretrained_model folder."""
     task: str = "pick_place"
     """A name from `demorec list tasks`, or my_package.my_module:MyTask."""
     robot: str = "panda"
     """A name from `demorec list robots`, or my_package.my_module:MY_ARM."""
-    objects: tuple[str, ...] = ()
+    objects: Rare[tuple[str, ...]] = ()
     """Shelves that the task draws from, as in generate-dataset."""
-    object_split: Split = "all"
+    object_split: Rare[Split] = "all"
     """Shapes of the shelves: eval has those that generate-dataset --object-split train leaves out."""
     cameras: tuple[str, ...] = ()
     """Your own cameras that the policy sees, as my_package.my_module:MY_CAMERA; it names the others itself."""
@@ -64,21 +50,21 @@ class RolloutFlags:
     """Folder for the results (auto: one per task)."""
     action: str | None = None
     """joint, joint_increment, ee or ee_delta (auto: as in the dataset that the policy was trained on)."""
-    action_steps: int | None = None
+    action_steps: Rare[int | None] = None
     """Actions to execute before the policy is queried again (auto: as trained)."""
-    episode_length: int | None = None
+    episode_length: Rare[int | None] = None
     """Time limit in frames (auto: 15 s per object to be moved)."""
     fps: int = 30
     """Frames per second, as in the dataset."""
     variation: Literal["none", "mild", "full"] = "mild"
     """How much the scenes vary, as in generate-dataset."""
-    renderer: str | None = None
+    renderer: Rare[str | None] = None
     """Renderer for a policy that uses images (auto: that of generate-dataset)."""
     video: VideoConfig = field(default_factory=VideoConfig)
     """Encoding of the recorded images."""
     workers: int | None = None
     """Processes (auto: one per core)."""
-    allow: Allow = ()
+    allow: Rare[Allow] = ()
     """A module or package of your own that may be imported for the cameras and steps that the policy names."""
     overwrite: bool = False
     """Delete this command's earlier results in the output folder and start again."""
@@ -104,7 +90,7 @@ class RolloutFlags:
             allowed=allowed_modules(self.allow),
         )
         workers = self.workers or available_cores()
-        with ProgressBar(title, total=self.num_episodes, unit="rollout", at_once=workers) as bar:
+        with ProgressBar(title, total=self.num_episodes, unit="rollout") as bar:
 
             def progress(evaluation: Evaluation) -> None:
                 bar.note(str(evaluation.rate))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, nullcontext, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,17 +13,9 @@ from typing import Any
 from demorec.core.config import GenerateConfig, deciding_versions
 from demorec.core.errors import ConfigError, DemorecError, GenerationError, describe_error, resource_error, write_error
 from demorec.core.files import LOCK_NAME, make_folder, read_json_object, replace_text, run_lock
-from demorec.core.own_versions import differences
-from demorec.core.plain import from_plain, to_plain
-from demorec.core.replacing import (
-    ReplaceableKind,
-    check_replaceable,
-    check_unsettled_parts,
-    json_object,
-    obstacle,
-    replaced_parts,
-    settle_parts,
-)
+from demorec.core.own_versions import version_differences
+from demorec.core.plain import from_plain, plain_differences, to_plain
+from demorec.core.replacing import ReplaceableKind, check_replaceable, delete_parts, json_object, obstacle
 from demorec.episode.features import ActionKind, StateKind
 from demorec.extensions.policies import TakeOver
 from demorec.extensions.policies.statistics import Rate
@@ -31,8 +23,8 @@ from demorec.generate.contents import foreign_recordings
 from demorec.runs.find import EVALUATION_NAME
 from demorec.runs.run_file import EPISODES, FAILED, Attempt
 
-_PARTS = (EVALUATION_NAME, EPISODES, FAILED)
-"""Names that an evaluation writes; other files in its folder are never touched."""
+_PARTS = (EPISODES, FAILED, EVALUATION_NAME)
+"""Names that an evaluation writes, and the file that marks it; other files in its folder are never touched."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -100,15 +92,13 @@ def load_evaluation(folder: Path) -> Evaluation:
 @contextmanager
 def open_evaluation(settings: Settings, out: Path, *, overwrite: bool) -> Iterator[Evaluation]:
     """Yield the existing evaluation, or a new one; the folder is locked until the context ends."""
-    if not check_unsettled_parts(out, _PARTS):
-        _check_place(out, overwrite=overwrite)  # leaves no lock in a refused folder
+    _check_place(out, overwrite=overwrite)  # leaves no lock in a refused folder
     make_folder(out)
     with run_lock(out):
-        settle_parts(out, _PARTS)
         _check_place(out, overwrite=overwrite)
-        with replaced_parts(out, _PARTS) if overwrite and (out / EVALUATION_NAME).is_file() else nullcontext():
-            evaluation = _begin_or_continue(settings, out)
-        yield evaluation
+        if overwrite:
+            delete_parts(out, _PARTS)
+        yield _begin_or_continue(settings, out)
 
 
 def _check_place(out: Path, *, overwrite: bool) -> None:
@@ -128,7 +118,7 @@ def _begin_or_continue(settings: Settings, out: Path) -> Evaluation:
     if (out / EVALUATION_NAME).is_file():
         evaluation = load_evaluation(out)
         there, here = _deciding(evaluation.settings), _deciding(settings)
-        if lines := differences(there, evaluation.versions, here, versions):
+        if lines := plain_differences(there, here) + version_differences(evaluation.versions, versions):
             advice = "choose another --out" + ("" if obstacle(out, EVALUATION) else " or --overwrite")
             raise ConfigError(f"Another evaluation is in this folder ({'; '.join(lines)}): {advice}: {out}")
         kept = [r for r in evaluation.rollouts if (out / r.file).is_file()]

@@ -61,7 +61,7 @@ class Render:
         workers = min(self.workers or available_cores(), len(jobs))
         reports: list[RerenderReport] = []
         try:
-            with ProgressBar("rendering", total=len(jobs), at_once=workers) as bar:
+            with ProgressBar("rendering", total=len(jobs)) as bar:
                 for report in in_turn(partial(_draw, self.options, allowed, self.overwrite), jobs, workers):
                     bar.advance()
                     reports.append(report)

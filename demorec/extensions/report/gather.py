@@ -32,6 +32,7 @@ from demorec.runs.run_file import (
     RUN_NAME,
     Attempt,
     DamagedRunFileError,
+    GeneratedRun,
     RunFile,
     load_any_run_file,
 )
@@ -201,7 +202,7 @@ def _recordings_report(
     run, missing = _run_file(found)
     stride, budget = -(-len(files) // MAX_SHOWN), strip_budget(len(files))
     components: Components = {}
-    beyond = () if run is None or run.generation is None else run.beyond
+    beyond = run.beyond if isinstance(run, GeneratedRun) else ()
     unrequested = {found.path / attempt.file for attempt in beyond}
     if unrequested:
         missing += (f"{len(unrequested)} recordings of episodes beyond the number last requested are left out.",)
@@ -217,7 +218,7 @@ def _recordings_report(
     if run is not None:
         episodes += [_without_recording(attempt) for attempt in run.attempts if not attempt.file]
     facts = [("attempts" if found.failed else "recordings", str(len(episodes)))]
-    if run is not None and run.generation is not None:
+    if isinstance(run, GeneratedRun):
         facts.insert(0, ("episodes", f"{len(run.successes)} of {run.num_episodes} asked"))
     facts += _common_facts(episodes, files)
     if run is not None:

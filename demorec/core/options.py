@@ -1,0 +1,10 @@
+"""Marks of options, which are fields of dataclasses."""
+
+from __future__ import annotations
+
+from typing import Annotated, TypeVar
+
+T = TypeVar("T")
+RARE = object()
+Rare = Annotated[T, RARE]
+"""Type of an option, or of a dataclass of options, that --help leaves out and --help-all shows."""
