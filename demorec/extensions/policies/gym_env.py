@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -29,7 +29,6 @@ from demorec.episode.features import STATE_KINDS, ActionKind, StateKind
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.scene import Scene
 from demorec.episode.simulated import on_request, with_simulation
-from demorec.episode.variation import Preset
 from demorec.loop import PreparedEpisode, Session, SimulatorCache, Step, prepare
 from demorec.loop.actions import ACTION_KINDS, ActionDecoder, action_bounds
 from demorec.render.painter import Painter, WarmRenderer
@@ -83,12 +82,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
 
     Args:
         task: A name of `demorec list tasks`, or package.module:Name.
-        split: "eval": scenes and seeds that `generate-dataset --split train` leaves out; "train", "all": those that it
-            generates.
-        seed: Root of all scenes, as in `generate-dataset`.
-        variation: How much the scenes differ.
-        objects, object_split, robot, fps, physics_hz, width, height, renderer: As in `generate-dataset`.
-        cameras: Names of `demorec list cameras`.
         privileged: Whether to return `environment_state`. None: only without cameras, and only if all scenes of the
             task have an equally long vector, since a space has a fixed length.
         sensed: Optional features that datasets contain only on request (`export --features`), such as
@@ -99,7 +92,9 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         render_mode: None or "rgb_array".
         render_camera: Camera for `render`.
         render_width, render_height: Size of these images, pixels.
-        config: Full configuration of scenes and images; replaces the arguments above that it contains.
+        config: Full configuration of scenes and images; replaces `task` and `options`.
+        options: Fields of `GenerateConfig`, as in `generate-dataset`; None counts as not given. By default there are no
+            cameras, and `split` is "eval": scenes and seeds that `generate-dataset --split train` leaves out.
 
     Raises:
         ConfigError: Unknown name or invalid value.
@@ -114,18 +109,6 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         self,
         task: str = "pick_place",
         *,
-        split: Literal["all", "train", "eval"] = "eval",
-        seed: int = 0,
-        variation: Preset = "mild",
-        objects: Collection[str] = (),
-        object_split: Literal["all", "train", "eval"] = "all",
-        robot: str = "panda",
-        fps: int = 30,
-        physics_hz: int = 240,
-        cameras: tuple[str, ...] = (),
-        width: int = 224,
-        height: int = 224,
-        renderer: str | None = None,
         privileged: bool | None = None,
         sensed: Collection[str] = (),
         state: StateKind = "joint",
@@ -136,23 +119,12 @@ class DemorecEnv(gymnasium.Env):  # type: ignore[misc]
         render_width: int = 320,
         render_height: int = 240,
         config: GenerateConfig | None = None,
+        **options: Any,
     ) -> None:
         if config is None:
-            config = GenerateConfig(
-                task=task,
-                split=split,
-                seed=seed,
-                variation=variation,
-                objects=tuple(objects),
-                object_split=object_split,
-                robot=robot,
-                fps=fps,
-                physics_hz=physics_hz,
-                cameras=tuple(cameras),
-                width=width,
-                height=height,
-                renderer=renderer or GenerateConfig.renderer,
-            )
+            given = {name: value for name, value in options.items() if value is not None}
+            given |= {name: tuple(given.get(name, ())) for name in ("cameras", "objects")}
+            config = GenerateConfig(**{"task": task, "split": "eval", **given})
         config.validate()
         self._action_kind = check_choice("action", action, ACTION_KINDS)
         self._state_kind = check_choice("state", state, STATE_KINDS)

@@ -74,7 +74,7 @@ class SimulatedArm(Robot):  # type: ignore[misc]
             split="train",
             robot=self.row,
             seed=config.seed,
-            variation=config.variation,  # type: ignore[arg-type]  # which is checked there
+            variation=config.variation,
             cameras=tuple(config.cameras),
             width=config.width,
             height=config.height,
