@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from demorec.core.plain import to_plain
 from demorec.episode.episode import Outcome, Table, Trajectory
 from demorec.episode.features import (
     ACTION,
@@ -110,15 +109,6 @@ def simulated_table(trajectory: Trajectory, info: EpisodeInfo) -> Table:
 def on_request(info: EpisodeInfo) -> tuple[Feature, ...]:
     """Return the observations that datasets and environments include only on request."""
     return tuple(feature for feature in info.features if feature.name in (EFFORT, CONTACT_FORCE) or feature.stream)
-
-
-def description_of(info: EpisodeInfo) -> dict[str, Any]:
-    """Return the description as plain data, without the versions and the CPU that made the episode."""
-    plain: dict[str, Any] = to_plain(info)
-    del plain["versions"]
-    if info.simulation is not None:
-        del plain["simulation"]["cpu"]
-    return plain
 
 
 def simulation_facts(info: EpisodeInfo) -> Mapping[str, Any]:

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import RecordingError, without_path
 from demorec.core.files import Closing
-from demorec.core.plain import to_json
+from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointSample, Table, Trajectory
 from demorec.episode.info import DEPTH_UNITS, NOT_SIMULATED, EpisodeInfo
 from demorec.episode.protocol import Box, SceneMotion
-from demorec.episode.simulated import description_of, has_failed, simulated_table
+from demorec.episode.simulated import has_failed, simulated_table
 from demorec.episode.validity import find_problems
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.columns import TimedMessages, read_columns
@@ -435,7 +435,11 @@ class Recording(Closing):
         File layout and software versions are excluded: two recordings with the same digest contain the same episode,
         bit-exact.
         """
-        result = hashlib.sha256(json.dumps(description_of(self.info), sort_keys=True).encode())
+        plain = to_plain(self.info)
+        del plain["versions"]
+        if self.info.simulation is not None:
+            del plain["simulation"]["cpu"]
+        result = hashlib.sha256(json.dumps(plain, sort_keys=True).encode())
         result.update(b"no outcome" if self.outcome is None else to_json(self.outcome).encode())
         for name, data in _content(self._numbers):
             result.update(name.encode() + data)

@@ -230,21 +230,14 @@ def test_a_video_that_does_not_decode(filmed: Path, tmp_path: Path) -> None:
 
 
 def test_the_command(good: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    cases = [
-        ((good,), 0),
-        ((good, "--strict", "--json"), 0),
-        ((good, "--only", "opens", "joint_limits"), 0),
-        ((good, "--only", "joint_limit"), 2),
-        ((tmp_path / "nothing",), 2),
-        ((), 2),
-    ]
-    for args, code in cases:
-        capsys.readouterr()
-        assert exit_code("check", *args) == code, args
-        if "--json" in args:
-            found = json.loads(capsys.readouterr().out)
-            assert (found["verdict"], found["findings"]) == ("good", [])
-            assert found["taken"]["observation.state"] == "state"
+    for args in ((good, "--only", "joint_limit"), (tmp_path / "nothing",), ()):
+        assert exit_code("check", *args) == 2, args
+    assert exit_code("check", good, "--only", "opens", "joint_limits") == 0
+    capsys.readouterr()
+    assert exit_code("check", good, "--strict", "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["verdict"], found["findings"]) == ("good", [])
+    assert found["taken"]["observation.state"] == "state"
 
 
 def test_unmeasured_checks_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -15,7 +15,7 @@ from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Pose
 from demorec.episode.scene import Texture
-from demorec.episode.variation import PRESETS, Ranges, resolve
+from demorec.episode.variation import PRESETS, Ranges, resolve, stated_error
 from demorec.render.procedural import texture_pixels
 from demorec.tasks.sampling import stratified_point
 
@@ -109,6 +109,10 @@ def test_calibration_error_is_between_truth_and_record() -> None:
         assert np.allclose(error.position, shift, atol=1e-9)
         # The image is drawn from the camera's true pose.
         assert np.array_equal(frame.images[name].color, reference.images[name].color)
+    behaviour = prepared.info.simulated.behaviour
+    assert stated_error("front", behaviour) is not None
+    for word, value in (("angle", math.nan), ("qy", 1.5), ("x", math.inf)):
+        assert stated_error("front", {**behaviour, f"calibration_front_{word}": value}) is None
 
 
 def test_stratified_points_are_the_known_sequences() -> None:

@@ -72,7 +72,7 @@ class Contents:
     """Everything in a recording's file.
 
     Attributes:
-        fixed: Topic, "metadata NAME" or "attachment NAME" -> field -> value, for all that is outside frames; of a topic
+        fixed: Topic or "metadata NAME" -> field -> value, for all that is outside frames; of a topic
         its type, encodings, definition and properties.
         schemas: Topic -> type of its messages.
         messages: Topic -> time in ns -> messages.
