@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from support.export import export, files_of
 from support.recording import make_episode, write_episode
 
 from demorec.cli import COMMANDS, run_command
@@ -32,12 +29,6 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     part = folder / "c.mcap.part"
     part.write_bytes(part.read_bytes()[:-3000])
     return folder
-
-
-@pytest.fixture(scope="module")
-def dataset(folder: Path) -> Path:
-    export(folder / "a.mcap", folder / "exported" / "dataset")
-    return folder / "exported" / "dataset"
 
 
 @pytest.mark.slow
@@ -66,67 +57,6 @@ def test_info_as_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert found["cameras"][0]["depth"] is True
     assert run("info", folder / "a.mcap", folder / "b.mcap", "--json") == 0
     assert [item["episode_index"] for item in json.loads(capsys.readouterr().out)] == [0, 7]
-
-
-def test_info_of_a_dataset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "meta").mkdir()
-    info = {
-        "codebase_version": "v3.0",
-        "total_episodes": 3,
-        "total_frames": 90,
-        "total_tasks": 1,
-        "fps": 30,
-        "robot_type": "panda",
-        "features": {"action": {"dtype": "float32", "shape": [8], "names": [f"j{n}" for n in range(8)]}},
-    }
-    (tmp_path / "meta" / "info.json").write_text(json.dumps(info))
-    assert run("info", tmp_path) == 0
-    text = capsys.readouterr().out
-    assert "LeRobot v3.0" in text
-    assert "90 (3.0 s at 30 Hz)" in text
-    assert "j0 .. j7" in text
-    (tmp_path / "meta" / "info.json").write_text("{}")
-    assert run("info", tmp_path) == 1
-    assert "info.json is damaged" in capsys.readouterr().err
-
-
-def empty_table(dataset: Path) -> None:
-    next((dataset / "data").glob("*/*.parquet")).write_bytes(b"")
-
-
-def drop_video(dataset: Path) -> None:
-    next((dataset / "videos/observation.images.front").glob("*/*.mp4")).unlink()
-
-
-def drop_tasks(dataset: Path) -> None:
-    (dataset / "meta" / "tasks.parquet").unlink()
-
-
-@pytest.mark.parametrize(
-    ("spoil", "words"),
-    [
-        (empty_table, "data/chunk-000/file-000.parquet"),
-        (drop_video, "videos/observation.images.front/chunk-000/file-000.mp4"),
-        (drop_tasks, "meta/tasks.parquet"),
-    ],
-)
-def test_info_lists_missing_parts_of_a_dataset(
-    dataset: Path, tmp_path: Path, spoil: Callable[[Path], None], words: str, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert run("info", dataset) == 0
-    good = capsys.readouterr().out
-    assert "problem" not in good
-    assert "digest" in good
-    spoilt = tmp_path / "d"
-    shutil.copytree(dataset, spoilt)
-    spoil(spoilt)
-    assert files_of(spoilt) != files_of(dataset)
-    assert run("info", spoilt) == 0
-    (line,) = (line for line in capsys.readouterr().out.splitlines() if line.startswith("problem"))
-    assert words in line
-    assert str(spoilt) not in line, "the first row names it"
-    assert run("info", spoilt, "--json") == 0
-    assert len(json.loads(capsys.readouterr().out)["problems"]) == 1
 
 
 def test_recover(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

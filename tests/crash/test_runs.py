@@ -285,21 +285,6 @@ def test_after_the_first_interrupt_work_ends_soon(tmp_path: Path, maker: str) ->
     assert_gone(workers)
 
 
-@pytest.mark.long
-def test_the_second_interrupt_ends_at_once(tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    process = driver(out, "make_stubbornly", 4, grace_s=10 * PATIENCE_S)
-    wait_until_busy(process, out)
-    workers = psutil.Process(process.pid).children(recursive=True)
-    process.send_signal(signal.SIGINT)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("Interrupted")  # two simultaneous signals may count as one
-    process.send_signal(signal.SIGINT)
-    process.communicate(timeout=PATIENCE_S)
-    assert process.returncode != 0
-    assert_gone(workers)
-
-
 def test_a_killed_driver_leaves_no_orphans(tmp_path: Path) -> None:
     process = driver(tmp_path / "run", "make_for_ever", 4)
     wait_until_busy(process, tmp_path / "run")
