@@ -48,7 +48,6 @@ EXTENSION = Extension(
         "household": "demorec.objects.catalog:HOUSEHOLD",
         "blocks": "demorec.objects.catalog:BLOCKS",
         "cubes": "demorec.objects.catalog:CUBES",
-        "random": "demorec.objects.folder:RANDOM",
     },
     renderers={
         "raster": "demorec.render.raster:RasterRenderer",

@@ -1,10 +1,9 @@
-"""Object sets from a folder of meshes: the user's, or the random shapes that come with PyBullet."""
+"""Object sets from a folder of the user's meshes."""
 
 from __future__ import annotations
 
 import functools
 import io
-import math
 import re
 from collections.abc import Callable, Collection
 from pathlib import Path
@@ -18,19 +17,13 @@ from demorec.core.geometry import Array
 from demorec.core.tables import OBJECTS
 from demorec.episode.mesh import MAX_EXTENT, MAX_POINTS, UNIT, SolidMesh
 from demorec.episode.words import COLOR_WORDS
-from demorec.objects.antipodal import standing_rotation
 from demorec.objects.shelf import Kind, Shelf
-from demorec.robots.assets import data_folder
 from demorec.robots.shape_files import read_obj
 
 SUFFIXES = (".obj", ".stl", ".glb")
 MAX_BYTES = 50_000_000
 WIDEST = 0.07
 """Maximum length of the narrowest side, metres; a hand of 8 cm can grip it."""
-FLAT = 2e-4
-"""Maximum distance from the plane of a face, metres, at which points belong to it."""
-RANDOM_SCALE = 0.015
-"""Scale of the files in `random_urdfs`, as in their URDFs."""
 
 
 def load_shelf(name: str, allowed: Collection[str] = ()) -> Shelf:
@@ -71,64 +64,14 @@ def _reader(files: list[Path]) -> Callable[[int], SolidMesh]:
     return lambda number: read_solid(files[number])
 
 
-def __getattr__(name: str) -> Shelf:
-    """Load `RANDOM` at its first use, since that reads a thousand files."""
-    if name != "RANDOM":
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return _random_urdfs()
-
-
-@functools.cache
-def _random_urdfs() -> Shelf:
-    """Select the shapes of pybullet_data's `random_urdfs` that are narrow enough for a hand from above.
-
-    Raises:
-        MissingDependencyError: pybullet_data is not installed.
-    """
-    files = []
-    for path in sorted(data_folder().glob("random_urdfs/*/*.obj")):
-        rows = [line.split()[1:3] for line in path.read_text().splitlines() if line.startswith("v ")]
-        sides = RANDOM_SCALE * np.ptp(np.array(rows, dtype=np.float64), axis=0)
-        if float(sides.min()) < WIDEST:
-            files.append(path)
-
-    @functools.lru_cache(maxsize=1024)
-    def shape(number: int) -> SolidMesh:
-        return on_steadiest_side(read_solid(files[number], RANDOM_SCALE))
-
-    return Shelf(kinds=(Kind(noun="blob", material="plastic", shape=shape, count=len(files)),))
-
-
-def on_steadiest_side(mesh: SolidMesh) -> SolidMesh:
-    """Turn the solid onto the face of its hull that needs the largest tilt to topple."""
-    from scipy.spatial import ConvexHull  # slow import
-
-    mesh = mesh.centred()
-    hull = ConvexHull(mesh.points)
-    best, down = 0.0, np.array([0.0, 0.0, -1.0])
-    for normal in np.unique(np.round(hull.equations[:, :3], 3), axis=0):
-        out = normal / math.sqrt(float(normal @ normal))
-        heights = mesh.points @ out
-        face = mesh.points[heights > heights.max() - FLAT]
-        across = np.cross(out, np.eye(3)[int(np.argmin(np.abs(out)))])
-        corners = np.stack([face @ across, face @ np.cross(out, across)], axis=1) / math.sqrt(float(across @ across))
-        if np.linalg.matrix_rank(corners - corners[0], tol=FLAT) < 2:
-            continue
-        steady = -float(ConvexHull(corners).equations[:, 2].max()) / float(heights.max())
-        if steady > best:
-            best, down = steady, out
-    x, y, z = (-down).tolist()
-    return mesh.moved(standing_rotation((x, y, z)), np.zeros(3))
-
-
 def _noun(stem: str) -> str:
     words = [word for word in re.findall("[a-z]+", stem.lower()) if word not in COLOR_WORDS]
     return "_".join(words) or "object"
 
 
 @functools.lru_cache(maxsize=1024)
-def read_solid(path: Path, scale: float = 1.0) -> SolidMesh:
-    """Read the solid in a mesh file (`scale` metres per unit) without convex parts, its middle at the origin.
+def read_solid(path: Path) -> SolidMesh:
+    """Read the solid in a mesh file, in metres, without convex parts, its middle at the origin.
 
     Raises:
         ConfigError: The file cannot be read, or its mesh is open, huge, too wide or has too many points.
@@ -139,7 +82,6 @@ def read_solid(path: Path, scale: float = 1.0) -> SolidMesh:
         raise ConfigError(f"The mesh cannot be read ({describe_error(error)}): {path}") from error
     if not len(faces) or not np.isfinite(points).all():
         raise ConfigError(f"The mesh has no triangles, or points that are not finite: {path}")
-    points = scale * points
     extents = points.max(axis=0) - points.min(axis=0)
     size = " x ".join(f"{side:.3g}" for side in extents.tolist())
     if float(extents.max()) > MAX_EXTENT:

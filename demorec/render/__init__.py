@@ -100,8 +100,8 @@ class RenderSetup:
 class Renderer(Protocol):
     """Interface of renderers: context managers that are reused across scenes.
 
-    `setup` is called for each scene and whenever its appearance changes, `render` at each frame. Images are a function
-    of setup and poses alone, on one type of machine.
+    `setup` is called for each scene, `render` at each frame. Images are a function of setup and poses alone, on one
+    type of machine.
     """
 
     def setup(self, setup: RenderSetup) -> None:

@@ -73,22 +73,17 @@ class Painter:
             RenderError: The renderer cannot draw a shape or camera.
         """
         self._world = world
-        self._setup = replace(self._setup, bodies=world.visuals(), mounts=world.mounts(), light=world.scene.light)
-        self._renderer.setup(self._setup)
+        bodies, mounts, light = world.visuals(), world.mounts(), world.scene.light
+        self._renderer.setup(replace(self._setup, bodies=bodies, mounts=mounts, light=light))
 
     def images(self) -> dict[str, CameraImages]:
         """Draw the world's current state: camera name -> images, with the recorded poses of the cameras.
 
         Raises:
             RuntimeError: `setup` was not called.
-            RenderError: A shape that has changed cannot be drawn.
         """
         if self._world is None:
             raise RuntimeError("the painter has no world: call setup first")
-        bodies = self._world.visuals()
-        if bodies != self._setup.bodies:  # a colour or shape has changed
-            self._setup = replace(self._setup, bodies=bodies)
-            self._renderer.setup(self._setup)
         images = self._renderer.render(self._world.poses())
         for name, error in self._true_from_recorded.items():
             images[name] = replace(images[name], world_from_camera=images[name].world_from_camera @ error)

@@ -170,18 +170,8 @@ def _without_visual_meshes(text: str, folder: Path) -> str:
     return ET.tostring(robot, encoding="unicode")
 
 
-ShapeRows = tuple[tuple[Any, ...], ...]
-"""Visual shapes as PyBullet reports them: body, link, kind, dimensions, file, position, orientation, colour."""
-
-
-def shape_rows(client: Any) -> ShapeRows:
-    """Read the visual shapes of a client; equal rows have equal appearance."""
-    return tuple(shape for body in range(client.getNumBodies()) for shape in client.getVisualShapeData(body))
-
-
 def visual_bodies(
     client: Any,
-    rows: ShapeRows,
     *,
     names: Mapping[int, str],
     textures: Mapping[int, Texture],
@@ -191,7 +181,6 @@ def visual_bodies(
 
     Args:
         client: Client with consecutively numbered bodies.
-        rows: Its `shape_rows`.
         names: Body -> name; other bodies keep PyBullet's name.
         textures: Body -> procedural texture: PyBullet cannot return its pixels.
         models: Body -> URDF and scale, for the bodies loaded by `load_urdf`.
@@ -204,7 +193,7 @@ def visual_bodies(
         dynamics = client.getDynamicsInfo(body, -1)
         name = names.get(body) or client.getBodyInfo(body)[1].decode()
         inertial_from_base = base_from_inertial(client, body).inverse()
-        visuals = [_visual(client, row, name, inertial_from_base) for row in rows if row[0] == body]
+        visuals = [_visual(client, row, name, inertial_from_base) for row in client.getVisualShapeData(body)]
         if body in models:
             visuals = list(_with_urdf_meshes(client, body, visuals, *models[body]))
         bodies.append(

@@ -20,7 +20,7 @@ from demorec.episode.scene import Body, Physics, Scene
 from demorec.render import Mount, VisualBody
 from demorec.robots.robot import RobotSpec
 from demorec.sim.arm import Arm
-from demorec.sim.bodies import ShapeRows, add_body, base_from_inertial, body_poses, shape_rows, visual_bodies
+from demorec.sim.bodies import add_body, base_from_inertial, body_poses, visual_bodies
 from demorec.sim.client import connect
 from demorec.sim.sensors import SENSORS
 
@@ -54,7 +54,6 @@ class World(Closing):
         """Joint states of the last control step, first and last excluded."""
         self._sample_joints = sample_joints
         self._scene: Scene | None = None
-        self._shape_rows: ShapeRows = ()
         self._visuals: tuple[VisualBody, ...] = ()
         self.inertial_poses: dict[str, Pose] = {}
 
@@ -87,7 +86,7 @@ class World(Closing):
         self._substeps = scene.physics.hz // self.fps
         self._steps = 0
         self.joint_samples = ()
-        self._shape_rows, self._visuals = (), ()
+        self._visuals = ()
         self.client.resetSimulation()
         set_engine(self.client, scene.physics)
         self._iterations = scene.physics.solver_iterations
@@ -200,13 +199,12 @@ class World(Closing):
         return self._specs[name]
 
     def visuals(self) -> tuple[VisualBody, ...]:
-        """Return the visible bodies in loading order; the same object until a colour or shape changes.
+        """Return the visible bodies in loading order, as at the reset.
 
         Raises:
             RenderError: A shape that no renderer draws.
         """
-        rows = shape_rows(self.client)
-        if rows != self._shape_rows or not self._visuals:
+        if not self._visuals:
             names = {index: name for name, index in self._bodies.items()} | {self.arm.body: self.robot.name}
             textures = {self._bodies[body.name]: body.texture for body in self.scene.bodies if body.texture is not None}
             models = {
@@ -214,8 +212,7 @@ class World(Closing):
                 for body in self.scene.bodies
                 if body.shape.kind == "urdf"
             } | {self.arm.body: (self.robot.urdf, self.scene.robot.scale)}
-            self._shape_rows = rows
-            self._visuals = visual_bodies(self.client, rows, names=names, textures=textures, models=models)
+            self._visuals = visual_bodies(self.client, names=names, textures=textures, models=models)
         return self._visuals
 
     def mounts(self) -> dict[str, Mount]:

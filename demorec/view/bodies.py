@@ -31,8 +31,6 @@ log = logging.getLogger(__name__)
 
 _ROD_RADIUS = 0.015
 """Radius, metres, of the rods in place of missing meshes."""
-_SAME_SIZE = 0.1
-"""Maximum difference between a model's extents and those of the recorded scene, relative to the largest extent."""
 
 
 def log_bodies(recording: rr.RecordingStream, episode: Playback, scene: Scene) -> None:
@@ -78,13 +76,10 @@ def _visible(body: Body, episode: Playback) -> rr.Mesh3D:
 def _installed_mesh(shape: Shape) -> RasterMesh | None:
     """Load the model file of a mesh or urdf in the body's frame; None, with a warning, if it is unusable."""
     try:
-        mesh = _model_mesh(shape)
-        if np.abs(np.ptp(mesh.points, axis=0) - shape.extents).max() > _SAME_SIZE * max(shape.extents):
-            raise ValueError(f"{shape.file} has another size")
+        return _model_mesh(shape)
     except (DemorecError, OSError, ValueError) as error:
         log.warning("An object is drawn as the recording describes it, since %s.", as_reason(error))
         return None
-    return mesh
 
 
 def _model_mesh(shape: Shape) -> RasterMesh:

@@ -21,7 +21,7 @@ from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
 from demorec.datasets.lerobot.recording import DatasetRecording, with_robot
 from demorec.episode.episode import Outcome, SuccessCheck
-from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE, STATE_KINDS, state_names
+from demorec.episode.features import ACTION, EE_POSE, ENVIRONMENT_STATE, STATE
 from demorec.episode.info import EpisodeInfo
 from demorec.episode.protocol import SceneMotion
 from demorec.episode.validity import read_episode_info
@@ -41,7 +41,9 @@ def open_stored_episode(dataset: LeRobotFolder, number: int) -> Iterator[Dataset
     """
     try:
         episode = _ShownEpisode(dataset, number)
-        yield _SimulatedEpisode(dataset, number) if episode.known.get("root_seed") is not None else episode
+        has_state = {STATE, ACTION} <= dataset.info.features.keys()
+        is_simulated = episode.known.get("root_seed") is not None and has_state
+        yield _SimulatedEpisode(dataset, number) if is_simulated else episode
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
         unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
         raise resource_error(error) or unreadable from error
@@ -99,24 +101,14 @@ class _ShownEpisode(DatasetRecording):
 class _SimulatedEpisode(DatasetRecording):
     """An episode simulated by demorec, with scene and outcome from the sidecar.
 
-    `has_targets` states whether its actions are joint targets. Raises RecordingError if state or action is missing or
-    belongs to another robot, and ValueError, TypeError, KeyError or IndexError for unexpected values in its tables.
+    `has_targets` states whether its actions are joint targets. Raises ValueError, TypeError, KeyError or IndexError for
+    unexpected values in its tables.
     """
 
     def __init__(self, dataset: LeRobotFolder, number: int) -> None:
         super().__init__(dataset, number)
         (self._row,) = dataset.sidecar_rows("episodes", self.place.episode_index)
         self.has_targets = read_json(self.path / SIDECAR_DIR / "export.json").get("action") == "joint"
-        missing = {STATE, ACTION} - dataset.info.features.keys()
-        if missing:
-            raise RecordingError(
-                f"The dataset lacks {' and '.join(sorted(missing))}, so it cannot be shown: {self.path}"
-            )
-        state = self.table().features[STATE]
-        if not len(state) or state.shape[1] not in {len(state_names(self._spec, kind)) for kind in STATE_KINDS}:
-            raise RecordingError(
-                f"The dataset has no rows of episode {self.place.episode_index}, or rows of another robot: {self.path}"
-            )
         self._phases = _phases(self._row, self.num_frames)
         if self.robot is not None:
             check_primitives(self.robot.urdf)

@@ -53,16 +53,5 @@ def phase_colors(phases: Iterable[str]) -> dict[str, Color]:
 
 
 def segment_colors(names: Iterable[str]) -> dict[str, Color]:
-    """Map each segment to a colour: bodies in the colours of the curves, the robot's links (ROBOT/LINK) in greys."""
-    colors: dict[str, Color] = {}
-    num_bodies = num_links = 0
-    for name in names:
-        if "/" in name:
-            # Steps of the golden ratio: adjacent links get clearly different greys.
-            grey = round(70 + 160 * (num_links * 0.618034 % 1))
-            colors[name] = (grey, grey, min(255, grey + 15))
-            num_links += 1
-        else:
-            colors[name] = SERIES[num_bodies % len(SERIES)]
-            num_bodies += 1
-    return colors
+    """Map each segment to a colour."""
+    return {name: SERIES[index % len(SERIES)] for index, name in enumerate(names)}

@@ -57,12 +57,9 @@ def _ffmpeg_folder() -> Path:
     folder = cache_folder("bin", program.name)
     link = folder / "ffmpeg"
     if not link.is_file():
-        fresh = folder / f"{link.name}.{os.getpid()}"
-        try:
-            fresh.symlink_to(program)
-        except OSError:
-            shutil.copy2(program, fresh)
-        fresh.replace(link)
+        link.unlink(missing_ok=True)
+        with suppress(FileExistsError):  # another process was faster
+            link.symlink_to(program)
     return folder
 
 

@@ -13,9 +13,6 @@ import pytest
 from support.commands import exit_code
 from support.export import files_of, make_run
 
-from demorec.episode.episode import Outcome
-from demorec.mcap import EpisodeWriter
-
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -25,41 +22,6 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recordings(out: Path) -> dict[str, int]:
     """Name -> modification time of the recording, ns."""
     return {path.name: path.stat().st_mtime_ns for path in sorted((out / "episodes").glob("*.mcap"))}
-
-
-@pytest.mark.slow
-def test_the_same_command_keeps_finished_renderings(
-    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    out = tmp_path / "out"
-    command = ("render", run, "--out", out, "--width", 32, "--height", 32, "--looks", 1, "--workers", 1)
-    drawn: list[Path] = []
-    write = EpisodeWriter.finish
-
-    def until_the_second(writer: EpisodeWriter, outcome: Outcome) -> Path:
-        if drawn:
-            raise KeyboardInterrupt
-        path = write(writer, outcome)
-        drawn.append(path)
-        return path
-
-    with monkeypatch.context() as patch:
-        patch.setattr(EpisodeWriter, "finish", until_the_second)
-        assert exit_code(*command) == 130
-    assert "Interrupted: 1 of 3 recordings are rendered; run the same command again" in capsys.readouterr().err
-    before = recordings(out)
-    assert len(before) == 1
-    assert list((out / "episodes").glob("*.part"))  # the partial file
-    assert exit_code(*command) == 0
-    said = capsys.readouterr().out
-    assert "1 of 3 had been rendered before and are unchanged" in said
-    assert "3 recordings, 12 images" in said
-    after = recordings(out)
-    assert before.items() <= after.items()
-    assert len(after) == 3
-    assert not list((out / "episodes").glob("*.part"))
-    assert exit_code("render", run, "--out", tmp_path / "once", *command[4:]) == 0
-    assert files_of(tmp_path / "once") == files_of(out)
 
 
 @pytest.mark.parametrize(
@@ -128,5 +90,9 @@ def test_an_interrupted_command_is_quiet_and_continues(tmp_path: Path, number: s
         assert "run the same command again" in lines[0]
     else:
         assert lines == []
+    before = recordings(out)
     assert exit_code(*command[3:-1], 1) == 0
-    assert len(recordings(out)) == 3
+    assert before.items() <= recordings(out).items()
+    assert not list((out / "episodes").glob("*.part"))
+    assert exit_code("render", run, "--out", tmp_path / "once", *options, 1) == 0
+    assert files_of(tmp_path / "once") == files_of(out)

@@ -48,17 +48,6 @@ def test_programs_run_and_are_short(name: str, run_folder: Path, tmp_path: Path)
     assert entity in {chunk.entity_path for chunk in RrdReader(target).stream()}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("name", PROGRAMS)
-def test_programs_name_missing_requirements(name: str, tmp_path: Path) -> None:
-    program = [sys.executable, str(VIEWERS / "rerun" / name)]
-    words = [str(tmp_path / "nothing"), str(tmp_path / "x.rrd")]
-    done = subprocess.run([*program, *words], capture_output=True, text=True, check=False)
-    assert done.returncode == 1
-    assert "Traceback" not in done.stderr
-    assert "nothing" in done.stderr
-
-
 @pytest.mark.parametrize("layout", sorted((VIEWERS / "foxglove").glob("*.json")), ids=lambda path: path.stem)
 def test_foxglove_layouts_use_topics_of_recordings(layout: Path, run_folder: Path) -> None:
     content = json.loads(layout.read_text())

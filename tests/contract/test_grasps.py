@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from support.sim import episode, run
 
@@ -66,10 +65,3 @@ def test_an_opening_hand_lets_go_at_any_frame_rate() -> None:
     frames, outcome = run(episode(0, task="tutorial", robot="iiwa", variation="full", fps=60, seed=72008))
     assert outcome.success
     assert frames[-1].observation.object_poses["red_cube"].position[2] < 0.3  # on the table, not in the hand at 0.8 m
-
-
-def test_a_dropped_object_rests_in_the_last_recorded_frames() -> None:
-    frames, outcome = run(episode(0, task="tutorial", variation="full", fps=10, seed=72019))
-    before, last = (frame.observation.object_poses["red_cube"].position for frame in frames[-2:])
-    assert outcome.success
-    assert np.linalg.norm(last - before) * 10 < 0.01  # m/s, the maximum of a success

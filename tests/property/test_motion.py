@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from demorec.core.geometry import Array
-from demorec.robots.motion import MotionLimits, plan_joints, plan_straight, quintic
+from demorec.robots.motion import MotionLimits, plan_joints, plan_straight
 from demorec.robots.panda import PANDA
 from demorec.sim.arm import arm_kinematics
 from demorec.tasks.grasping import hand_down
@@ -67,16 +67,3 @@ def test_velocity_and_acceleration_limits_hold(
     # The peak speed of the hand is at most the requested one (2 % for the time law's sampling).
     hand = np.array([ARM.forward(row).position for row in rows[1:]])
     assert np.linalg.norm(np.diff(hand, axis=0), axis=1).max() * fps <= speed * 1.02 + 2e-4 * fps
-
-
-def test_the_time_law_starts_and_ends_at_rest() -> None:
-    u = np.linspace(0, 1, 2001, dtype=np.float64)
-    s = quintic(u)
-    assert s[0] == 0
-    assert abs(s[-1] - 1) < 1e-12
-    velocity = np.gradient(s, u)
-    acceleration = np.gradient(velocity, u)
-    assert velocity[0] < 1e-4
-    assert velocity[-1] < 1e-4
-    assert abs(velocity.max() - 1.875) < 1e-3
-    assert abs(acceleration[5:-5].max() - 10 / math.sqrt(3)) < 1e-2

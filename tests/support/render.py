@@ -14,10 +14,9 @@ from pybullet_utils.bullet_client import BulletClient
 
 from demorec.core.geometry import Pose, look_at
 from demorec.episode.episode import CameraImages
-from demorec.episode.scene import RobotPlacement, Scene, SceneCamera, Texture
-from demorec.render import Mount, Renderer, RenderSetup, VisualBody
-from demorec.sim.bodies import body_poses, shape_rows, visual_bodies
-from demorec.sim.renderers import view_matrix
+from demorec.episode.scene import SceneCamera, Texture
+from demorec.render import Mount, Renderer, RenderSetup
+from demorec.sim.bodies import body_poses, visual_bodies
 
 DATA = pybullet_data.getDataPath()
 
@@ -46,27 +45,9 @@ def setup(
     client: Any, *cameras: SceneCamera, textures: dict[int, Texture] | None = None, **changes: Any
 ) -> RenderSetup:
     """A setup of a client's bodies, with depth and segmentation."""
-    bodies = visual_bodies(client, shape_rows(client), names={}, textures=textures or {}, models={})
+    bodies = visual_bodies(client, names={}, textures=textures or {}, models={})
     fields: dict[str, Any] = {"bodies": bodies, "cameras": cameras, "depth": True, "segmentation": True, **changes}
     return RenderSetup(**fields)
-
-
-class ClientWorld:
-    """A client as a `demorec.render.painter.Drawable`."""
-
-    def __init__(self, client: Any) -> None:
-        self.client = client
-        home = RobotPlacement(name="none", world_from_base=Pose(), joint_position=(), gripper_width=0.0)
-        self.scene = Scene(robot=home, bodies=())
-
-    def visuals(self) -> tuple[VisualBody, ...]:
-        return visual_bodies(self.client, shape_rows(self.client), names={}, textures={}, models={})
-
-    def mounts(self) -> dict[str, Mount]:
-        return {}
-
-    def poses(self) -> Any:
-        return body_poses(self.client)
 
 
 def draw(renderer: Renderer, client: Any) -> dict[str, CameraImages]:
@@ -143,13 +124,6 @@ def cast_capsule(radius: float, length: float, origin: Any, direction: Any) -> N
     return np.asarray(np.minimum.reduce([cast_tube(radius, length, origin, direction), *ends]))
 
 
-def project(cam: SceneCamera, point: Any) -> NDArray[np.float64]:
-    """(2,) image position, pixels, of a point in the world."""
-    seen = cam.mount_from_camera.inverse().apply(np.asarray(point, dtype=np.float64))
-    image = cam.intrinsics @ seen
-    return np.asarray(image[:2] / image[2])
-
-
 def away_from_borders(labels: NDArray[np.int32], distance: int = 1) -> NDArray[np.bool_]:
     """(H, W) whether all neighbours of a pixel within `distance` have the same label."""
     same = np.ones(labels.shape, dtype=bool)
@@ -216,25 +190,3 @@ def panda_cameras(width: int, height: int) -> tuple[SceneCamera, SceneCamera]:
 def panda_mounts(bodies: dict[str, Any]) -> dict[str, Mount]:
     """Pose of the wrist camera."""
     return {"hand": Mount(body=bodies["panda"], link=8)}
-
-
-def centred_tiny_segmentation(client: Any, cam: SceneCamera, world_from_camera: Pose) -> NDArray[np.int32]:
-    """TinyRenderer's segmentation without its half-pixel shift: it samples pixels at their corner."""
-    projection = np.array(
-        client.computeProjectionMatrixFOV(math.degrees(cam.fov_y), cam.width / cam.height, cam.near, cam.far)
-    )
-    # Clip coordinates move by this ratio of w = -z: half a pixel left and up.
-    projection[8] += TINY_SHIFT[0] / cam.width
-    projection[9] += TINY_SHIFT[1] / cam.height
-    _, _, _, _, labels = client.getCameraImage(
-        cam.width,
-        cam.height,
-        viewMatrix=view_matrix(world_from_camera),
-        projectionMatrix=projection.tolist(),
-        flags=client.ER_SEGMENTATION_MASK_OBJECT_AND_LINKINDEX,
-        renderer=client.ER_TINY_RENDERER,
-    )
-    return np.array(np.reshape(labels, (cam.height, cam.width)), dtype=np.int32)
-
-
-TINY_SHIFT = (1.0, 1.0)

@@ -6,21 +6,13 @@ from typing import Any
 
 import pytest
 
-from demorec.core.tables import ROBOTS, TASKS
+from demorec.core.tables import TASKS
 
 QUICK_TASKS = ("pick_from_clutter", "tutorial")
 """Many bodies, a custom script.
 
 Most other tests use one cube (`pick_place`); `tests/contract/test_tasks.py` always runs every task.
 """
-
-PAIRS = [
-    (task, robot)
-    for task in TASKS.names()
-    for robot in ROBOTS.names()
-    if not TASKS.load(task).refusal(ROBOTS.load(robot))
-]
-"""Every task with every robot that supports it."""
 
 
 def tasks_with_slow_ones() -> list[Any]:

@@ -13,8 +13,9 @@ import pytest
 from support.sim import episode, run
 
 from demorec.core.plain import to_json
+from demorec.core.tables import ROBOTS
 from demorec.episode.episode import Frame, Outcome
-from demorec.loop import PreparedEpisode
+from demorec.loop import PreparedEpisode, make_world
 
 
 @pytest.fixture(scope="module")
@@ -122,3 +123,17 @@ def test_joint_samples_at_the_physics_rate() -> None:
     assert all(len(frame.joint_samples) == 7 for frame in frames[1:])
     times = [t for frame in frames[1:] for t in (*(s.time_ns for s in frame.joint_samples), frame.time_ns)]
     assert np.abs(np.diff(times) - 1e9 / 240).max() <= 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ROBOTS.names())
+def test_recorded_commands_replay_to_the_bit_in_a_used_world(robot: str) -> None:
+    prepared = episode(3, robot=robot, variation="full")
+    with make_world(prepared.info) as world:
+        run(episode(4, robot=robot, variation="full", max_episode_seconds=2.0), world)
+        frames, outcome = run(prepared, world)
+        world.reset(prepared.info.simulated.scene)
+        for frame in frames:
+            assert world.observe().object_poses == frame.observation.object_poses
+            world.apply(frame.command)
+        assert world.state_digest() == outcome.final_state_digest

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import colorsys
 import math
 from collections import Counter
 from pathlib import Path
@@ -12,18 +11,15 @@ import numpy as np
 import pytest
 import trimesh
 from support.commands import exit_code
-from support.present import present
-from support.sim import body_index, episode, run
+from support.sim import episode, run
 
 from demorec.core.errors import ConfigError, SceneError
-from demorec.core.tables import OBJECTS, RENDERERS, ROBOTS
+from demorec.core.tables import OBJECTS, ROBOTS
 from demorec.episode.mesh import SolidMesh, decode_mesh, encode_mesh
-from demorec.episode.variation import Ranges
 from demorec.loop import ScriptAgent, Session, make_world
 from demorec.objects.antipodal import antipodal_grasps
 from demorec.objects.folder import load_shelf, read_solid
 from demorec.objects.shelf import Kind
-from demorec.render.painter import Painter
 from demorec.sim.solids import at_rest, with_parts
 
 pytestmark = pytest.mark.slow
@@ -163,19 +159,6 @@ def test_scenes_name_one_object_unambiguously_from_the_requested_shelves() -> No
     assert targets == {"", "blue_tray", "white_bowl", "white_plate"}
 
 
-def test_distractors_are_of_the_same_shelves_and_grey_or_black() -> None:
-    ranges = Ranges(distractors=(2, 2))
-    for index in range(4):
-        scene = episode(index, task="pick_anything", objects=("household",), ranges=ranges).info.simulated.scene
-        others = [body for body in scene.movable if body.color_name in ("grey", "black")]
-        assert len(others) == 2
-        assert len({body.name for body in scene.bodies}) == len(scene.bodies)
-        for body in others:
-            assert body.role == "distractor"
-            assert body.name.split("_")[1] in {kind.noun for kind in OBJECTS.load("household").kinds}
-        assert scene.body(scene.goals[0].object) not in others
-
-
 @pytest.mark.parametrize("target", ["white_bowl", "white_plate"])
 def test_an_object_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -> None:
     """Verified with PyBullet's contacts and with the object's points, all inside the rim."""
@@ -199,54 +182,13 @@ def test_an_object_ends_at_rest_on_the_floor_of_a_bowl_or_a_plate(target: str) -
     assert np.hypot(inside[:, 0], inside[:, 1]).max() < vessel.shape.size[0] / 2
 
 
-def test_objects_have_the_texture_of_their_material_in_tints_of_their_colour() -> None:
-    worn: dict[str, set[str]] = {}
-    for number in range(40):
-        for body in episode(number, task="pick_anything").info.simulated.scene.movable:
-            worn.setdefault(body.name.partition("_")[2], set()).add(body.texture.pattern if body.texture else "plain")
-            hues = [colorsys.rgb_to_hsv(*color[:3])[:2] for color in (body.rgba, body.mean_color)]
-            assert hues[0] == pytest.approx(hues[1])
-    assert worn["cube"] == worn["arch"] == {"wood"}
-    assert worn["apple"] == {"noise"}
-    assert worn["glass"] == {"plain"}
-    assert len(worn["mug"] | worn["can"]) >= 3
-
-
-def test_walls_surround_the_table_in_pick_anything_alone() -> None:
-    made = episode(0, task="pick_anything", variation="full", width=160, height=120, cameras=("front",))
-    scene, (camera,) = made.info.simulated.scene, made.info.simulated.scene.cameras
-    walls = [body for body in scene.bodies if body.name.startswith("wall")]
-    assert len({body.texture or body.rgba for body in walls}) == 3
-    with make_world(made.info) as world, RENDERERS.load("raster")() as renderer:
-        world.reset(scene)
-        painter = Painter(renderer, scene.cameras, depth=True, segmentation=True)
-        painter.setup(world)
-        seen = painter.images()[camera.name]
-        assert (present(seen.segmentation) >= 0).all()  # no sky is visible
-        assert body_index(world, "wall_back") in present(seen.segmentation)
-        farthest = float(present(seen.depth).max())
-        # The arm cannot reach the walls: they are farther from its base than its length.
-        for body in walls:
-            closest = np.abs(body.world_from_body.inverse().position)[0] - 0.01
-            assert 1.2 < closest < farthest
-    assert not [
-        body for body in episode(0, task="pick_place").info.simulated.scene.bodies if body.name.startswith("wall")
-    ]
-
-
-def test_tasks_with_their_own_objects_refuse_shelves(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_tasks_with_their_own_objects_refuse_shelves() -> None:
     with pytest.raises(ConfigError, match="--objects was given"):
         episode(task="stack", objects=("blocks",))
     with pytest.raises(ConfigError, match="--object-split was given"):
         episode(task="stack", object_split="train")
     with pytest.raises(ConfigError, match=r"Unknown shelf 'houshold'.*household"):
         episode(task="pick_anything", objects=("houshold",))
-    (tmp_path / "config.json").write_text('{"type": "act", "input_features": {}}')
-    words = ("evaluate", "--policy", tmp_path, "--action", "joint", "--workers", "1", "--out", tmp_path / "out")
-    assert exit_code(*words, "--object-split", "eval") == 2
-    assert "--object-split was given, but the task 'pick_place'" in capsys.readouterr().err
-    assert exit_code(*words, "--task", "pick_anything", "--objects", "houshold") == 2
-    assert "Unknown shelf 'houshold'" in capsys.readouterr().err
 
 
 def export(mesh: trimesh.Trimesh, path: Path) -> Path:
@@ -302,25 +244,10 @@ def test_a_glb_file_is_turned_upright_and_a_broken_one_is_refused(tmp_path: Path
     assert solid.mass_properties()[0] == pytest.approx(0.03 * 0.05 * 0.04 + 0.02 * 0.02 * 0.01)
     top = solid.points[solid.points[:, 2] > solid.points[:, 2].max() - 1e-4]
     assert float(np.ptp(top[:, 0])) == pytest.approx(0.02, abs=1e-5)  # the lid is on top
-    rng = np.random.default_rng(0)
-    refused = 0
-    for row in rng.integers(20, len(data), 60).tolist():
-        (tmp_path / "tin.glb").write_bytes(data[:row] + bytes([data[row] ^ 0xFF]) + data[row + 1 :])
-        read_solid.cache_clear()
-        try:
-            read_solid(tmp_path / "tin.glb")
-        except ConfigError:
-            refused += 1
-    assert refused > 15
-
-
-def test_random_shapes_are_closed_and_lie_flat() -> None:
-    (kind,) = OBJECTS.load("random").kinds
-    assert kind.count == 345
-    for number in (0, 100, 344):
-        shape = kind.shape(number)
-        assert shape.is_closed()
-        assert float(shape.extents[2]) < 0.07
+    (tmp_path / "tin.glb").write_bytes(data[: len(data) // 2])
+    read_solid.cache_clear()
+    with pytest.raises(ConfigError, match=r"tin\.glb"):
+        read_solid(tmp_path / "tin.glb")
 
 
 def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:

@@ -12,9 +12,7 @@ import pytest
 from rerun.chunk import RrdReader
 from support.recording import make_episode, write_episode
 
-from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
-from demorec.datasets.options import select_episodes
 from demorec.episode.scene import Body, Shape
 from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter, Recording
@@ -22,7 +20,6 @@ from demorec.robots import assets
 from demorec.robots.assets import asset_path
 from demorec.view import bodies
 from demorec.view.bodies import robot_model
-from demorec.view.meshes import primitive
 from demorec.view.scene import save
 from demorec.view.sources import find_episodes
 from demorec.view.viewer import viewer_environment
@@ -197,34 +194,9 @@ def test_a_recording_shows_everything_where_the_models_are_not_installed(
     assert _mesh_of(drawn["/world/bodies/brick"])[1] == {0x3366FFFF}
 
 
-def test_a_model_of_another_size_does_not_replace_the_recorded_one(
-    with_models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    monkeypatch.setattr(bodies, "_model_mesh", lambda shape: primitive("box", (1.0, 1.0, 1.0)))
-    drawn = _drawn(with_models, tmp_path)
-    assert "duck.obj has another size" in caplog.text
-    vertices, _ = _mesh_of(drawn["/world/bodies/duck"])
-    np.testing.assert_allclose(np.ptp(vertices, axis=0), DUCK.shape.size, atol=0.01)
-
-
 def test_the_viewer_finds_ffmpeg(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.setenv("DEMOREC_CACHE", str(tmp_path / "cache"))
     folder = viewer_environment()["PATH"].split(os.pathsep)[-1]
     said = subprocess.run([f"{folder}/ffmpeg", "-version"], capture_output=True, text=True, check=True).stdout
     assert said.startswith("ffmpeg version")
-
-
-def test_episodes_are_chosen_by_number(tmp_path: Path) -> None:
-    folder = tmp_path / "episodes"
-    folder.mkdir()
-    for index in range(5):
-        (folder / f"episode_{index:06d}.mcap").touch()
-    sources = find_episodes([tmp_path])
-    assert len(sources) == 5
-    assert select_episodes(sources, "") == sources
-    assert select_episodes(sources, "1:3") == sources[1:3]
-    assert select_episodes(sources, "4,0:2") == [sources[4], *sources[:2]]
-    for bad in ("5", "2:2", "-1", "x", "0:2,9"):
-        with pytest.raises(ConfigError):
-            select_episodes(sources, bad)

@@ -13,7 +13,6 @@ from support.recording import write_episode
 
 from demorec.core.errors import ExportError
 from demorec.core.geometry import Array
-from demorec.datasets.lerobot.dataset_features import why_not_recorded
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.mcap import Recording
 from demorec.view.from_dataset import open_dataset_episode
@@ -75,33 +74,6 @@ def test_depth_is_shown_in_millimetres_as_the_recordings_have_it(tmp_path: Path)
     buffers = [row[0] for batch in batches for row in batch.column("DepthImage:buffer").to_pylist()]
     drawn = np.frombuffer(bytes(buffers[-1]), dtype=np.uint16).reshape(measured[0].shape) / 1000
     np.testing.assert_allclose(drawn, measured[-1], atol=2e-3)
-
-
-def test_codes_of_depth_follow_the_datasets_metadata(tmp_path: Path) -> None:
-    """Datasets of LeRobot may have another range, and a linear scale."""
-    write_episode(tmp_path / "e.mcap", num_frames=3, depth=True, cameras=("front",))
-    export(tmp_path / "e.mcap", tmp_path / "d", depth=True)
-    info = tmp_path / "d" / "meta" / "info.json"
-    written = json.loads(info.read_text())
-    scale = written["features"]["observation.images.front_depth"]["info"]
-    scale |= {"video.use_log": False, "video.depth_min": 0.5, "video.depth_max": 4.595}
-    info.write_text(json.dumps(written))
-    with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
-        assert episode.info.simulation is not None
-        _, shown = list(episode.distances("front"))[2]
-    with Recording(tmp_path / "e.mcap") as recording:
-        measured = list(recording.depth("front"))[2]
-    low, high = np.log(3.51), np.log(13.5)
-    codes = np.rint((np.log(measured + 3.5) - low) / (high - low) * 4095).clip(0)  # as in docs/dataset-format.md
-    np.testing.assert_allclose(shown / 1000, np.where(codes > 0, 0.5 + codes / 1000, 0), atol=6e-4)
-    for spoilt in (scale | {"video.depth_max": 0.1}, scale | {"video.shift": "far"}):
-        written["features"]["observation.images.front_depth"]["info"] = spoilt
-        info.write_text(json.dumps(written))
-        with open_dataset_episode(LeRobotFolder(tmp_path / "d"), 0) as episode:
-            assert episode.info.simulation is not None
-            assert (list(episode.videos), list(episode.depth)) == (["front"], [])
-            name = "observation.images.front_depth"
-            assert "depth is" in why_not_recorded(name, LeRobotFolder(tmp_path / "d").info.features[name])
 
 
 def test_info_json_must_match_the_video(tmp_path: Path) -> None:

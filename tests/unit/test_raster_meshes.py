@@ -10,7 +10,6 @@ import trimesh
 from support import render as scenes
 
 from demorec.core.errors import RenderError
-from demorec.render.raster import RasterRenderer
 from demorec.render.raster.decimate import decimate
 from demorec.render.raster.mesh import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
@@ -47,17 +46,6 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: bytes) -> No
     path.write_bytes(content)
     with pytest.raises(RenderError, match=name):
         load_mesh(path)
-
-
-def test_a_mesh_that_vanished_is_named_with_its_body(tmp_path: Path) -> None:
-    path = tmp_path / "here.obj"
-    path.write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
-    client = scenes.connect()
-    body = scenes.add(client, "mesh", (1.0, 1.0, 1.0), fileName=str(path))
-    path.unlink()
-    with RasterRenderer() as raster, pytest.raises(RenderError, match=f"Body {body} .*here.obj"):
-        raster.setup(scenes.setup(client, scenes.camera(32, 32)))
-    client.disconnect()
 
 
 def test_decimation_stays_near_the_surface() -> None:

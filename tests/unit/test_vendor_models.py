@@ -79,18 +79,13 @@ def mesh_name(package: Path) -> str:
     return name
 
 
-def test_a_mesh_is_found_in_its_package_whatever_the_repository_is_called(package: Path) -> None:
-    name = mesh_name(package)
-    file = package / "meshes" / "visual" / name.rpartition("/")[2]
-    assert mesh_path(package / "urdf", name) == file
-    renamed = package.rename(package.with_name("vendor-main"))
-    assert mesh_path(renamed / "urdf", name) == renamed / file.relative_to(package)
-
-
 def test_a_mesh_is_found_where_ros_would_find_it(
     package: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     name = mesh_name(package)
+    renamed = package.rename(package.with_name("vendor-main"))  # as a repository may be called
+    assert mesh_path(renamed / "urdf", name).is_relative_to(renamed)
+    renamed.rename(package)
     elsewhere = tmp_path / "a" / "b" / "c" / "d" / "e" / "f" / "g"
     elsewhere.mkdir(parents=True)
     monkeypatch.chdir(elsewhere)
@@ -167,13 +162,6 @@ def test_a_recorded_arm_is_drawn_with_its_meshes_while_they_exist(package: Path,
         "base": BOX_CORNERS,
         "tip": BOX_CORNERS,
     }
-
-
-def test_a_model_with_changed_joints_is_not_drawn(package: Path, tmp_path: Path) -> None:
-    urdf = package / "urdf" / "vendor.urdf"
-    recording = record(tmp_path / "run", urdf)
-    urdf.write_text(urdf.read_text().replace("0 0 0.3", "0 0 0.4"))
-    assert drawn(recording, tmp_path / "a.rrd")["base"][0] == BOX_CORNERS
 
 
 def test_a_described_arm_is_drawn_with_its_meshes_where_ros_finds_them(

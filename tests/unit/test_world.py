@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -57,23 +56,6 @@ def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> No
     at_rest = world.client.calculateInverseDynamics(world.arm.body, seen.joint_position.tolist(), [0.0] * 9, [0.0] * 9)
     assert np.abs(seen.joint_effort[:7] - at_rest[:7]).max() < 0.01
     assert np.abs(at_rest[:7]).max() > 10
-
-
-def test_the_force_torque_sensor_does_not_affect_the_physics(world: World, scene: Scene) -> None:
-    def digest_after(sensor: bool) -> tuple[str, bool]:
-        world.reset(scene)
-        hand = world.arm.links[PANDA.hand_link]
-        world.client.enableJointForceTorqueSensor(world.arm.body, hand, sensor)
-        q = world.arm.target + 0.05
-        for _ in range(30):
-            world.apply(
-                Action(joint_target=q, gripper_target=0.01, base_from_tcp_target=world.arm.kinematics.forward(q))
-            )
-        return world.state_digest(), bool(world.observe().sensed["wrench"].any())
-
-    with_sensor, without = digest_after(True), digest_after(False)
-    assert with_sensor[0] == without[0]
-    assert (with_sensor[1], without[1]) == (True, False)
 
 
 def test_the_wrench_grows_by_the_weight_of_the_lifted_object() -> None:
@@ -149,16 +131,3 @@ def test_wrong_scenes_are_refused_in_one_sentence(world: World, scene: Scene) ->
         world.reset(dataclasses.replace(scene, robot=dataclasses.replace(scene.robot, name="other_arm")))
     with World(PANDA, fps=70) as odd, pytest.raises(ConfigError, match="70"):
         odd.reset(scene)
-
-
-def test_broken_model_file_is_a_scene_error(
-    world: World, scene: Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    broken = tmp_path / "broken.urdf"
-    broken.write_text("<robot name='x'><link")
-    monkeypatch.setattr("demorec.sim.bodies.asset_path", lambda name: broken)
-    body = Body(
-        name="b", role="object", shape=Shape(kind="urdf", file="x", size=(1.0, 1.0, 1.0)), world_from_body=Pose()
-    )
-    with pytest.raises(SceneError, match="'b'"):
-        world.reset(with_bodies(scene, body))

@@ -49,7 +49,7 @@ def merge(attributes: Sequence[Floats], faces: Sequence[NDArray[np.integer]], *,
     )
 
 
-def caster_geometry(instances: Sequence[Instance], levels: Sequence[int | None], casts: Sequence[bool]) -> Geometry:
+def caster_geometry(instances: Sequence[Instance], levels: Sequence[int], casts: Sequence[bool]) -> Geometry:
     """Merge positions only, for the shadow map; shapes that cast no shadow get no faces."""
     points, faces = [], []
     for instance, level, does in zip(instances, levels, casts, strict=True):
@@ -73,8 +73,8 @@ SPARE_VERTICES = 4096
 """Initial capacity for vertices created by clipping; grown on demand."""
 
 
-def make_batch(instances: Sequence[Instance], levels: Sequence[int | None], *, specular: float) -> Batch:
-    """Merge the instances, each at its number of faces (None: all of them).
+def make_batch(instances: Sequence[Instance], levels: Sequence[int], *, specular: float) -> Batch:
+    """Merge the instances, each at its number of faces.
 
     Args:
         specular: Strength of highlights, 0..1.

@@ -15,7 +15,6 @@ from demorec.episode.episode import CameraImages
 from demorec.episode.scene import SceneCamera, Texture
 from demorec.render import RenderSetup, Visual, VisualBody, VisualKind, check_setup, world_from_camera
 from demorec.render.raster.batch import Batch, make_batch
-from demorec.render.raster.canvas import Canvas
 from demorec.render.raster.kernels.jit import compiled_folder
 from demorec.render.raster.shapes import Instance, ModelStore, make_instances
 from demorec.render.raster.stage import Stage
@@ -36,12 +35,10 @@ class RasterRenderer(Closing):
     """The default renderer, on the CPU, compiled with numba: no system package, no GPU. See docs/rendering.md.
 
     Args:
-        exact: Draw every triangle of every mesh, for depth that matches the file exactly.
         keep_still: Whether fixed cameras reuse static pixels; the images are bit-exact either way.
     """
 
-    def __init__(self, *, exact: bool = False, keep_still: bool = True) -> None:
-        self._exact = exact
+    def __init__(self, *, keep_still: bool = True) -> None:
         self._keep_still = keep_still
         self._store = ModelStore()
         self._setup: RenderSetup | None = None
@@ -68,18 +65,18 @@ class RasterRenderer(Closing):
             instances,
             setup.light,
             shadow_size=shadow_size(largest),
-            caster_faces=[None if self._exact else caster_faces(instance) for instance in instances],
+            caster_faces=[caster_faces(instance) for instance in instances],
         )
-        batches: dict[tuple[int | None, ...], Batch] = {}
+        batches: dict[tuple[int, ...], Batch] = {}
         self._views = []
         for camera in setup.cameras:
-            levels = tuple(None if self._exact else self._level(instance, camera) for instance in instances)
+            levels = tuple(self._level(instance, camera) for instance in instances)
             if levels not in batches:
                 batches[levels] = make_batch(instances, levels, specular=setup.light.specular)
-            canvas = Canvas(camera, batches[levels], self._stage, setup)
-            self._views.append(CameraView(canvas, self._stage, keep_still=self._keep_still and camera.mount == "world"))
+            view = CameraView(camera, batches[levels], self._stage, setup, keep_still=self._keep_still)
+            self._views.append(view)
 
-    def _level(self, instance: Instance, camera: SceneCamera) -> int | None:
+    def _level(self, instance: Instance, camera: SceneCamera) -> int:
         """Compute the number of faces of an instance for a camera."""
         distance = WORKING_DISTANCE["world" if camera.mount == "world" else "link"]
         pixels = 2 * instance.radius * float(camera.intrinsics[1, 1]) / distance
@@ -130,31 +127,29 @@ def warm_up() -> None:
         done.touch()
 
 
-def _body(kind: VisualKind, *size: float, is_fixed: bool, texture: Texture | None = None) -> VisualBody:
-    visual = Visual(link=-1, kind=kind, size=size, link_from_shape=Pose(), rgba=(1.0, 1.0, 1.0, 1.0))
-    return VisualBody(name=kind, num_links=0, is_fixed=is_fixed, visuals=(visual,), texture=texture)
-
-
 def rehearse() -> None:
     """Draw a box and a sphere in every mode."""
     texture = Texture(pattern="plain", colors=((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)))
-    bodies = [_body("box", 0.3, 0.3, 0.1, is_fixed=True, texture=texture), _body("sphere", 0.1, is_fixed=False)]
+    shapes: dict[VisualKind, tuple[float, ...]] = {"box": (0.3, 0.3, 0.1), "sphere": (0.1,)}
+    bodies = [
+        VisualBody(
+            name=kind,
+            num_links=0,
+            is_fixed=kind == "box",
+            visuals=(Visual(link=-1, kind=kind, size=size, link_from_shape=Pose(), rgba=(1.0, 1.0, 1.0, 1.0)),),
+            texture=texture if kind == "box" else None,
+        )
+        for kind, size in shapes.items()
+    ]
     instances = make_instances(bodies, ModelStore())
-    camera = SceneCamera(
-        name="rehearsal",
-        width=32,
-        height=24,
-        fov_y=1.0,
-        mount="world",
-        mount_from_camera=look_at((0.8, 0, 0.5), (0, 0, 0)),
-    )
+    pose = look_at((0.8, 0, 0.5), (0, 0, 0))
+    camera = SceneCamera(name="rehearsal", width=32, height=24, fov_y=1.0, mount="world", mount_from_camera=pose)
     setup = RenderSetup(bodies=(), cameras=(), depth=True, segmentation=True)
-    stage = Stage(instances, setup.light, shadow_size=64, caster_faces=[None, None])
+    stage = Stage(instances, setup.light, shadow_size=64, caster_faces=[64, 64])
     poses = np.array([[0.0, 0.0, 0.15 * body, 0.0, 0.0, 0.0, 1.0] for body in range(2)])
-    batch = make_batch(instances, [None, None], specular=setup.light.specular)
+    batch = make_batch(instances, [64, 64], specular=setup.light.specular)
     for antialias in (True, False):
         for keep_still in (True, False):
-            canvas = Canvas(camera, batch, stage, replace(setup, antialias=antialias))
-            view = CameraView(canvas, stage, keep_still=keep_still)
+            view = CameraView(camera, batch, stage, replace(setup, antialias=antialias), keep_still=keep_still)
             stage.update(poses)
-            view.draw(camera.mount_from_camera)
+            view.draw(pose)

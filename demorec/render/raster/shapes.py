@@ -109,7 +109,7 @@ class Model:
             self._pieces[place] = make_piece(mesh, textured=textured)
         return self._pieces[place]
 
-    def caster(self, target: int | None) -> Piece:
+    def caster(self, target: int) -> Piece:
         """Return the same for the shadow map, without textures."""
         if self.coarse is None:
             return self.piece(target, textured=False)
@@ -168,8 +168,8 @@ class Instance:
     centre: Floats
     radius: float
 
-    def piece(self, target: int | None) -> Piece:
-        """Return its mesh with about `target` faces (None: all), before scaling.
+    def piece(self, target: int) -> Piece:
+        """Return its mesh with about `target` faces, before scaling.
 
         Textured meshes keep all faces: decimation would destroy their texture coordinates.
         """

@@ -34,7 +34,7 @@ class Stage:
         instances: Instances, static ones first.
         light: Direction, colour and strengths.
         shadow_size: Texels along the side of the shadow map; a multiple of the tile.
-        caster_faces: Faces of each instance in the shadow map, None for all.
+        caster_faces: Faces of each instance in the shadow map.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Stage:
         light: Light,
         *,
         shadow_size: int,
-        caster_faces: Sequence[int | None],
+        caster_faces: Sequence[int],
     ) -> None:
         self.instances = tuple(instances)
         self.num_still = sum(instance.stands for instance in instances)
