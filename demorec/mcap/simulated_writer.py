@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.errors import RecordingError
 from demorec.core.geometry import Array
 from demorec.episode.episode import CameraImages, Event, Frame, JointSample, frame_time_ns
 from demorec.episode.info import Camera, EpisodeInfo
@@ -41,12 +41,6 @@ class EpisodeWriter(BatchWriter):
         self._is_miss: bool | None = None
         robot, scene = info.simulated.robot, info.simulated.scene
         urdf = Urdf.load(asset_path(robot.urdf), scale=scene.robot.scale)
-        known = {joint.name for joint in urdf.joints if joint.kind != "fixed"}
-        if wrong := [name for name in robot.joint_names if name not in known]:
-            raise ConfigError(
-                f"The robot {robot.name!r} has no joints {', '.join(wrong)}; its URDF has "
-                f"{', '.join(sorted(known))}: {robot.urdf}"
-            )
         self._objects = [body.name for body in scene.movable]
         return FrameTree(urdf, robot.joint_names, info.cameras, scene)
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -86,17 +85,3 @@ def test_each_fault_of_a_robot_is_found(
 
     with pytest.raises(AssertionError, match=words):
         test(Contract())
-
-
-def test_the_robot_of_the_examples_meets_the_contract(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    shutil.copytree(ROOT / "examples" / "own_robot", tmp_path / "mine")
-    (tmp_path / "mine" / "my_robots.py").rename(tmp_path / "mine" / "my_tested_robots.py")
-    monkeypatch.syspath_prepend(str(tmp_path / "mine"))
-
-    class Contract(RobotContract):
-        robot = "my_tested_robots:XARM6"
-
-    tests = [name for name in dir(Contract) if name.startswith("test_")]
-    assert len(tests) == 5
-    for name in tests:
-        getattr(Contract(), name)()

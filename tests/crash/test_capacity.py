@@ -111,15 +111,11 @@ def test_lost_workers_end_the_run_with_an_error(
     assert 1 < lost < len(MOMENTS), "some must lose the workers, and some have ended before"
 
 
-@pytest.mark.parametrize("in_flight", ["lost", "stuck", "finished"])
-@pytest.mark.parametrize("back_after", [1, 7])
-def test_returning_workers_make_the_same_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: str, in_flight: InFlight, back_after: int
-) -> None:
+def test_returning_workers_make_the_same_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reference: str) -> None:
     monkeypatch.setattr(executing, "CAPACITY_WAIT_S", 60.0)
     lost = 0
     for moment in MOMENTS:
-        executor = Waning(tmp_path / str(moment), moment, back_after, in_flight)
+        executor = Waning(tmp_path / str(moment), moment, back_after=7)
         assert run_on(executor, executor.folder, monkeypatch, Remembers()).run.digest == reference
         lost += executor.now >= moment
     assert lost > 1

@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.export import export
 from support.external import URDF
 
 from demorec import Recorder
@@ -232,9 +231,6 @@ def test_odd_sizes_are_recorded_by_the_recommended_codec(tmp_path: Path) -> None
     with recording_of(tmp_path / "run") as found:
         (image,) = found.images("top")
         assert np.abs(image.astype(int) - pixels).max() <= 3
-    with pytest.raises(ConfigError, match=r"65x47 pixels cannot be h264 video.* of which no LeRobot dataset"):
-        export(tmp_path / "run", tmp_path / "dataset")
-    assert export(tmp_path / "run", tmp_path / "d.hdf5", "hdf5").num_frames == 1
 
 
 def test_foreign_folders_are_left_alone(tmp_path: Path) -> None:

@@ -11,11 +11,9 @@ import numpy as np
 import pytest
 from support.recording import make_episode
 
-from demorec.core.errors import ConfigError, RecordingError
+from demorec.core.errors import RecordingError
 from demorec.core.geometry import Pose
 from demorec.episode.episode import Frame
-from demorec.episode.info import EpisodeInfo
-from demorec.episode.simulated import with_simulation
 from demorec.mcap import EpisodeWriter
 
 
@@ -75,23 +73,3 @@ def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path
             writer.write(frame)
         with pytest.raises(RecordingError, match=f"^Frame 2 has .*{words}"):
             writer.write(spoil(frames[2]))
-
-
-def renamed(info: EpisodeInfo, *names: str) -> EpisodeInfo:
-    return with_simulation(
-        info, robot=replace(info.simulated.robot, arm_joints=(*names, *info.simulated.robot.arm_joints[len(names) :]))
-    )
-
-
-@pytest.mark.parametrize(
-    ("names", "words"),
-    [
-        (("elbow",), "has no joints elbow; its URDF has"),
-        (("panda_joint2",), "2 joints of the robot are called 'panda_joint2'"),
-    ],
-)
-def test_joints_that_the_robot_does_not_have_are_refused(names: tuple[str, ...], words: str, tmp_path: Path) -> None:
-    info, _, _ = make_episode(num_frames=1, cameras=())
-    with pytest.raises(ConfigError, match=words):
-        EpisodeWriter(tmp_path / "e.mcap", renamed(info, *names))
-    assert not list(tmp_path.iterdir())  # refused before anything is written
