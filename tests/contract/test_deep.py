@@ -1,4 +1,4 @@
-"""`check --deep` names every difference from the regenerated recording: every field of every topic, every image."""
+"""`check --deep` finds every changed bit of a recording, and names its stream, field and frame."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.check import checked, simulate
+from support.check import Spoilt, checked, simulate
 from support.commands import exit_code
 
 from demorec.extensions.remake.deep_check import deep_check
@@ -105,8 +105,6 @@ def test_looks_are_a_function_of_the_seed(filmed: Path, tmp_path: Path) -> None:
 
 
 def test_a_spoilt_image_is_found(filmed: Path, tmp_path: Path) -> None:
-    from support.check import Spoilt
-
     spoilt = Spoilt(filmed)
     spoilt.image("front", lambda t, p: p[::-1] if t == 20 else p)
     path = spoilt.write(tmp_path / "s.mcap")
