@@ -11,8 +11,7 @@ from pathlib import Path
 import pytest
 from support.commands import exit_code
 from support.doctor_bases import BASES, record
-from support.doctor_faults import FAULTS
-from support.doctor_judge import Bench, bench, check, episodes_of, findings_of, is_found
+from support.doctor_judge import SECOND, Bench, bench, check, episodes_of, findings_of
 from support.doctor_writer import VideoStore, write_dataset
 
 
@@ -51,9 +50,9 @@ def test_a_parked_arm_with_the_rounding_of_lerobot_is_good(tmp_path: Path) -> No
 )
 def test_a_planted_fault_is_found(arm: Bench, name: str) -> None:
     """The fault alone, with a second bad episode, and with a NaN in another episode."""
-    for second in ("", "bad", "nan"):
+    for second in SECOND:
         answer = check(arm.plant(name, second))
-        assert is_found(FAULTS[name], answer, episodes_of(name), arm.alarms), (second, answer)
+        assert arm.is_found(answer, episodes_of(name), second), (second, answer)
 
 
 @pytest.fixture

@@ -50,6 +50,10 @@ class DatasetBase:
     pace: float = 1.0
     tasks: tuple[str, ...] = ("Put the red cube on the plate", "Put the red cube into the left tray")
 
+    def feature(self, name: str) -> str:
+        """Name of the feature; "state" and "action" stand for those of the base."""
+        return {"state": self.state, "action": self.action}.get(name, name)
+
 
 @dataclass(kw_only=True)
 class DemoEpisode:
@@ -81,17 +85,16 @@ def record(
     seed: int,
     episodes: int,
     *,
-    spoilt: Mapping[int, tuple[str, float]] | None = None,
+    spoilt: Mapping[int, str] | None = None,
     cameras: bool = True,
 ) -> DemoDataset:
-    """Record a dataset; `spoilt` has kind and size of faulty episodes; the others are sound."""
+    """Record a dataset; `spoilt` has the kinds of faulty episodes; the others are sound."""
     shared = np.random.default_rng((seed, len(base.name)))
     pace, table = base.pace * shared.uniform(0.85, 1.2), int(shared.integers(2**31))
     found = []
     for number in range(episodes):
         rng = np.random.default_rng((seed, len(base.name), number))
-        kind, size = (spoilt or {}).get(number, ("", 1.0))
-        motions = [demonstrate(rng, base.arms[0], base.fps, pace, spoilt=kind, size=size)]
+        motions = [demonstrate(rng, base.arms[0], base.fps, pace, spoilt=(spoilt or {}).get(number, ""))]
         motions += [_resting(rng, arm, len(motions[0].state)) for arm in base.arms[1:]]
         shot = Shot(motion=motions[0], arm=base.arms[0], table=table, seed=int(rng.integers(2**31)))
         images = {camera: _drawn(camera, shot) for camera in (base.cameras if cameras else ())}

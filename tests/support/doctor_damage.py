@@ -43,15 +43,23 @@ def _regular(dataset: DemoDataset, episode: DemoEpisode) -> None:
 def on(feature: str, change: Callable[[Array, DatasetBase], Array], *, whole: bool = False) -> RowFault:
     """Change the state, the action or another feature, in one episode or in all."""
 
-    def spoil(dataset: DemoDataset, number: int) -> None:
-        base = dataset.base
-        name = {"state": base.state, "action": base.action}.get(feature, feature)
-        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
-            before = episode.columns[name].copy()
-            episode.columns[name] = change(before.copy(), base)
-            assert not np.array_equal(before, episode.columns[name], equal_nan=True), f"{name} was not changed"
+    def spoil(episode: DemoEpisode, base: DatasetBase) -> None:
+        name = base.feature(feature)
+        before = episode.columns[name].copy()
+        episode.columns[name] = change(before.copy(), base)
+        assert not np.array_equal(before, episode.columns[name], equal_nan=True), f"{name} was not changed"
 
-    return spoil
+    return _each(spoil, whole)
+
+
+def _each(spoil: Callable[[DemoEpisode, DatasetBase], None], whole: bool) -> RowFault:
+    """Spoil one episode, or all."""
+
+    def spoil_dataset(dataset: DemoDataset, number: int) -> None:
+        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
+            spoil(episode, dataset.base)
+
+    return spoil_dataset
 
 
 def both(change: Callable[[Array, DatasetBase], Array]) -> RowFault:
@@ -62,12 +70,11 @@ def both(change: Callable[[Array, DatasetBase], Array]) -> RowFault:
     return spoil
 
 
-def time(change: Callable[[Array, DatasetBase], Array], *, whole: bool = False) -> RowFault:
-    def spoil(dataset: DemoDataset, number: int) -> None:
-        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
-            episode.time_s = change(episode.time_s, dataset.base)
+def time(change: Callable[[Array], Array], *, whole: bool = False) -> RowFault:
+    def spoil(episode: DemoEpisode, base: DatasetBase) -> None:
+        episode.time_s = change(episode.time_s)
 
-    return spoil
+    return _each(spoil, whole)
 
 
 def put(value: float, rows: slice, element: int = 1) -> Callable[[Array, DatasetBase], Array]:
@@ -94,18 +101,13 @@ def other_unit(values: Array, base: DatasetBase) -> Array:
     return values
 
 
-def _reach_of(values: Array) -> Array:
-    found: Array = np.ptp(values, axis=0)
-    return found
-
-
 def spiked(values: Array, base: DatasetBase) -> Array:
-    values[len(values) // 2, 1] += 1.5 * _reach_of(values)[1]
+    values[len(values) // 2, 1] += 1.5 * np.ptp(values[:, 1])
     return values
 
 
 def slipped(values: Array, base: DatasetBase) -> Array:
-    values[len(values) // 2 :, 1] += 0.5 * _reach_of(values)[1]
+    values[len(values) // 2 :, 1] += 0.5 * np.ptp(values[:, 1])
     return values
 
 
@@ -159,27 +161,13 @@ def turned_round(grip: Array) -> Array:
     return found
 
 
-def columns_of(values: Array, first: int, count: int, factor: float) -> Array:
-    values[:, first : first + count] *= factor
-    return values
-
-
 def quaternion_flips(values: Array, base: DatasetBase) -> Array:
     values[len(values) // 3 : len(values) // 2, 3:7] *= -1
     return values
 
 
-def w_first(values: Array, base: DatasetBase) -> Array:
-    values[:, 3:7] = values[:, [6, 3, 4, 5]]
-    return values
-
-
 def equal_to_state(*, whole: bool) -> RowFault:
-    def spoil(dataset: DemoDataset, number: int) -> None:
-        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
-            episode.columns[dataset.base.action] = episode.columns[dataset.base.state].copy()
-
-    return spoil
+    return _each(lambda episode, base: episode.columns.update({base.action: episode.columns[base.state].copy()}), whole)
 
 
 def _fastest(state: Array, length: int) -> NDArray[np.int64]:
@@ -233,7 +221,7 @@ def _noisy(images: Pixels) -> Pixels:
 def spoilt(kind: str) -> RowFault:
     def spoil(dataset: DemoDataset, number: int) -> None:
         has_cameras = bool(dataset.episodes[number].images)
-        made = record(dataset.base, dataset.seed, number + 1, spoilt={number: (kind, 1.0)}, cameras=has_cameras)
+        made = record(dataset.base, dataset.seed, number + 1, spoilt={number: kind}, cameras=has_cameras)
         dataset.episodes[number] = made.episodes[number]
 
     return spoil
@@ -256,32 +244,31 @@ def shared_piece(dataset: DemoDataset, number: int) -> None:
 
 def two_in_one(dataset: DemoDataset, number: int) -> None:
     first, second = dataset.episodes[number], dataset.episodes[number - 2]
-    images = {camera: (draw, second.images[camera]) for camera, draw in first.images.items()}
+    joined = {camera: (draw, second.images[camera]) for camera, draw in first.images.items()}
     first.columns = {n: np.concatenate([v, second.columns[n]]) for n, v in first.columns.items()}
     first.time_s = np.arange(len(first.time_s) + len(second.time_s)) / dataset.base.fps
-    first.images = {camera: _joined(*pair) for camera, pair in images.items()}
-
-
-def _joined(first: Images, second: Images) -> Images:
-    return lambda: np.concatenate([first(), second()])
+    first.images = {c: lambda both=both: np.concatenate([draw() for draw in both]) for c, both in joined.items()}
 
 
 def task(text: str) -> RowFault:
-    def spoil(dataset: DemoDataset, number: int) -> None:
-        dataset.episodes[number].task = text
-
-    return spoil
+    return lambda dataset, number: setattr(dataset.episodes[number], "task", text)
 
 
 def shown(change: Callable[[Pixels], Pixels], *, whole: bool = False) -> RowFault:
-    """Change the images of the last camera, in one episode or in all."""
+    """Change the images of the last camera."""
 
-    def spoil(dataset: DemoDataset, number: int) -> None:
-        camera = dataset.base.cameras[-1]
-        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
-            episode.images[camera] = _changed(episode.images[camera], change)
+    def spoil(episode: DemoEpisode, base: DatasetBase) -> None:
+        episode.images[base.cameras[-1]] = _changed(episode.images[base.cameras[-1]], change)
 
-    return spoil
+    return _each(spoil, whole)
+
+
+def third_rate(images: Pixels) -> Pixels:
+    return images[np.arange(len(images)) // 3 * 3]
+
+
+def late(images: Pixels) -> Pixels:
+    return images[np.maximum(np.arange(len(images)) - len(images) // 6, 0)]
 
 
 def covered(images: Pixels) -> Pixels:
@@ -305,11 +292,7 @@ def exchange_cameras(dataset: DemoDataset, number: int) -> None:
 
 
 def double_camera(*, whole: bool) -> RowFault:
-    def spoil(dataset: DemoDataset, number: int) -> None:
-        for episode in dataset.episodes if whole else [dataset.episodes[number]]:
-            episode.images[WRIST] = episode.images[dataset.base.cameras[0]]
-
-    return spoil
+    return _each(lambda episode, base: episode.images.update({WRIST: episode.images[base.cameras[0]]}), whole)
 
 
 def other_take(dataset: DemoDataset, number: int) -> None:

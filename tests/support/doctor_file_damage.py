@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from support.doctor_bases import DatasetBase
 
 FileFault = Callable[[Path, DatasetBase, int], None]
+RANGE = ("dataset_from_index", "dataset_to_index")
+"""Columns of the table of episodes with the rows of an episode."""
 
 
 def data_file(root: Path, number: int) -> Path:
@@ -124,7 +126,7 @@ def statistics(feature: str, name: str, factor: float) -> FileFault:
     """Falsify one statistic of a feature in the file that training reads."""
 
     def spoil(root: Path, base: DatasetBase, number: int) -> None:
-        key = {"state": base.state, "action": base.action}.get(feature, feature)
+        key = base.feature(feature)
         if base.version != "v2.1":
             path = root / "meta/stats.json"
             content = json.loads(path.read_text())

@@ -122,89 +122,41 @@ def sound_reaches(rng: np.random.Generator, arm: ArmModel, pace: float) -> list[
     ]  # fmt: skip
 
 
-Spoiler = Callable[[list[Reach], np.random.Generator, ArmModel, float], list[Reach]]
-"""Functions of sound reaches and of a size from 0, hardly noticeable, to 1."""
-
-
-def _before(reaches: list[Reach], name: str, *added: Reach) -> list[Reach]:
-    place = next(number for number, reach in enumerate(reaches) if reach.name == name)
-    return [*reaches[:place], *added, *reaches[place:]]
-
-
-def _named(reaches: list[Reach], name: str) -> Reach:
-    return next(reach for reach in reaches if reach.name == name)
-
-
-def _detour(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: float) -> list[Reach]:
-    for name in rng.choice(["over", "at", "carry", "lower"], 1 if size < 0.5 else rng.integers(2, 4), replace=False):
-        after = _named(reaches, name)
-        aside = size * (rng.uniform(0.4, 0.8, 3) * rng.choice([-1, 1], 3) * (1, 1, 0.2) + (0, 0, 0.3))
+def _detour(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel) -> list[Reach]:
+    for name in rng.choice(["over", "at", "carry", "lower"], rng.integers(2, 4), replace=False):
+        after = next(reach for reach in reaches if reach.name == name)
+        aside = rng.uniform(0.4, 0.8, 3) * rng.choice([-1, 1], 3) * (1, 1, 0.2) + (0, 0, 0.3)
         grip = arm.grip[0] if name == "over" else after.grip
-        reaches = _before(reaches, name, replace(after, place=after.place + aside, grip=grip, name="aside"))
+        place = reaches.index(after)
+        reaches = [
+            *reaches[:place],
+            replace(after, place=after.place + aside, grip=grip, name="aside"),
+            *reaches[place:],
+        ]
     return reaches
 
 
-def _hesitation(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: float) -> list[Reach]:
-    stops = rng.choice(np.arange(1, len(reaches) - 1), 1 if size < 0.5 else rng.integers(2, 4), replace=False)
-    return [
-        replace(reach, rest_s=0.6 + size * rng.uniform(0.6, 1.9)) if number in stops else reach
-        for number, reach in enumerate(reaches)
-    ]
-
-
-def _wrong_object(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: float) -> list[Reach]:
-    over, at = _named(reaches, "over"), _named(reaches, "at")
-    aside = (0.4 + 0.6 * size) * np.array([-rng.uniform(0.5, 0.9), rng.uniform(0.3, 0.7), 0])
-    down = replace(at, name="aside", place=at.place + aside + (0, 0, rng.uniform(0.05, 0.2)))
-    up = replace(over, name="aside", place=over.place + aside)
-    return _before(reaches, "over", up, down, up)
-
-
-def _dropped(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: float) -> list[Reach]:
-    lift, carry, at, grip = (_named(reaches, name) for name in ("lift", "carry", "at", "grip"))
-    lost = at.place + rng.uniform(0.3, 0.6) * (carry.place - lift.place)
-    high = lost + (lift.place - at.place)
-    slip = replace(carry, name="aside", place=high, duration_s=0.6 * carry.duration_s)
-    empty = replace(slip, name="slip", grip=arm.grip[1], duration_s=0.3)
-    again = [replace(slip, grip=arm.grip[0], duration_s=0.5), replace(at, place=lost), replace(grip, place=lost)]
-    return _before(reaches, "carry", slip, empty, *again, replace(lift, place=high))
-
-
-def _late_gripper(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: float) -> list[Reach]:
-    at, grip = _named(reaches, "at"), _named(reaches, "grip")
-    lifted = replace(at, place=at.place + np.array([0, 0, 0.1 + 0.2 * size]), duration_s=rng.uniform(0.5, 0.9))
-    return _before(
-        reaches, "grip", lifted, replace(lifted, name="slip", grip=arm.grip[1]), lifted, replace(grip, grip=arm.grip[0])
-    )
-
-
-def _slow(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel, size: float) -> list[Reach]:
-    factor = 1 + size * rng.uniform(0.7, 1.6)
+def _slow(reaches: list[Reach], rng: np.random.Generator, arm: ArmModel) -> list[Reach]:
+    factor = 1 + rng.uniform(0.7, 1.6)
     return [replace(r, duration_s=r.duration_s * factor, rest_s=r.rest_s * factor) for r in reaches]
 
 
-SPOILERS: dict[str, Spoiler] = {
+SPOILERS: dict[str, Callable[[list[Reach], np.random.Generator, ArmModel], list[Reach]]] = {
     "detour": _detour,
-    "hesitation": _hesitation,
-    "jerky": lambda reaches, rng, arm, size: reaches,  # `demonstrate` adds the tremor
-    "cut off": lambda reaches, rng, arm, size: reaches[: int(rng.integers(4, len(reaches) - 3))],
-    "wrong object": _wrong_object,
-    "dropped": _dropped,
+    "jerky": lambda reaches, rng, arm: reaches,  # `demonstrate` adds the tremor
+    "cut off": lambda reaches, rng, arm: reaches[: int(rng.integers(4, len(reaches) - 3))],
     "slow": _slow,
-    "late gripper": _late_gripper,
 }
 """Kinds of faulty demonstrations."""
 
 
-def demonstrate(
-    rng: np.random.Generator, arm: ArmModel, fps: int, pace: float = 1.0, *, spoilt: str = "", size: float = 1.0
-) -> Motion:
-    """Record one demonstration of a pick and place at `fps`, sound or of a kind and size in `SPOILERS`."""
+def demonstrate(rng: np.random.Generator, arm: ArmModel, fps: int, pace: float = 1.0, *, spoilt: str = "") -> Motion:
+    """Record one demonstration of a pick and place at `fps`, sound or of a kind in `SPOILERS`."""
     reaches = sound_reaches(rng, arm, pace * rng.lognormal(0, 0.1))
     if spoilt:
-        reaches = SPOILERS[spoilt](reaches, rng, arm, size)
+        reaches = SPOILERS[spoilt](reaches, rng, arm)
     wanted = _operator(reaches, rng, arm, fps)
-    shake = arm.tremor + (0.03 * size * np.abs(np.array(arm.reach)).sum(0) if spoilt == "jerky" else 0)
+    shake = arm.tremor + (0.03 * np.abs(np.array(arm.reach)).sum(0) if spoilt == "jerky" else 0)
     wanted[:, :-1] += _tremor(rng, wanted.shape[0], len(arm.home) - 1, fps) * shake
     command = arm.readings(wanted)
     ends_s = np.cumsum([reach.duration_s + reach.rest_s for reach in reaches])
