@@ -118,12 +118,18 @@ NUMBERS: dict[str, tuple[Change, str]] = {
 }
 
 
+def changed(sound: Evidence, change: Callable[[int, Array, Array], tuple[Array, Array]]) -> Evidence:
+    """The set without images, with another state and action of each episode."""
+    episodes = []
+    for each in sound.episodes:
+        assert each.state is not None
+        assert each.action is not None
+        episodes.append(episode(each.number, *change(each.number, each.state.copy(), each.action.copy())))
+    return replace(sound, episodes=episodes, cameras={})
+
+
 def spoilt(sound: Evidence, change: Change) -> Evidence:
-    state, action = sound.by_number[BAD].state, sound.by_number[BAD].action
-    assert state is not None
-    assert action is not None
-    changed = episode(BAD, *change(state.copy(), action.copy()))
-    return replace(sound, episodes=[changed if each.number == BAD else each for each in sound.episodes], cameras={})
+    return changed(sound, lambda number, state, action: change(state, action) if number == BAD else (state, action))
 
 
 def found(diagnosis: Diagnosis, check: str) -> set[int | None]:
@@ -158,30 +164,25 @@ def held_by_dead_band(target: Array, dead_band: float) -> Array:
 
 
 def test_a_servo_that_holds_its_joint_within_the_dead_band_is_sound(sound: Evidence) -> None:
-    episodes = []
-    for each in sound.episodes:
-        assert each.state is not None
-        assert each.action is not None
-        action = each.action.copy()
-        action[:, 3] = 10 + 3 * np.sin(np.arange(len(action)) / 15 + each.number)
-        state = each.state.copy()
+    def holding(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        action[:, 3] = 10 + 3 * np.sin(np.arange(len(action)) / 15 + number)
         state[LAG:, 3] = held_by_dead_band(action[:-LAG, 3], 1.5)
         state[:LAG, 3] = state[LAG, 3]
-        episodes.append(episode(each.number, state, action))
-    assert found(diagnose(replace(sound, episodes=episodes, cameras={})), "frozen_state") == set()
+        return state, action
+
+    assert found(diagnose(changed(sound, holding)), "frozen_state") == set()
 
 
 def test_a_resting_encoder_flickers_by_a_tick(sound: Evidence) -> None:
     tick = 360 / 4096
-    episodes = []
-    for each in sound.episodes[:3]:
-        assert each.state is not None
-        assert each.action is not None
-        state, action = each.state.copy(), each.action.copy()
+
+    def resting(number: int, state: Array, action: Array) -> tuple[Array, Array]:
         state[:, 3], action[:, 3] = 10 * tick, 10 * tick
         state[40:43, 3] = 11 * tick
-        episodes.append(episode(each.number, state, action))
-    assert found(diagnose(replace(sound, episodes=episodes, cameras={})), "state_jumps") == set()
+        return state, action
+
+    few = replace(sound, episodes=sound.episodes[:3])
+    assert found(diagnose(changed(few, resting)), "state_jumps") == set()
 
 
 @pytest.mark.parametrize("is_whole", [True, False])
@@ -200,42 +201,39 @@ def test_a_fast_start_of_the_whole_arm_is_not_a_jump(is_whole: bool, sound: Evid
 
 def test_a_stale_first_reading_of_a_joint_that_rests_is_worth_a_look(sound: Evidence) -> None:
     """The joint has another position in each episode, and hardly moves within one."""
-    episodes = []
-    for each in sound.episodes:
-        assert each.state is not None
-        assert each.action is not None
-        state = each.state.copy()
-        state[:, 3] = 10 * each.number + np.random.default_rng(each.number).normal(0, 0.001, len(state))
-        state[0, 3] += 30 * (each.number == BAD)
-        episodes.append(episode(each.number, state, each.action))
-    findings = diagnose(replace(sound, episodes=episodes, cameras={})).findings
+
+    def stale(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        state[:, 3] = 10 * number + np.random.default_rng(number).normal(0, 0.001, len(state))
+        state[0, 3] += 30 * (number == BAD)
+        return state, action
+
+    findings = diagnose(changed(sound, stale)).findings
     assert [(f.episode, f.severity, f.value) for f in findings if f.check == "state_jumps"] == [
         (BAD, "look", "27% of its range")
     ]
 
 
-def with_second_arm(sound: Evidence, change: Callable[[int, Array], tuple[Array, Array]]) -> Evidence:
-    """Add a second arm with the state and action (T, 3) that `change` computes from number and state."""
+def with_second_arm(sound: Evidence, arm: Callable[[int, int], tuple[Array, Array]]) -> Evidence:
+    """Add a second arm with the state and action (T, 3) computed from number and length."""
     names = (*NAMES, *(f"left.joint_{number}.pos" for number in range(3)))
     roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", names)}, NO_NAMES)
-    episodes = []
-    for each in sound.episodes:
-        assert each.state is not None
-        assert each.action is not None
-        state, action = change(each.number, each.state)
-        episodes.append(episode(each.number, np.hstack([each.state, state]), np.hstack([each.action, action])))
-    return replace(sound, roles=roles, episodes=episodes, cameras={})
+
+    def both(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        second_state, second_action = arm(number, len(state))
+        return np.hstack([state, second_state]), np.hstack([action, second_action])
+
+    return replace(changed(sound, both), roles=roles)
 
 
 def test_a_resting_arm_that_shakes_by_a_few_encoder_steps_is_not_frozen(sound: Evidence) -> None:
     """It holds its weight while the operator's idle leader shakes, and sways once."""
     tick = 0.022
 
-    def shaking(number: int, state: Array) -> tuple[Array, Array]:
+    def shaking(number: int, length: int) -> tuple[Array, Array]:
         rng = np.random.default_rng(number)
-        held = np.tile(tick * rng.integers(0, 3, (len(state), 1)), 3)
+        held = np.tile(tick * rng.integers(0, 3, (length, 1)), 3)
         held[30:80] = held[30]
-        leader = np.tile(0.2 * (np.arange(len(state))[:, None] // 25 % 2), 3)
+        leader = np.tile(0.2 * (np.arange(length)[:, None] // 25 % 2), 3)
         if number == BAD:
             held[50] += 30 * tick
         return held, leader
@@ -245,17 +243,14 @@ def test_a_resting_arm_that_shakes_by_a_few_encoder_steps_is_not_frozen(sound: E
 
 
 def test_a_state_that_is_a_second_late_is_found_beside_a_resting_arm(sound: Evidence) -> None:
-    delayed = [
-        replace(each, state=np.vstack([np.repeat(each.state[:1], FPS, axis=0), each.state[:-FPS]]))
-        for each in sound.episodes
-        if each.state is not None
-    ]
+    def delay(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        return np.vstack([np.repeat(state[:1], FPS, axis=0), state[:-FPS]]), action
 
-    def resting(number: int, state: Array) -> tuple[Array, Array]:
-        flicker: Array = np.random.default_rng(number).integers(0, 3, (len(state), 3)).astype(np.float64)
-        return 0.1 * flicker, np.zeros((len(state), 3))
+    def resting(number: int, length: int) -> tuple[Array, Array]:
+        flicker: Array = np.random.default_rng(number).integers(0, 3, (length, 3)).astype(np.float64)
+        return 0.1 * flicker, np.zeros((length, 3))
 
-    diagnosis = diagnose(with_second_arm(replace(sound, episodes=delayed), resting))
+    diagnosis = diagnose(with_second_arm(changed(sound, delay), resting))
     messages = [each.message for each in diagnosis.findings if each.check == "action_lag"]
     assert messages == ["the state follows its action by 0.70 s or more"]
 
@@ -265,15 +260,11 @@ def test_a_late_increment_is_found_in_both_notations(sound: Evidence, form: str)
     names = (*(form.format(name.removesuffix(".pos")) for name in NAMES[:4]), NAMES[4])
     columns = {"observation.state": Column("float32", NAMES), "action": Column("float32", names)}
 
-    def incremental(each: EpisodeEvidence) -> EpisodeEvidence:
-        assert each.state is not None
-        assert each.action is not None
-        steps = np.diff(each.action[:, :4], axis=0, append=each.action[-1:, :4])
-        late = 4 if each.number == BAD else 0
-        return episode(each.number, each.state, np.column_stack([np.roll(steps, late, axis=0), each.action[:, 4]]))
+    def incremental(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        steps = np.diff(action[:, :4], axis=0, append=action[-1:, :4])
+        return state, np.column_stack([np.roll(steps, 4 if number == BAD else 0, axis=0), action[:, 4]])
 
-    episodes = [incremental(each) for each in sound.episodes]
-    diagnosis = diagnose(replace(sound, roles=find_roles(columns, NO_NAMES), episodes=episodes, cameras={}))
+    diagnosis = diagnose(replace(changed(sound, incremental), roles=find_roles(columns, NO_NAMES)))
     assert found(diagnosis, "action_lag") == {BAD}
     assert "its action is 4" in next(each.message for each in diagnosis.findings if each.check == "action_lag")
 
@@ -291,9 +282,12 @@ def test_a_gripper_with_one_wrong_reading_is_not_of_another_unit(sound: Evidence
     assert found(diagnose(spoilt(sound, in_degrees)), "unit_mismatch") == {BAD}
 
 
-def test_a_hand_of_numbered_joints_may_snap(sound: Evidence) -> None:
-    names = (*NAMES[:3], "right_hand.joint_1.pos", "kRightHandIndex")
-    roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", names)}, NO_NAMES)
+@pytest.mark.parametrize("names", [("right_hand.joint_1.pos", "kRightHandIndex"), ("Wrist_Vel4", "LeftForce.fx")])
+def test_fingers_snap_and_velocities_and_forces_may_change_within_a_frame(
+    names: tuple[str, str], sound: Evidence
+) -> None:
+    states = Column("float32", (*NAMES[:3], *names))
+    roles = find_roles({"observation.state": states, "action": Column("float32", NAMES)}, NO_NAMES)
 
     def snap(state: Array, action: Array) -> tuple[Array, Array]:
         state[60:, 3:] += 200
@@ -302,27 +296,12 @@ def test_a_hand_of_numbered_joints_may_snap(sound: Evidence) -> None:
     assert found(diagnose(replace(spoilt(sound, snap), roles=roles)), "state_jumps") == set()
 
 
-def test_a_velocity_may_change_within_a_frame(sound: Evidence) -> None:
-    names = (*NAMES[:3], "Wrist_Vel4", "LeftForce.fx")
-    roles = find_roles({"observation.state": Column("float32", names), "action": Column("float32", NAMES)}, NO_NAMES)
-
-    def brake(state: Array, action: Array) -> tuple[Array, Array]:
-        state[60:, 3:] += 200
-        return state, action
-
-    assert found(diagnose(replace(spoilt(sound, brake), roles=roles)), "state_jumps") == set()
-
-
 def test_numbered_elements_of_different_counts_have_nothing_in_common(sound: Evidence) -> None:
     """The state is a pose that rests, the action has joints."""
     states = Column("float32", tuple(map(str, range(4))))
     roles = find_roles({"observation.state": states, "action": Column("float32", tuple("01234"))}, NO_NAMES)
-    episodes = [
-        episode(each.number, np.full((each.length, 4), 0.3) + np.eye(4)[3] * each.state[:, :1], each.action)
-        for each in sound.episodes
-        if each.state is not None and each.action is not None
-    ]
-    assert found(diagnose(replace(sound, roles=roles, episodes=episodes, cameras={})), "frozen_state") == set()
+    resting = changed(sound, lambda n, s, a: (np.full((len(s), 4), 0.3) + np.eye(4)[3] * s[:, :1], a))
+    assert found(diagnose(replace(resting, roles=roles)), "frozen_state") == set()
 
 
 def test_slow_motion_is_no_idle_end(sound: Evidence) -> None:
@@ -344,33 +323,27 @@ def test_an_episode_in_which_nothing_moves(sound: Evidence) -> None:
 
 def test_a_joint_that_hardly_moves_although_its_action_does_is_dead(sound: Evidence) -> None:
     """Its reading changes by a step once, in one episode, while the servo of a sound joint would follow."""
-    episodes = []
-    for each in sound.episodes[:3]:
-        assert each.state is not None
-        assert each.action is not None
-        state = each.state.copy()
+
+    def dead(number: int, state: Array, action: Array) -> tuple[Array, Array]:
         state[:, 3] = 10.0
-        state[0, 3] += 0.1 * (each.number == 1)
-        episodes.append(episode(each.number, state, each.action))
-    messages = [
-        (each.severity, each.message)
-        for each in diagnose(replace(sound, episodes=episodes, cameras={})).findings
-        if each.check == "frozen_state"
-    ]
+        state[0, 3] += 0.1 * (number == 1)
+        return state, action
+
+    findings = diagnose(changed(replace(sound, episodes=sound.episodes[:3]), dead)).findings
+    messages = [(each.severity, each.message) for each in findings if each.check == "frozen_state"]
     assert messages == [("broken", "wrist.pos: the state never changes although the action does")]
 
 
 def test_measured_velocities_as_actions_are_worth_a_look(sound: Evidence) -> None:
     """A controller's feedback at t is centred on t; the motion that an action causes is centred on t + 1/2."""
-    episodes = []
-    for each in sound.episodes:
-        position = motion(each.number, each.length)[1]
-        smooth = np.apply_along_axis(np.convolve, 0, position, np.hanning(9) / np.hanning(9).sum(), "same")[8:-8]
-        episodes.append(episode(each.number, smooth, np.gradient(smooth, axis=0)))
-    severities = {
-        e.severity for e in diagnose(replace(sound, episodes=episodes, cameras={})).findings if e.check == "action_lag"
-    }
-    assert severities == {"look"}
+
+    def measured(number: int, state: Array, action: Array) -> tuple[Array, Array]:
+        weights = np.hanning(9) / np.hanning(9).sum()
+        smooth = np.apply_along_axis(np.convolve, 0, action, weights, "same")[8:-8]
+        return smooth, np.gradient(smooth, axis=0)
+
+    findings = diagnose(changed(sound, measured)).findings
+    assert {each.severity for each in findings if each.check == "action_lag"} == {"look"}
 
 
 @pytest.mark.parametrize(("frame", "severity"), [(60, "broken"), (-8, "look")])

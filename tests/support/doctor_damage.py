@@ -244,10 +244,13 @@ def shared_piece(dataset: DemoDataset, number: int) -> None:
 
 def two_in_one(dataset: DemoDataset, number: int) -> None:
     first, second = dataset.episodes[number], dataset.episodes[number - 2]
-    joined = {camera: (draw, second.images[camera]) for camera, draw in first.images.items()}
     first.columns = {n: np.concatenate([v, second.columns[n]]) for n, v in first.columns.items()}
     first.time_s = np.arange(len(first.time_s) + len(second.time_s)) / dataset.base.fps
-    first.images = {c: lambda both=both: np.concatenate([draw() for draw in both]) for c, both in joined.items()}
+    first.images = {camera: _joined(draw, second.images[camera]) for camera, draw in first.images.items()}
+
+
+def _joined(first: Images, second: Images) -> Images:
+    return lambda: np.concatenate([first(), second()])
 
 
 def task(text: str) -> RowFault:
@@ -264,11 +267,13 @@ def shown(change: Callable[[Pixels], Pixels], *, whole: bool = False) -> RowFaul
 
 
 def third_rate(images: Pixels) -> Pixels:
-    return images[np.arange(len(images)) // 3 * 3]
+    found: Pixels = images[np.arange(len(images)) // 3 * 3]
+    return found
 
 
 def late(images: Pixels) -> Pixels:
-    return images[np.maximum(np.arange(len(images)) - len(images) // 6, 0)]
+    found: Pixels = images[np.maximum(np.arange(len(images)) - len(images) // 6, 0)]
+    return found
 
 
 def covered(images: Pixels) -> Pixels:

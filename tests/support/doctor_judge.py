@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -86,12 +86,12 @@ class Bench:
             assert _contents(root) != before, f"{name} changed no file"
         return root
 
-    def is_found(self, answer: dict[str, Any], episodes: Iterable[int] | None, second: str = "") -> bool:
+    def is_found(self, answer: dict[str, Any], episodes: range | None, second: str = "") -> bool:
         """Whether a finding names one of the episodes, any for None, that the dataset without the fault lacks."""
         if second not in self.alarms:
             self.alarms[second] = alarms_of(check(self.write(f"without_{second}", SECOND[second])))
         new = alarms_of(answer) - self.alarms[second]
-        return any(episodes is None or episode in episodes for _, episode in new)
+        return any(episodes is None or (episode is not None and episode in episodes) for _, episode in new)
 
 
 def _contents(root: Path) -> dict[Path, bytes]:
