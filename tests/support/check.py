@@ -23,8 +23,8 @@ from demorec.check.report import CheckOptions, Subject, SubjectReport, check_sub
 from demorec.core.config import EpisodePlan, GenerateConfig
 from demorec.episode.episode import CameraImages, Event, Frame, Outcome, Trajectory
 from demorec.episode.info import EpisodeInfo
+from demorec.extensions.doctor.check_command import split_checks
 from demorec.extensions.doctor.examine import examine
-from demorec.extensions.doctor.explain_command import split_checks
 from demorec.extensions.doctor.from_dataset import ReadOptions
 from demorec.loop import ScriptAgent, Session, make_renderer, make_world, prepare
 from demorec.mcap import EpisodeWriter, Recording

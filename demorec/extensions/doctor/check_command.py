@@ -1,7 +1,8 @@
-"""`demorec check`: file integrity, the doctor, and remaking of episodes."""
+"""`demorec check`: file integrity, the doctor, and remaking of episodes; `demorec explain`: one check."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -9,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from demorec.check.base import RANK
-from demorec.cli.shared.flags import Allow, allowed_modules
+from demorec.cli.shared.flags import Allow, Positional, allowed_modules, terminal_width
 from demorec.cli.shared.output import ProgressBar, counted, say, say_json
 from demorec.cli.shared.paths import (
     MappingFile,
@@ -23,7 +24,8 @@ from demorec.cli.shared.paths import (
     tell_unfinished,
 )
 from demorec.core.errors import ConfigError, describe_error
-from demorec.extensions.doctor.examine import as_json, examine, lines_of
+from demorec.core.registry import nearest_match
+from demorec.extensions.doctor.examine import examine, lines_of
 
 if TYPE_CHECKING:
     from demorec.check.base import Check
@@ -93,7 +95,6 @@ class CheckCommand:
         from demorec.check.report import CheckOptions, check_subjects, find_subjects, useful_workers
         from demorec.core.processes import available_cores
         from demorec.datasets.lerobot.files import leave_pandas_out
-        from demorec.extensions.doctor.explain_command import split_checks
 
         leave_pandas_out()
         integrity, chosen = split_checks(self.only)
@@ -148,10 +149,9 @@ class CheckCommand:
     def _print_json(self, diagnoses: Sequence[Diagnosis], remade: Sequence[DeepReport]) -> None:
         deep = {"deep": [plain_deep(report) for report in remade]} if self.deep else {}
         if len(diagnoses) == 1:
-            say_json({**as_json(self.paths[0], diagnoses[0]), **deep})
+            say_json({**diagnoses[0].to_json(), **deep})
         else:
-            both = zip(self.paths, diagnoses, strict=True)
-            say_json({"paths": [as_json(path, diagnosis) for path, diagnosis in both], **deep})
+            say_json({"paths": [diagnosis.to_json() for diagnosis in diagnoses], **deep})
 
     def _description(self) -> str:
         """Read the URDF named by the user, "" for none; ConfigError if it is invalid."""
@@ -232,3 +232,66 @@ def plain_deep(report: DeepReport) -> dict[str, Any]:
     return {"path": str(report.path), "kind": "deep", "level": report.level, "results": [
         {name: value for name, value in plain.items() if name != "path"}
     ]}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True)
+class Explain:
+    """Explain a check: its input, its limits, why it matters, and the fix.
+
+    Examples:
+      demorec explain action_lag
+      demorec explain frozen_images
+    """
+
+    check: Positional[str]
+    """Name of the check, as demorec check prints it and demorec list checks lists it."""
+
+    def run(self) -> int:
+        """Print the page of the check."""
+        from demorec.core.tables import FILE_CHECKS
+
+        _, doctors = split_checks((self.check,))
+        found = doctors[0] if doctors else FILE_CHECKS.load(self.check)
+        width = min(terminal_width(), 100)
+        lines = [self.check, ""]
+        for paragraph in found.page.split("\n\n"):
+            lines += [*textwrap.wrap(" ".join(paragraph.split()), width), ""]
+        rows = [("finds", found.measures), ("needs", found.needs), ("unit", found.unit or "none")]
+        rows += [("why", found.why), ("do", found.do)]
+        say(*lines, *(line for name, text in rows for line in _row(name, text, width)))
+        return 0
+
+
+def _row(name: str, text: str, width: int) -> Iterator[str]:
+    text = text.format(path="DATASET", episode="N", camera="CAMERA")
+    yield from textwrap.wrap(text, width, initial_indent=f"{name:<7}", subsequent_indent=" " * 7)
+
+
+def split_checks(names: Sequence[str]) -> tuple[tuple[str, ...], tuple[Check, ...]]:
+    """Find the named checks: names of file integrity checks, and checks of the doctor; all of them without names.
+
+    Raises:
+        ConfigError: Unknown check.
+    """
+    from demorec.core.tables import FILE_CHECKS
+    from demorec.extensions.doctor.checks import all_checks
+
+    if not names:
+        return (), all_checks()
+    doctors = {check.name: check for check in all_checks()}
+    for name in names:
+        if name not in doctors and name not in FILE_CHECKS.names():
+            near = nearest_match(name, [*doctors, *FILE_CHECKS.names()])
+            raise ConfigError(f"Unknown check {name!r}.{near} demorec list checks prints them.")
+    return tuple(n for n in names if n not in doctors), tuple(doctors[n] for n in names if n in doctors)
+
+
+def check_rows() -> Iterator[tuple[str, str]]:
+    """Yield (name, summary) of every check, the doctor's first."""
+    from demorec.core.tables import FILE_CHECKS
+    from demorec.extensions.doctor.checks import all_checks
+
+    for check in all_checks():
+        yield check.name, check.measures
+    for name in FILE_CHECKS.names():
+        yield name, FILE_CHECKS.load(name).measures

@@ -68,31 +68,14 @@ class Diagnosis:
 
     def to_json(self) -> dict[str, Any]:
         """Convert to JSON data as described in docs/checks.md."""
+        fields = ("check", "severity", "episode", "frames", "value", "message", "why", "do")
+        episodes = [{**vars(each), "score": round(each.score, 4)} for each in self.episodes]
         return {
+            "path": str(self.path),
             "verdict": self.verdict,
             "taken": dict(self.taken),
-            "findings": [
-                {
-                    "check": finding.check,
-                    "severity": finding.severity,
-                    "episode": finding.episode,
-                    "frames": None if finding.frames is None else list(finding.frames),
-                    "value": finding.value,
-                    "message": finding.message,
-                    "why": finding.why,
-                    "do": finding.do,
-                }
-                for finding in self.findings
-            ],
-            "episodes": [
-                {
-                    "episode": each.episode,
-                    "verdict": each.verdict,
-                    "score": round(each.score, 4),
-                    "reasons": list(each.reasons),
-                }
-                for each in self.episodes
-            ],
+            "findings": [{name: getattr(finding, name) for name in fields} for finding in self.findings],
+            "episodes": episodes,
             "not_measured": [{"check": name, "reason": reason} for name, reason in self.not_measured.items()],
         }
 
@@ -117,7 +100,7 @@ def diagnose(evidence: Evidence, checks: Sequence[Check] | None = None, extra: S
     )
     return Diagnosis(
         path=evidence.path,
-        taken=dict(evidence.taken()),
+        taken=evidence.roles.of,
         findings=tuple(findings),
         episodes=_verdicts(evidence, findings),
         not_measured={result.check: result.not_measured for result in made if result.not_measured},

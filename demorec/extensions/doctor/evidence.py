@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from demorec.check.base import NotMeasuredError
 from demorec.core.geometry import Array, signs_of_course
 from demorec.episode.element_names import is_position, joint_of
-from demorec.episode.roles import Role, Roles
+from demorec.episode.roles import Roles
 from demorec.extensions.doctor.robust import without_gaps
 
 if TYPE_CHECKING:
@@ -209,10 +208,6 @@ class Evidence:
         """Convert a number of frames to a duration."""
         return frames / self.fps
 
-    def taken(self) -> Iterator[tuple[str, Role | None]]:
-        """Yield (column, role) of every feature except counters."""
-        yield from self.roles.of.items()
-
 
 def joined(parts: Sequence[str], columns: Mapping[str, NDArray[Any]]) -> Array | None:
     """Concatenate features to (T, D), without gaps; None if the list is empty or one is missing."""
@@ -239,8 +234,3 @@ def continuous(values: Array | None, names: Sequence[str]) -> Array | None:
     for place in quaternion_places(names):
         values[:, place : place + 4] *= signs_of_course(values[:, place : place + 4])[:, None]
     return values
-
-
-def number_in_words(value: float) -> str:
-    """Format a number with three digits."""
-    return f"{value:.3g}" if math.isfinite(value) else str(value)

@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from demorec.check.base import Finding
 from demorec.cli.shared.output import counted
@@ -226,8 +226,3 @@ def _episodes(diagnosis: Diagnosis, *, everything: bool) -> Iterator[str]:
 
 def _listed(numbers: Sequence[int], shown: int = _MAX_NUMBERS) -> str:
     return ", ".join(map(str, numbers[:shown])) + (", ..." if len(numbers) > shown else "")
-
-
-def as_json(path: Path, diagnosis: Diagnosis) -> dict[str, Any]:
-    """Convert to JSON data as described in docs/checks.md, with the path."""
-    return {"path": str(path), **diagnosis.to_json()}

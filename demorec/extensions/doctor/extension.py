@@ -15,9 +15,9 @@ EXTENSION = Extension(
             limits="reading",
             drawing_flags=("--deep",),
         ),
-        "explain": CommandRow(target="demorec.extensions.doctor.explain_command:Explain", group="judge"),
+        "explain": CommandRow(target="demorec.extensions.doctor.check_command:Explain", group="judge"),
     },
-    columns=dict.fromkeys(("verdict", "score"), "demorec.extensions.doctor.columns:judged_columns"),
-    rankings={"score": "demorec.extensions.doctor.columns:by_score"},
-    lists={"checks": "demorec.extensions.doctor.explain_command:check_rows"},
+    columns=dict.fromkeys(("verdict", "score"), "demorec.extensions.doctor.from_dataset:judged_columns"),
+    rankings={"score": "demorec.extensions.doctor.from_dataset:by_score"},
+    lists={"checks": "demorec.extensions.doctor.check_command:check_rows"},
 )

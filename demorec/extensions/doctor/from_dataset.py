@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from demorec.core.errors import DemorecError, ExportError
+from demorec.core.errors import ConfigError, ExportError
 from demorec.datasets.lerobot.episode_places import EpisodePlace
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.inspect import noted
@@ -19,9 +19,11 @@ from demorec.datasets.lerobot.robots import DatasetRobot, recognised_robot, robo
 from demorec.datasets.lerobot.videos import opened_video
 from demorec.episode.features import STATE
 from demorec.episode.roles import NO_NAMES, NamedRoles
+from demorec.extensions.doctor.diagnosis import diagnose
 from demorec.extensions.doctor.evidence import EpisodeEvidence, Evidence, continuous, joined
 from demorec.extensions.doctor.thumbnails import CameraThumbnails, EpisodeThumbnails, Shrinker, frames_of
 from demorec.robots.motors import Motors
+from demorec.runs.find import find
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -206,12 +208,30 @@ def _read_stored(
             errors[place.episode_index] = problems[0]
 
 
-def why_unreadable(root: Path, named: NamedRoles) -> str:
-    """Explain why a dataset cannot be opened at all; "" if it can."""
-    try:
-        folder = LeRobotFolder(root, named=named)
-        folder.roles  # noqa: B018
-        folder.listed  # noqa: B018
-    except DemorecError as error:
-        return str(error)
-    return ""
+def judged_columns(folder: LeRobotFolder, names: Collection[str]) -> list[dict[str, Any]]:
+    """Judge each episode: the "verdict", the "score", or both.
+
+    The verdict needs the images, which takes as long as `demorec check`; the score needs only the tables.
+    """
+    evidence = evidence_of_dataset(folder.root, ReadOptions(images="verdict" in names))
+    found = {each.episode: each for each in diagnose(evidence).episodes}
+    numbers = [place.episode_index for place in folder.places]
+    return [{name: getattr(found.get(number), name, None) for name in names} for number in numbers]
+
+
+def by_score(paths: Sequence[Path], named: NamedRoles) -> dict[str, str]:
+    """Rank the episodes of datasets by verdict and score, the worst first: name of its `PlaybackSource` -> its reason.
+
+    Raises:
+        ConfigError: A path is not a dataset.
+    """
+    if others := [path for path in paths if find(path).kind != "dataset"]:
+        raise ConfigError(f"--rank score is for LeRobot datasets, and this is not one: {others[0]}")
+    options = ReadOptions(images=False, named=named)
+    found = [(path, each) for path in paths for each in diagnose(evidence_of_dataset(path, options)).episodes]
+    ranked = {}
+    for path, each in sorted(found, key=lambda pair: pair[1].rank):
+        reasons = "; ".join(each.reasons)
+        line = f"{each.verdict}, {each.score:.2f}  episode {each.episode}{': ' * bool(reasons)}{reasons}"
+        ranked[f"{path}: episode {each.episode}"] = line
+    return ranked

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotMeasuredError, check
-from demorec.core.geometry import Array
+from demorec.core.geometry import Array, rotation_rows
 from demorec.episode.element_names import joint_of
 from demorec.episode.features import EE_POSE
 from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
@@ -141,16 +141,15 @@ def pose_mismatch(evidence: Evidence) -> Iterator[Fault]:
     errors: dict[int, float] = {}
     others: list[float] = []
     for episode, state in episodes[:: max(1, len(episodes) // MAX_FITTED_EPISODES)]:
-        joints = {name: column for name, column in zip(arm.joints, state.T, strict=True) if name}
         pose = _pose(episode.columns, poses)
         frames = np.flatnonzero(np.isfinite(pose).all(axis=1))
         if len(frames) >= MIN_FRAMES and np.ptp(pose[frames], axis=0).any():
-            error_m = _fitted_error(arm.urdf, {name: values[frames] for name, values in joints.items()}, pose[frames])
-            errors[episode.number] = float(np.quantile(error_m, 0.9))
+            joints = {name: column[frames] for name, column in zip(arm.joints, state.T, strict=True) if name}
+            links = _link_poses(arm.urdf, joints, len(frames))
+            errors[episode.number] = _fitted_error(links, pose[frames])
             if not others and errors[episode.number] > MIN_ORDER_ERROR_M:
                 turned = pose[frames][:, [0, 1, 2, 4, 5, 6, 3]]
-                other = _fitted_error(arm.urdf, {name: values[frames] for name, values in joints.items()}, turned)
-                others.append(float(np.quantile(other, 0.9)) / errors[episode.number])
+                others.append(_fitted_error(links, turned) / errors[episode.number])
     if others and others[0] < MAX_ORDER_RATIO:
         yield Fault(
             severity="broken",
@@ -192,14 +191,11 @@ def _pose(columns: Mapping[str, NDArray[Any]], place: tuple[str, list[int]]) -> 
     return np.asarray(columns[feature].astype(np.float64)[:, order])
 
 
-def _fitted_error(urdf: Urdf, joints: Mapping[str, Array], poses: Array) -> Array:
-    """Compute the (T,) residual in metres after the best fit of a base, a tool and a size to some frames."""
-    last = [joint.child for joint in urdf.depth_first() if joint.name in joints][-1]
-    count = len(poses)
-    links = _LinkMatrices(urdf, joints, count)[last]
+def _fitted_error(links: Array, poses: Array) -> float:
+    """Compute the error in metres, in nine of ten frames, after the best fit of a base, a tool and a size."""
     hands = matrices(poses)
-    rows = np.unique(np.linspace(0, count - 1, min(MAX_FITTED_FRAMES, count)).astype(int))
-    return _displacement(_placed(_fit(links[rows], hands[rows]), links), hands)
+    rows = np.unique(np.linspace(0, len(poses) - 1, min(MAX_FITTED_FRAMES, len(poses))).astype(int))
+    return float(np.quantile(_displacement(_placed(_fit(links[rows], hands[rows]), links), hands), 0.9))
 
 
 def _transform(numbers: Array) -> Array:
@@ -244,43 +240,21 @@ def _fit(links: Array, poses: Array) -> Array:
 def matrices(poses: Array) -> Array:
     """Convert poses (T, 7), position and quaternion xyzw of any length, to (T, 4, 4)."""
     quat = poses[:, 3:] / np.maximum(np.linalg.norm(poses[:, 3:], axis=1, keepdims=True), 1e-12)
-    x, y, z, w = quat.T
     out = np.zeros((len(poses), 4, 4))
-    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = 1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)
-    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = 2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)
-    out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = 2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)
+    out[:, :3, :3] = np.moveaxis(np.array(rotation_rows(*quat.T)), -1, 0)
     out[:, :3, 3] = poses[:, :3]
     out[:, 3, 3] = 1.0
     return out
 
 
-class _LinkMatrices:
-    """Forward kinematics of some joint positions: each link's poses are computed once, on demand.
-
-    Args:
-        urdf: The joint tree.
-        joint_position: Joint name -> (T,) positions, rad or m; missing joints are at 0.
-        count: T.
-    """
-
-    def __init__(self, urdf: Urdf, joint_position: Mapping[str, Array], count: int) -> None:
-        self._joint_position = joint_position
-        self._above = {joint.child: joint for joint in urdf.joints}
-        self._known = {urdf.root: np.broadcast_to(np.eye(4), (count, 4, 4))}
-
-    def __getitem__(self, link: str) -> Array:
-        """Compute (T, 4, 4) base_from_link; KeyError if the link does not exist."""
-        if link not in self._known:
-            joint = self._above[link]
-            self._known[link] = self[joint.parent] @ self._parent_from_child(joint)
-        return self._known[link]
-
-    def _parent_from_child(self, joint: UrdfJoint) -> Array:
-        """Compute (T, 4, 4), or (4, 4) if the joint does not move."""
-        position = self._joint_position.get(joint.name)
-        if position is None or joint.kind == "fixed":
-            return joint.parent_from_joint.matrix()
-        return _joint_matrices(joint, position)
+def _link_poses(urdf: Urdf, joints: Mapping[str, Array], count: int) -> Array:
+    """Compute (T, 4, 4) base_from_link of the last moved link, from joint name -> (T,) positions, rad or m."""
+    last = [joint.child for joint in urdf.depth_first() if joint.name in joints][-1]
+    found = np.broadcast_to(np.eye(4), (count, 4, 4))
+    for joint in urdf.path_to(last):
+        position = None if joint.kind == "fixed" else joints.get(joint.name)
+        found = found @ (joint.parent_from_joint.matrix() if position is None else _joint_matrices(joint, position))
+    return found
 
 
 def _joint_matrices(joint: UrdfJoint, position: Array) -> Array:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
 from demorec.episode.element_names import joint_of
-from demorec.extensions.doctor.evidence import DROP, Evidence, number_in_words
+from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.units import (
     MIN_MOTION_TICKS,
@@ -213,8 +213,8 @@ def state_jumps(evidence: Evidence) -> Iterator[Fault]:
             episode=episode.number,
             frames=(int(frames[0]) + 1, int(frames[-1]) + 1),
             value=f"{share:.0%} of its range",
-            message=f"{element_name(evidence, element)} jumps from {number_in_words(state[frame, element])} to "
-            f"{number_in_words(state[frame + 1, element])} within one frame (frame {frame + 1}{count})",
+            message=f"{element_name(evidence, element)} jumps from {state[frame, element]:.3g} to "
+            f"{state[frame + 1, element]:.3g} within one frame (frame {frame + 1}{count})",
         )
 
 
