@@ -26,12 +26,6 @@ _RECORDED: Mapping[str, Literal["float32", "float64"]] = {
 }
 """Type of a column -> recording type that holds all its values, except the largest integers."""
 NOT_HELD = "imported recordings hold none"
-_NEXT: Mapping[str, str] = {
-    "next.success": "its last value becomes the outcome of the episode",
-    "next.done": "an export computes it again: true in the last row of an episode",
-    "next.reward": "imported recordings hold an outcome, and no rewards",
-}
-"""Columns of LeRobot's environments -> their treatment in an import."""
 
 
 class _Group(NamedTuple):
@@ -108,7 +102,7 @@ def why_not_recorded(name: str, feature: DatasetFeature) -> str:
     if name in AUTOMATIC_FEATURES:
         return ""
     if name.startswith("next."):
-        return _NEXT.get(name, NOT_HELD)
+        return "recordings hold an outcome instead"
     if feature.is_depth:
         return _why_no_distances(feature)
     if feature.dtype in ("video", "image"):

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from demorec.core.errors import ExportError, describe_error
 from demorec.core.geometry import Array
+from demorec.datasets.lerobot.layout import video_info
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.stats import PixelHistogram
 
@@ -129,16 +130,10 @@ def _encoder(width: int, height: int, fps: int) -> av.VideoCodecContext:
     return context
 
 
-def depth_info(*, width: int, height: int, fps: int) -> dict[str, Any]:
-    """The `info` of a depth feature, from which LeRobot decodes distances."""
+def depth_info(size: tuple[int, int], fps: int) -> dict[str, Any]:
+    """The `info` of a depth feature, from which LeRobot decodes distances; `size` is (width, height)."""
     return {
-        "video.height": height,
-        "video.width": width,
-        "video.codec": "hevc",
-        "video.pix_fmt": "gray12le",
-        "video.fps": fps,
-        "video.channels": 1,
-        "has_audio": False,
+        **video_info(size, "hevc", "gray12le", fps, channels=1),
         "video.g": _GOP,
         "video.crf": _CRF,
         "video.preset": None,

@@ -356,6 +356,20 @@ _PLAIN_FIELDS = (
 )  # fmt: skip
 _INFO_FIELDS = frozenset(("fps", "robot_type", "video_path", *_PLAIN_FIELDS))
 
+
+def video_info(size: tuple[int, int], codec: str, pixels: str, fps: int, channels: int = 3) -> dict[str, Any]:
+    """The first entries of a camera feature's `info`; `size` is (width, height)."""
+    return {
+        "video.height": size[1],
+        "video.width": size[0],
+        "video.codec": codec,
+        "video.pix_fmt": pixels,
+        "video.fps": fps,
+        "video.channels": channels,
+        "has_audio": False,
+    }
+
+
 _ENCODER_INFO = ("video.g", "video.crf", "video.preset", "video.fast_decode", "video.extra_options")
 
 

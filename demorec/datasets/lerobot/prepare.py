@@ -21,7 +21,13 @@ from demorec.datasets.lerobot.boxes import SeenByCamera
 from demorec.datasets.lerobot.depth import depth_info, depth_video
 from demorec.datasets.lerobot.facts import episode_facts, stage_columns
 from demorec.datasets.lerobot.language import COLUMNS, EpisodeLanguage, episode_language, language_arrays
-from demorec.datasets.lerobot.layout import AUTOMATIC_FEATURES, LANGUAGE_FEATURE, DatasetFeature, DatasetInfo
+from demorec.datasets.lerobot.layout import (
+    AUTOMATIC_FEATURES,
+    LANGUAGE_FEATURE,
+    DatasetFeature,
+    DatasetInfo,
+    video_info,
+)
 from demorec.datasets.lerobot.mp4 import EncodedVideo
 from demorec.datasets.lerobot.options import ExportOptions
 from demorec.datasets.lerobot.robots import IN_MOTOR_UNITS, motor_features
@@ -117,7 +123,7 @@ def prepare_episode(episode: LeRobotEpisode) -> ExportedEpisode:
         key, settings = camera.feature, recording.video_settings(camera.name)
         if camera.is_depth:
             videos[key], pixels[key] = depth_video(episode.images(camera), fps=episode.fps)
-            video_infos[key] = depth_info(height=settings.height, width=settings.width, fps=episode.fps)
+            video_infos[key] = depth_info((settings.width, settings.height), episode.fps)
             continue
         settings = replace(settings, fps=episode.fps, gop=settings.gop if episode.stride == 1 else 1)
         if reasons[camera]:
@@ -291,14 +297,9 @@ def _video_info(settings: VideoSettings) -> dict[str, Any]:
     of 0.
     """
     preset = int(settings.preset) if settings.preset.isdigit() else settings.preset or None
+    size = settings.width, settings.height
     return {
-        "video.height": settings.height,
-        "video.width": settings.width,
-        "video.codec": _mp4_codec(settings),
-        "video.pix_fmt": settings.pix_fmt,
-        "video.fps": settings.fps,
-        "video.channels": 3,
-        "has_audio": False,
+        **video_info(size, _mp4_codec(settings), settings.pix_fmt, settings.fps),
         "video.g": settings.gop or None,
         "video.crf": settings.crf,
         "video.preset": preset,

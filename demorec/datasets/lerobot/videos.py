@@ -26,12 +26,13 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.layout import DatasetFeature
+from demorec.datasets.lerobot.layout import video_info
 from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
 from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
 
 if TYPE_CHECKING:
+    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.mcap.video import Rgb
 
 PacketCodec = Literal["h264", "h265", "av1"]
@@ -134,16 +135,7 @@ class VideoFile:
 
     def stream_info(self) -> dict[str, Any]:
         """Describe the encoding in info.json's form."""
-        return {
-            "video.height": self.size[1],
-            "video.width": self.size[0],
-            "video.codec": self.codec_name,
-            "video.pix_fmt": self.pixels,
-            "video.fps": int(self._fps),
-            "video.channels": 3,
-            "has_audio": False,
-            "is_depth_map": False,
-        }
+        return video_info(self.size, self.codec_name, self.pixels, int(self._fps)) | {"is_depth_map": False}
 
 
 class _Part(NamedTuple):
@@ -158,10 +150,6 @@ class _Part(NamedTuple):
 class EpisodeVideo:
     """The images of a camera feature in one episode of T frames.
 
-    Args:
-        open_file: Opens a video file, or returns an open one.
-        key, feature: The camera.
-
     Attributes:
         path: The mp4 file.
         first: Number of the episode's first image in it.
@@ -170,12 +158,11 @@ class EpisodeVideo:
     Methods and properties raise ExportError if the images cannot be read.
     """
 
-    def __init__(
-        self, open_file: Callable[[Path], VideoFile], key: str, feature: DatasetFeature, place: EpisodePlace, fps: int
-    ) -> None:
+    def __init__(self, folder: LeRobotFolder, key: str, place: EpisodePlace) -> None:
         self.path, self.first = place.videos[key]
         self.length = place.length
-        self._open_file, self._key, self._feature, self._fps = open_file, key, feature, fps
+        self._open_file, self._key, self._feature = folder.open_video, key, folder.info.features[key]
+        self._fps = int(folder.info.fps)
         self._episode = place.episode_index
 
     @property

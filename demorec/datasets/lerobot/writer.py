@@ -49,8 +49,6 @@ from demorec.datasets.lerobot.stats import (
     vector_statistics,
 )
 
-_MOST_UNSEEN = 100
-"""Maximum number of separate statistics of images without histograms, before they are merged."""
 _MAX_SECONDS_PER_VIDEO = 900.0
 """LeRobot compares timestamps as float32, whose step is 6e-5 s beyond 512 s and 1.2e-4 s beyond 1024 s, with a
 tolerance of 1e-4 s: a new mp4 file begins before that, unless a single episode is longer.
@@ -148,7 +146,7 @@ class DatasetWriter(Closing):
         self._video_positions = {key: next_position(root / "videos" / key, info.chunks_size) for key in info.video_keys}
         self._video_info = {key: info.features[key].info for key in info.video_keys}
         self._pixels: dict[str, PixelHistogram] = {}
-        self._unseen: dict[str, list[Statistics]] = {}
+        self._unseen: dict[str, Statistics] = {}  # of images without histograms
         self._sidecar = None if start.configs is None else SidecarWriter(root, info, start.configs)
         self._boxes: dict[str, BoxFile] = {}
 
@@ -242,10 +240,8 @@ class DatasetWriter(Closing):
 
     def _count(self, key: str, pixels: PixelHistogram | Statistics) -> Statistics:
         if isinstance(pixels, Statistics):
-            unseen = self._unseen.setdefault(key, [])
-            unseen.append(pixels)
-            if len(unseen) >= _MOST_UNSEEN:
-                unseen[:] = [merge_statistics(unseen)]
+            before = self._unseen.get(key)
+            self._unseen[key] = pixels if before is None else merge_statistics([before, pixels])
             return pixels
         self._pixels[key] = self._pixels[key] + pixels if key in self._pixels else pixels
         return pixels.statistics()
@@ -289,8 +285,8 @@ class DatasetWriter(Closing):
         statistics = data_statistics(tables_in(self._root, "data"), self._info.features)
         for key in self._cameras:
             new = self._pixels[key].statistics() if key in self._pixels else None
-            parts = [part for part in (self._old_statistics.get(key), new) if part is not None]
-            if parts := [*parts, *self._unseen.get(key, ())]:
+            found = (self._old_statistics.get(key), new, self._unseen.get(key))
+            if parts := [part for part in found if part is not None]:
                 statistics[key] = merge_statistics(parts)
         ordered = {name: statistics[name].to_json() for name in self._info.features if name in statistics}
         write_text(self._root / STATS_PATH, json.dumps(ordered, indent=4) + "\n")

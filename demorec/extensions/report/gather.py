@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -13,12 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from demorec.check.base import Finding
-from demorec.core.errors import ConfigError, ExportError, RecordingError, resource_error, without_path
+from demorec.core.errors import ConfigError, ExportError, RecordingError, describe_error, resource_error, without_path
 from demorec.core.replacing import shown
 from demorec.datasets.lerobot.folder import LeRobotFolder
 from demorec.datasets.lerobot.paths import SIDECAR_DIR
+from demorec.datasets.lerobot.recording import DatasetRecording
 from demorec.episode.element_names import is_numbered
-from demorec.episode.episode import Outcome, consecutive_runs
+from demorec.episode.episode import Outcome, SuccessCheck, consecutive_runs
 from demorec.episode.protocol import Episode
 from demorec.episode.roles import NO_NAMES, NamedRoles, Roles, roles_of_recording
 from demorec.episode.simulated import simulation_facts
@@ -36,7 +37,6 @@ from demorec.runs.run_file import (
     RunFile,
     load_any_run_file,
 )
-from demorec.view.from_dataset import open_stored_episode
 
 State = Literal["unreadable", "failed", "flagged", "unknown", "succeeded"]
 """State of an episode. "flagged" is a success with a finding of a check."""
@@ -164,6 +164,10 @@ _KINDS: Mapping[PathKind, str] = {
     "evaluation": "evaluation of a policy",
     "recordings": "folder of recordings",
 }
+_DETAILS = (
+    "source", "root_seed", "success", "failure_phase", "failure_reason", "num_retries", "checks", "phases",
+)  # fmt: skip
+"""Columns of the sidecar."""
 _Progress = Callable[[int, int], None]
 
 
@@ -241,19 +245,21 @@ def _dataset_report(
     stride, budget = max(1, -(-len(folder.places) // MAX_SHOWN)), strip_budget(len(folder.places))
     flagged = set() if diagnosis is None else {finding.episode for finding in diagnosis.findings}
     without_videos = folder.leave_out_missing_cameras()
+    rows = {row["episode_index"]: row for row in folder.sidecar(_DETAILS)}
     components: Components = {}
     episodes: list[ReportedEpisode] = []
     for number, place in enumerate(folder.places):
         strip_bytes = budget if place.episode_index in flagged or number % stride == 0 else 0
-        opened = partial(open_stored_episode, folder, number)
-        episode = _read(opened, root, folder.roles, camera, strip_bytes, components)
+        episode = _read(partial(_stored, folder, number), root, folder.roles, camera, strip_bytes, components)
         episode = replace(episode, name=f"episode {place.episode_index}")
+        if place.episode_index in rows:
+            episode = _with_details(episode, rows[place.episode_index], root)
         episodes.append(_judged(episode, place.episode_index, diagnosis))
         advance(len(episodes), len(folder.places))
     files = (file for file in root.rglob("*") if file.is_file())
     facts = [("episodes", str(len(episodes))), *_common_facts(episodes, files)]
     missing = [*folder.notes, *(f"No episode has a video of {key}." for key in without_videos), *folder.roles.notes()]
-    if not folder.sidecar_tables("episodes"):
+    if not rows:
         missing.append(
             f"The dataset has no folder {SIDECAR_DIR}/, which exports of demorec have: random seeds, phases "
             "and the conditions of success are not known."
@@ -267,6 +273,14 @@ def _dataset_report(
         diagnosis=diagnosis,
         missing=tuple(missing),
     )
+
+
+@contextmanager
+def _stored(folder: LeRobotFolder, number: int) -> Iterator[Episode]:
+    try:
+        yield DatasetRecording(folder, number)
+    except (ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
+        raise ExportError(f"The dataset cannot be read ({describe_error(error)}): {folder.root}") from error
 
 
 def _read(
@@ -311,6 +325,21 @@ def _read(
         if (lack := resource_error(error)) is not None:
             raise lack from error
         return ReportedEpisode(name=path.stem, problem=without_path(error, path).replace(f"{path}/", ""))
+
+
+def _with_details(episode: ReportedEpisode, row: Mapping[str, Any], root: Path) -> ReportedEpisode:
+    """Add seed, phases and outcome of the sidecar's row. Raises ExportError if it cannot be used."""
+    try:
+        names = ("success", "failure_phase", "failure_reason", "num_retries")
+        known = {name: row[name] for name in names if row[name] is not None}
+        checks = tuple(SuccessCheck(**check) for check in row["checks"] or ())
+        phases = tuple((phase["name"], phase["from"], phase["to"]) for phase in row["phases"] or ())
+    except (KeyError, TypeError) as error:
+        raise ExportError(
+            f"The sidecar's row of {episode.name} cannot be used ({describe_error(error)}): {root}"
+        ) from error
+    outcome = Outcome(num_frames=episode.num_frames, checks=checks, **known)
+    return replace(episode, seed=row["root_seed"], phases=phases, outcome=outcome, source=str(row["source"] or ""))
 
 
 def _facts_of(episode: Episode) -> Iterator[tuple[str, str]]:
