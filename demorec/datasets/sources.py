@@ -48,7 +48,7 @@ def why_left_out(recording: Recording, options: CommonOptions) -> LeftOut | None
         phases = recording.phases
         if POLICY_PHASE in phases and not interventions(phases).any():
             return "unwanted"
-    if options.include_failures or not (recording.has_failed or recording.path.parent.name == "failed"):
+    if options.include_failures or not (recording.success is False or recording.path.parent.name == "failed"):
         return None
     return "unknown" if recording.outcome is None else "failures"
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from demorec.episode.episode import Outcome, Table, Trajectory
+from demorec.episode.episode import Table, Trajectory
 from demorec.episode.features import (
     ACTION,
     COMMAND,
@@ -125,10 +125,3 @@ def simulation_facts(info: EpisodeInfo) -> Mapping[str, Any]:
 def scene_of(info: EpisodeInfo) -> Scene | None:
     """Return the scene at the start of the episode; None if unknown."""
     return None if info.simulation is None else info.simulation.scene
-
-
-def has_failed(info: EpisodeInfo, outcome: Outcome | None) -> bool:
-    """Check whether an episode failed, by its outcome or because a crash cut off a simulation without one."""
-    if outcome is None:
-        return info.simulation is not None
-    return outcome.success is False

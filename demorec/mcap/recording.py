@@ -21,7 +21,7 @@ from demorec.core.plain import to_json, to_plain
 from demorec.episode.episode import NO_IMAGE, CameraImages, Event, Frame, JointSample, Table, Trajectory
 from demorec.episode.info import DEPTH_UNITS, NOT_SIMULATED, EpisodeInfo
 from demorec.episode.protocol import Box, SceneMotion
-from demorec.episode.simulated import has_failed, simulated_table
+from demorec.episode.simulated import simulated_table
 from demorec.episode.validity import find_problems
 from demorec.mcap import channels, messages, metadata
 from demorec.mcap.columns import TimedMessages, read_columns
@@ -148,14 +148,11 @@ class Recording(Closing):
         return settings.height, settings.width
 
     @property
-    def has_failed(self) -> bool:
-        """Whether the outcome is a failure, or a crash cut off a simulated episode."""
-        return has_failed(self.info, self.outcome)
-
-    @property
     def success(self) -> bool | None:
-        """Success of its attempt; None if unknown."""
-        return False if self.has_failed else None if self.outcome is None else self.outcome.success
+        """Success of its attempt; None if unknown, False for a simulation that a crash cut off."""
+        if self.outcome is None:
+            return None if self.info.simulation is None else False
+        return self.outcome.success
 
     @property
     def topics(self) -> dict[str, tuple[str, int]]:
