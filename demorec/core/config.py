@@ -174,12 +174,9 @@ class GenerateConfig:
         check_option("physics_hz", self.physics_hz, 60, MAX_PHYSICS_HZ)
         check_option("fps", self.fps, 1, MAX_PHYSICS_HZ)
         if self.physics_hz % self.fps:
-            steps = -(-self.physics_hz // self.fps)  # steps per frame, rounded up
-            other = f", or --physics-hz {steps * self.fps}" if steps * self.fps <= MAX_PHYSICS_HZ else ""
+            other = _nearest_divisors(self.physics_hz, self.fps)
             raise OptionError(
-                "fps",
-                f"is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz: use "
-                f"{_nearest_divisors(self.physics_hz, self.fps)}{other}.",
+                "fps", f"is {self.fps}, which does not divide the physics rate of {self.physics_hz} Hz: use {other}."
             )
         for name, value in (("width", self.width), ("height", self.height)):
             check_option(name, value, 16, 8192)

@@ -19,9 +19,8 @@ from demorec.core.errors import ConfigError
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"fps": 50}, "use 48 or 60, or --physics-hz 250"),
-        ({"fps": 300}, "use 240, or --physics-hz 300"),
-        ({"fps": 7001, "physics_hz": 8000}, "use 4000 or 8000\\."),
+        ({"fps": 50}, "use 48 or 60"),
+        ({"fps": 300}, "use 240"),
         ({"height": 0}, "height is 0"),
         ({"width": 8000, "height": 8000}, "pixels per image"),
         ({"video": VideoConfig(crf=99)}, "crf is 99"),
