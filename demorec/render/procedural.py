@@ -5,6 +5,8 @@ Only integer noise and triangle waves: NumPy's vectorised sines may differ in th
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,8 +14,9 @@ from demorec.core.geometry import Array
 from demorec.episode.scene import Texture
 
 
+@functools.lru_cache(maxsize=32)
 def texture_pixels(texture: Texture, size: int = 256) -> NDArray[np.uint8]:
-    """Compute (size, size, 3) RGB pixels."""
+    """Compute (size, size, 3) RGB pixels; the same array again for the same arguments."""
     axis = (np.arange(size) + 0.5) / size
     v, u = np.meshgrid(axis, axis, indexing="ij")
     mix = _mix(texture, u, v)[..., None]

@@ -52,7 +52,15 @@ def new_recording(episode: Playback) -> rr.RecordingStream:
     """Create an empty Rerun recording with the episode's name and properties."""
     recording = rr.RecordingStream(_application_id(episode), recording_id=f"{episode.name}-{episode.identity}")
     recording.send_recording_name(_entry(episode))
-    recording.send_property("episode", rr.AnyValues(**_properties(episode)))
+    properties = {
+        "instruction": episode.info.instruction,
+        "outcome": episode.verdict,
+        "seconds": round(episode.duration, 3),
+        "frames": episode.num_frames,
+        "episode": episode.info.episode_index,
+        "source": episode.source,
+    }
+    recording.send_property("episode", rr.AnyValues(**properties))
     return recording
 
 
@@ -151,29 +159,6 @@ def _entry(episode: Playback) -> str:
     if outcome is None or outcome.success is None:
         return f"{name} ?"
     return f"{name} ok" if outcome.success else f"{name} FAIL {outcome.failure_phase}".rstrip()
-
-
-def _properties(episode: Playback) -> dict[str, str | int | float | bool]:
-    """Collect the properties that the viewer lists next to the recording's name."""
-    info, outcome = episode.info, episode.data.outcome
-    values: dict[str, str | int | float | bool] = {
-        "instruction": info.instruction,
-        "outcome": episode.verdict,
-        "seconds": round(episode.duration, 3),
-        "frames": episode.num_frames,
-        "episode": info.episode_index,
-        "robot": info.robot_name,
-        "source": episode.source,
-    }
-    if outcome is not None and outcome.success is not None:
-        values["success"] = outcome.success
-    if facts := simulation_facts(info):
-        values |= {"task": facts["task"], "seed": facts["root_seed"], "attempt": info.attempt}
-        values |= {} if outcome is None else {"retries": outcome.num_retries}
-        values |= {"config_digest": facts["config_digest"]} if facts["config_digest"] else {}
-    if origin := _origin(episode):
-        values["origin"] = origin
-    return values
 
 
 def _origin(episode: Playback) -> str:

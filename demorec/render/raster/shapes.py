@@ -217,13 +217,6 @@ class ModelStore:
             self._models[place] = _model_of(mesh, key=repr(place), read=lambda: mesh, coarse=coarse)
         return self._models[place]
 
-    def procedural(self, texture: Texture) -> Pixels:
-        """Draw a procedural texture's image."""
-        place = (texture,)
-        if place not in self._images:
-            self._images[place] = texture_pixels(texture)
-        return self._images[place]
-
     def image(self, path: Path) -> Pixels:
         """Read a texture file's image."""
         try:
@@ -302,7 +295,7 @@ def _model(visual: Visual, store: ModelStore) -> tuple[Model, Floats]:
 def _texture(model: Model, texture: Texture | None, store: ModelStore) -> Pixels | None:
     """Choose the image that covers a shape: one set on it, else the mesh file's."""
     if texture is not None and model.has_uv:
-        return store.procedural(texture)
+        return texture_pixels(texture)
     if model.texture is not None and model.has_uv:
         return store.image(model.texture)
     return None
