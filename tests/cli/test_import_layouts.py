@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from support import bags
 from support.commands import exit_code
-from support.layouts import LAYOUTS, Layout, Part
+from support.layouts import LAYOUTS, Part
 
 from demorec.mcap import Recording
 
 
-def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int, layout: Layout) -> list[float]:
+def _expected(notes: bags.Notes, parts: Sequence[Part], time_ns: int) -> list[float]:
     """Return the latest values of each part at each time, by header time where a topic has one."""
     row: list[float] = []
     for part in parts:
         known = [
-            (note.header_ns or note.log_ns - layout.clock_ns, numbers)
+            (note.header_ns or note.log_ns, numbers)
             for note in notes
             if note.topic == part.topic and (numbers := part.numbers(note.body)) is not None
         ]
@@ -52,9 +52,9 @@ def test_a_suggested_mapping_works_unedited(name: str, tmp_path: Path, capsys: p
         assert len(times) >= 30
         for row, time_ns in enumerate(times):
             state = table.features["observation.state"]
-            assert state[row].tolist() == _expected(notes, layout.state, time_ns, layout)
+            assert state[row].tolist() == _expected(notes, layout.state, time_ns)
             if layout.action:
-                assert table.features["action"][row].tolist() == _expected(notes, layout.action, time_ns, layout)
+                assert table.features["action"][row].tolist() == _expected(notes, layout.action, time_ns)
             elif row:
                 assert np.array_equal(table.features["action"][row - 1], state[row])
         assert len(recording.info.cameras) == layout.cameras

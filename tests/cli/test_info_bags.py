@@ -67,16 +67,6 @@ def test_a_text_file_is_not_mcap(command: str, tmp_path: Path, capsys: pytest.Ca
     assert "cannot be computed" not in printed.out
 
 
-def test_the_only_file_of_a_bag_is_read_under_another_name(
-    notes: bags.Notes, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    path = bags.write_rosbag2(notes, tmp_path / "x")
-    (file,) = (file for file in path.iterdir() if file.name != "metadata.yaml")
-    file.rename(path / f"monday{file.suffix}")
-    assert exit_code("info", path, "--json") == 0
-    assert json.loads(capsys.readouterr().out)["messages"] == len(notes)
-
-
 def test_no_mapping_is_offered_for_a_bag_without_messages(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = bags.write_mcap([], tmp_path / "empty.mcap")
     assert exit_code("info", path) == 0

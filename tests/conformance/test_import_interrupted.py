@@ -88,20 +88,3 @@ def test_an_interrupted_import_lists_missing_episodes(
     assert plain["digest"] == other["digest"]
     assert plain["episodes"] == other["episodes"]
     assert exit_code("check", run, "--no-images", "--strict", "--only", "run_complete") == 0
-
-
-def test_the_plan_is_that_of_the_last_import(
-    calls: dict[str, tuple[list[object], tuple[str, ...]]], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """An import without the broken bag makes the run complete."""
-    (monday, tuesday, wednesday, *mapping), _ = calls["bags"]
-    broken = tmp_path / "broken.mcap"
-    broken.write_bytes(Path(str(tuesday)).read_bytes()[:2000])
-    run = tmp_path / "run"
-    assert exit_code("import", monday, broken, wednesday, *mapping, "--out", run) == 1
-    assert info(run, capsys)["planned"] == ["broken.mcap", "wednesday.mcap"]
-    assert exit_code("import", monday, *mapping, "--out", run) == 0
-    assert info(run, capsys)["planned"] == []
-    assert exit_code("import", monday, broken, wednesday, *mapping, "--out", run, "--skip-bad") == 1
-    plain = info(run, capsys)
-    assert (plain["complete"], len(plain["episodes"]), len(plain["left_out"])) == (True, 2, 1)

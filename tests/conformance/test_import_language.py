@@ -166,9 +166,7 @@ def test_subtasks_are_never_invented(tmp_path: Path, capsys: pytest.CaptureFixtu
 
 
 FAULTS: dict[str, tuple[bags.Notes, str, int, str]] = {
-    "no topic": ([], SUBTASKS, 1, "no message of '/subtask'"),
     "no text": ([], SUBTASKS.replace("/subtask", "/leader/joint_states") + 'field = "position"\n', 1, "is not a text"),
-    "no field": (texts("/subtask", SAID), SUBTASKS + 'field = "dta"\n', 1, "Did you mean 'data'?"),
     "another field": (
         texts("/subtask", SAID),
         SUBTASKS + 'field = "data"\n[episodes]\ncut = "marker"\ntopic = "/subtask"\nfield = "x"\n', 2, "subtasks.field",

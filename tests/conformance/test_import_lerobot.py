@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shutil
 from collections.abc import Callable
@@ -14,9 +15,10 @@ import pyarrow.parquet as pq
 import pytest
 from lerobot_datasets import CAMERA, DEPTH, write_by_lerobot
 from numpy.typing import NDArray
+from PIL import Image
 from support.check import edit_parquet
 from support.commands import exit_code
-from support.export import data_table, export, make_run, recordings
+from support.export import export, make_run, recordings
 
 from demorec.core.errors import DemorecError
 from demorec.extensions.imports.dataset_import import import_lerobot
@@ -89,7 +91,7 @@ def test_images_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None
         rows = [
             row for file in sorted((dataset / "data").rglob("*.parquet")) for row in pq.read_table(file).to_pylist()
         ]
-        expected = [np.asarray(_opened(row[CAMERA]["bytes"])) for row in rows]
+        expected = [np.asarray(Image.open(io.BytesIO(row[CAMERA]["bytes"])).convert("RGB")) for row in rows]
     else:
         expected = shown_by(dataset)
     assert len(found) == len(expected) == sum(LENGTHS)
@@ -99,26 +101,6 @@ def test_images_are_kept_or_coded_once(imported: tuple[str, Path, Path]) -> None
         for index in range(1, len(found)):
             own, before = (np.abs(found[index].astype(int) - expected[k]).mean() for k in (index, index - 1))
             assert own < before / 2, index
-
-
-def _opened(data: bytes) -> Any:
-    import io
-
-    from PIL import Image
-
-    return Image.open(io.BytesIO(data)).convert("RGB")
-
-
-def test_exported_again_it_has_equal_numbers(imported: tuple[str, Path, Path], tmp_path: Path) -> None:
-    kind, dataset, run = imported
-    report = export(run, tmp_path / "again")
-    assert (report.num_episodes, report.transcoded) == (3, ())
-    table = data_table(tmp_path / "again")
-    for name in VECTORS:
-        again = np.array(table.column(name).to_pylist()).reshape(sum(LENGTHS), -1)
-        np.testing.assert_array_equal(again, columns_of(dataset, name).astype(np.float32))
-    if kind == "video":
-        assert all(np.array_equal(a, b) for a, b in zip(shown_by(tmp_path / "again"), shown_by(dataset), strict=True))
 
 
 def codes_of(dataset: Path, key: str) -> list[NDArray[np.uint16]]:
@@ -205,10 +187,8 @@ FAULTS: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-CASES = [(kind, fault) for kind in ("image", "long_gops") for fault in FAULTS if (kind, fault) != ("image", "video")]
-
-
-@pytest.mark.parametrize(("imported", "fault"), CASES, indirect=["imported"])
+@pytest.mark.parametrize("imported", ["long_gops"], indirect=True)
+@pytest.mark.parametrize("fault", sorted(FAULTS))
 def test_impossible_imports_are_one_sentence(fault: str, imported: tuple[str, Path, Path], tmp_path: Path) -> None:
     _, dataset, _ = imported
     shutil.copytree(dataset, tmp_path / "d")

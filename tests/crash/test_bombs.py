@@ -50,13 +50,6 @@ def many_large_chunks(good: Path, path: Path) -> None:
     path.write_bytes(rewritten(good, extra_chunks=[chunk] * 60))
 
 
-def empty_records(good: Path, path: Path) -> None:
-    """Millions of empty records."""
-    content = record(200, b"") * 3_000_000
-    chunk = chunk_record(zstandard.ZstdCompressor().compress(content), size=len(content), crc=zlib.crc32(content))
-    path.write_bytes(rewritten(good, extra_chunks=[chunk] * 7))
-
-
 def empty_messages(good: Path, path: Path) -> None:
     """Four million messages on an existing topic."""
     content = message_record(2, 0, b"") * 1_300_000
@@ -64,16 +57,13 @@ def empty_messages(good: Path, path: Path) -> None:
     path.write_bytes(rewritten(good, extra_chunks=[chunk] * 3))
 
 
-BOMBS: tuple[Callable[[Path, Path], None], ...] = (one_huge_chunk, many_large_chunks, empty_records, empty_messages)
+BOMBS: tuple[Callable[[Path, Path], None], ...] = (one_huge_chunk, many_large_chunks, empty_messages)
 
 
 @pytest.mark.parametrize(
     ("bomb", "command"),
     [(bomb, "check") for bomb in BOMBS]
-    + [
-        pytest.param(bomb, "recover", marks=pytest.mark.long if bomb in (many_large_chunks, empty_records) else ())
-        for bomb in BOMBS
-    ],
+    + [pytest.param(bomb, "recover", marks=pytest.mark.long if bomb is many_large_chunks else ()) for bomb in BOMBS],
 )
 def test_a_small_recording_never_becomes_large(
     bomb: Callable[[Path, Path], None], command: str, good: Path, commands: LimitedCommands, tmp_path: Path
@@ -88,10 +78,9 @@ def test_a_small_recording_never_becomes_large(
     assert told.code == 1 or command == "recover" or bomb is many_large_chunks
 
 
-@pytest.mark.parametrize(("opening", "depth"), [("[", 200), ("[", 100_000), ('{"a":', 5000)])
-def test_metadata_nested_without_end(opening: str, depth: int, good: Path, tmp_path: Path) -> None:
-    closing = {"[": "]", '{"a":': "1}"}[opening] if depth < 1000 else ""
-    text = '{"config": ' + opening * depth + closing * (depth if closing == "]" else 0) + "}"
+@pytest.mark.parametrize("depth", [200, 100_000])
+def test_metadata_nested_without_end(depth: int, good: Path, tmp_path: Path) -> None:
+    text = '{"config": ' + "[" * depth + ("]" * depth if depth < 1000 else "") + "}"
     path = tmp_path / "nested.mcap"
     path.write_bytes(rewritten(good, change={"demorec.episode": {"info": text}}))
     with pytest.raises(RecordingError) as caught:
@@ -128,9 +117,8 @@ def _box(kind: bytes, content: bytes) -> bytes:
     [
         _box(b"stsz", struct.pack(">III", 0, 1, 10**9)),
         _box(b"stsz", struct.pack(">IIIII", 0, 0, 2, 2**31, 2**31)),
-        _box(b"stsz", struct.pack(">III", 0, 0, 2**32 - 1)),
     ],
-    ids=["images of a byte", "large images", "more images than sizes"],
+    ids=["images of a byte", "large images"],
 )
 def test_a_video_that_claims_too_many_images(table: bytes, commands: LimitedCommands, tmp_path: Path) -> None:
     recording = write_episode(tmp_path / "seen.mcap", num_frames=6, cameras=("front",))

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
-from support import bag_mappings, bags
 from support.commands import exit_code
 from support.drawn_datasets import ACTION, DRAWN, HEIGHT, PLAIN, REFERENCE, STATE, TOP, WIDTH, DrawnDataset, write_drawn
 from support.export import recordings
@@ -73,34 +72,6 @@ def test_the_pixel_format_decides_what_a_video_of_a_dataset_holds(
             with Recording(path) as recording:
                 assert (recording.cameras, recording.num_frames) == (("top",), length)
                 assert {image.shape for image in recording.images("top")} == {(HEIGHT, WIDTH, 3)}
-
-
-@pytest.mark.slow
-@settings(max_examples=6, **FEW)  # type: ignore[arg-type]
-@given(kind=KINDS.filter(lambda kind: kind[0] != "png"), gop=st.sampled_from([1, 5]))
-def test_the_pixel_format_decides_what_a_video_of_a_bag_holds(kind: tuple[str, str], gop: int) -> None:
-    codec, pixels = kind
-    notes = bags.trossen(1.0)
-    deep = bags.of_topic(notes, "/cameras/cam_wrist/image")
-    images = [bags.image(note.header_ns, 1) for note in deep]
-    packets = bags.video(images, gop=gop, codec={"h264": "libx264", "hevc": "libx265"}[codec], pixels=pixels)
-    name = {"h264": "h264", "hevc": "h265"}[codec]
-    body = iter([{"format": name, "data": packet} for packet in packets])
-    notes = [replace(note, body=next(body)) if note.topic == deep[0].topic else note for note in bags.in_order(notes)]
-    with tempfile.TemporaryDirectory() as folder:
-        bag, run = bags.write_trossen(notes, Path(folder) / "bag.mcap"), Path(folder) / "run"
-        mapping = bag_mappings.write_mapping(bag_mappings.TROSSEN, Path(folder) / "robot.toml")
-        code, _, error = command("import", bag, "--mapping", mapping, "--out", run)
-        suggestion = command("import", bag, "--suggest")[1]
-        is_mapped = f'[cameras.wrist]\ntopic = "{deep[0].topic}"' in suggestion
-        if pixels in MEASURED:
-            assert (code, recordings(run), is_mapped) == (1, [], False)
-            assert f"holds {pixels}, which is depth or another measurement" in error
-            assert f"holds {pixels}, which is depth or another measurement" in suggestion
-            return
-        assert (code, is_mapped) == (0, True), error
-        with Recording(recordings(run)[0]) as recording:
-            assert set(recording.cameras) == {"high", "wrist"}
 
 
 @pytest.mark.slow

@@ -58,21 +58,6 @@ topic = "/static_camera/cam_side/image_raw/compressed"
 """
 )
 
-AGILEX = (
-    HEAD.format(robot="cobot_magic")
-    + "".join(
-        f"""
-[[features."{feature}"]]
-topic = "/{arm}/joint_{side}"
-field = "position"
-prefix = "{side}_"
-"""
-        for feature, arm in (("observation.state", "puppet"), ("action", "master"))
-        for side in ("left", "right")
-    )
-    + "".join(f'[cameras.{name}]\ntopic = "/camera_{name[0]}/color/image_raw"\n' for name in ("front", "left", "right"))
-)
-
 TROSSEN = (
     HEAD.format(robot="wxai")
     + """

@@ -5,7 +5,6 @@ without reading it. Topics, types, joint names and rates are those of:
 
 - franka: franka_ros2's broadcasters and GELLO's leader arm at up to 1 kHz, realsense2_camera, rosbag2 with MCAP;
 - so101: so101_ros2's follower and leader, usb_cam's JPEG images, rosbag2 with SQLite;
-- agilex: Cobot Magic's two master and two puppet arms and three cameras, ROS 1 messages in MCAP;
 - trossen: Trossen SDK's protobuf joint states and Foxglove's CompressedVideo in MCAP.
 """
 
@@ -139,7 +138,6 @@ def jpeg_images(topic: str, moments: Sequence[int], camera: int, frame_id: str) 
 FRANKA_JOINTS = tuple(f"fr3_joint{k}" for k in range(1, 8))
 FRANKA_FINGERS = ("fr3_finger_joint1", "fr3_finger_joint2")
 SO101_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow_flex", "wrist_flex", "wrist_roll", "gripper")
-AGILEX_JOINTS = tuple(f"joint{k}" for k in range(7))
 
 
 def franka(seconds: float = 2.0) -> Notes:
@@ -153,7 +151,7 @@ def franka(seconds: float = 2.0) -> Notes:
             type="geometry_msgs/msg/PoseStamped",
             log_ns=moment + 200_000,
             header_ns=moment,
-            body={"pose": _pose(moment)},
+            body={"pose": pose(moment)},
             frame_id="fr3_link0",
         )
         for moment in times(200, seconds, seed=3)
@@ -175,7 +173,8 @@ def franka(seconds: float = 2.0) -> Notes:
     return notes
 
 
-def _pose(moment: int) -> dict[str, Any]:
+def pose(moment: int) -> dict[str, Any]:
+    """A pose that moves."""
     angle = 0.3 * np.sin((moment - EPOCH_NS) / NS)
     position = motion(moment, 3)
     return {
@@ -195,20 +194,6 @@ def so101(seconds: float = 2.0) -> Notes:
         )
     ):
         notes += jpeg_images(topic, times(30, seconds, seed=3 + camera), camera, frame)
-    return notes
-
-
-def agilex(seconds: float = 2.0) -> Notes:
-    """Two master and two puppet arms of 7 joints each, and three cameras."""
-    notes: Notes = []
-    for number, side in enumerate(("left", "right")):
-        notes += joints(f"/puppet/joint_{side}", AGILEX_JOINTS, times(200, seconds, seed=1 + number), shift=number)
-        notes += joints(
-            f"/master/joint_{side}", AGILEX_JOINTS, times(200, seconds, seed=3 + number), shift=number + 0.1
-        )
-    for camera, letter in enumerate("flr"):
-        topic = f"/camera_{letter}/color/image_raw"
-        notes += raw_images(topic, times(30, seconds, seed=5 + camera), camera, f"camera_{letter}_color_optical_frame")
     return notes
 
 

@@ -21,13 +21,16 @@ from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, NamedTuple, Self
 
 from demorec.cli import COMMANDS, main
 from demorec.cli.shared.flags import parse
 from demorec.core import limited
 from demorec.core.errors import DemorecError
 from demorec.core.text import printable
+
+if TYPE_CHECKING:
+    from support.fuzz_data import Fuzzed
 
 MAX_BYTES = 600_000_000
 """Private memory for an input of less than a megabyte: 500 MB, 20 MB, and growth until the parent measures again."""
@@ -127,16 +130,6 @@ def changed_bytes(data: bytes, chance: random.Random) -> bytes:
     return bytes(changed)
 
 
-class Fuzzed(Protocol):
-    """Numbered inputs."""
-
-    def case(self, number: int) -> tuple[str, list[str]]:
-        """Description of the change to an input, and a command that reads it."""
-
-    def clear(self) -> None:
-        """Remove the command's output."""
-
-
 def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
     """Run commands in this process, inside the handler of unexpected errors: any other exception fails the test."""
     results: Counter[str] = Counter()
@@ -148,7 +141,6 @@ def results_here(fuzzed: Fuzzed, numbers: Iterable[int]) -> Counter[str]:
                 parse(COMMANDS.load(name), arguments, prog=f"demorec {name}").run()
             results["done"] += 1
         except DemorecError as error:
-            said.write(str(error))
             results["refused" if 0 < len(str(error)) < 4000 else "refused without words, or with too many"] += 1
         except Exception as error:
             raise AssertionError(f"case {number}, {what}: demorec {name} {' '.join(arguments)}") from error

@@ -103,16 +103,14 @@ def write_aloha(path: Path, *, count: int = 8, is_compressed: bool = False, seed
     return path
 
 
-def write_isaac(
-    path: Path, *, robot: str = "robot", count: int = 6, joints: int = 9, demos: tuple[str, ...] = ("demo_0", "demo_1")
-) -> Path:
+def write_isaac(path: Path, *, robot: str = "robot") -> Path:
     """Write a file like Isaac Lab's recorder: joint_pos relative to the default pose, quaternions with w first."""
-    rng = np.random.default_rng(2)
+    rng, count, joints = np.random.default_rng(2), 6, 9
     default = rng.normal(size=joints)
     with h5py.File(path, "w") as file:
         data = file.create_group("data")
         data.attrs["env_args"] = json.dumps({"env_name": "Isaac-Stack-Cube-Franka-v0", "type": 2})
-        for name in demos:
+        for name in ("demo_0", "demo_1"):
             demo = data.create_group(name)
             absolute = rng.normal(size=(count, joints)).astype(np.float32)
             demo["actions"] = rng.uniform(-1, 1, (count, 7)).astype(np.float32)

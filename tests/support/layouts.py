@@ -1,7 +1,7 @@
-"""Topics of third-party robots, a row each, with the expected result of a suggested mapping.
+"""Messages of third-party robots, with the expected result of a suggested mapping.
 
-Types, topics, names and rates are those of public drivers: ur_robot_driver, ROBOTIS's open_manipulator, Isaac Sim's
-ROS 2 bridge, realsense2_camera, ros2_controllers, Foxglove's SDK. All are written by `rosbags`, `mcap` or `foxglove`.
+Types, topics, names and rates are those of public drivers: ur_robot_driver, ROBOTIS's open_manipulator,
+realsense2_camera, ros2_controllers, Foxglove's SDK. All are written by `rosbags`, `mcap` or `foxglove`.
 """
 
 from __future__ import annotations
@@ -21,17 +21,6 @@ Body = dict[str, Any]
 
 
 @dataclass(frozen=True, kw_only=True)
-class Topic:
-    """A topic at a steady rate; `body` makes the fields of a message from its time and number."""
-
-    name: str
-    type: str
-    body: Callable[[int, int], Body]
-    rate: int = 50
-    has_header: bool = True
-
-
-@dataclass(frozen=True, kw_only=True)
 class Part:
     """Expected elements of a feature from one topic: names, and the numbers of a message (None if unrelated)."""
 
@@ -42,43 +31,36 @@ class Part:
 
 @dataclass(frozen=True, kw_only=True)
 class Layout:
-    """A robot's topics, and the expected features; an empty action is that of the next row.
+    """A robot's messages, and the expected features; an empty action is that of the next row."""
 
-    Attributes:
-        clock_ns: Time of recording minus that of the headers.
-        write: Function that writes the bag.
-    """
-
-    topics: Sequence[Topic]
+    topics: Sequence[Notes]
     state: Sequence[Part] = ()
     action: Sequence[Part] = ()
     cameras: int = 1
-    clock_ns: int = 0
     write: Callable[[Notes, Path], Path] = field(default=lambda notes, path: bags.write_rosbag2(notes, path / "bag"))
 
     def notes(self) -> Notes:
-        """Messages in the order of recording. Images begin last, so that each of them can have a row."""
-        made = []
-        for topic in self.topics:
-            begin = EPOCH_NS + (NS // 20 if "image" in topic.type.lower() else 0)
-            for number in range(int(SECONDS * topic.rate)):
-                time = begin + number * NS // topic.rate
-                made.append(
-                    Note(topic=topic.name, type=topic.type, log_ns=time + self.clock_ns, frame_id=topic.name[1:],
-                         header_ns=time if topic.has_header else 0, body=topic.body(time, number))
-                )  # fmt: skip
-        return bags.in_order(made)
+        """Messages in the order of recording."""
+        return bags.in_order([note for notes in self.topics for note in notes])
 
 
-def field_of(field_name: str = "position") -> Callable[[Body], Any]:
-    return lambda body: body[field_name]
+def moments(rate: int, *, begin_ns: int = EPOCH_NS) -> list[int]:
+    return [begin_ns + number * NS // rate for number in range(int(SECONDS * rate))]
 
 
-def joints(topic: str, names: Sequence[str], *, shift: float = 0.0, rate: int = 50) -> Topic:
-    return Topic(
-        name=topic, type="sensor_msgs/msg/JointState", rate=rate,
-        body=lambda time, number: {"name": list(names), "position": motion(time, len(names), shift=shift)},
-    )  # fmt: skip
+IMAGES = moments(30, begin_ns=EPOCH_NS + NS // 20)
+"""Times of images: they begin last, so that each of them can have a row."""
+
+
+def messages(topic: str, kind: str, body: Callable[[int], Body], *, has_header: bool = True) -> Notes:
+    return [
+        Note(topic=topic, type=kind, log_ns=time, header_ns=time if has_header else 0, body=body(time))
+        for time in moments(50)
+    ]
+
+
+def joints(topic: str, names: Sequence[str], *, shift: float = 0.0, rate: int = 50) -> Notes:
+    return bags.joints(topic, names, moments(rate), shift=shift)
 
 
 def joint_part(topic: str, names: Sequence[str]) -> Part:
@@ -91,78 +73,35 @@ def joint_part(topic: str, names: Sequence[str]) -> Part:
     return Part(topic=topic, names=names, numbers=numbers)
 
 
-def camera(topic: str, shade: int = 0) -> Topic:
-    return Topic(
-        name=topic, type="sensor_msgs/msg/CompressedImage", rate=30,
-        body=lambda time, number: {
-            "format": "jpeg", "data": np.frombuffer(bags.jpeg(bags.image(time, shade)), np.uint8),
-        },
-    )  # fmt: skip
+def camera(topic: str, shade: int = 0) -> Notes:
+    return bags.jpeg_images(topic, IMAGES, shade, topic[1:])
 
 
-def raw_camera(topic: str, shade: int = 0) -> Topic:
-    return Topic(
-        name=topic, type="sensor_msgs/msg/Image", rate=30,
-        body=lambda time, number: {
-            "encoding": "rgb8", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 3 * bags.WIDTH,
-            "data": bags.image(time, shade),
-        },
-    )  # fmt: skip
+def depth_camera(topic: str) -> Notes:
+    distances = np.full((bags.HEIGHT, bags.WIDTH), 500, np.uint16)
+    body = {"encoding": "16UC1", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 2 * bags.WIDTH,
+            "data": np.frombuffer(distances.tobytes(), np.uint8)}  # fmt: skip
+    return [Note(topic=topic, type="sensor_msgs/msg/Image", log_ns=time, header_ns=time, body=body) for time in IMAGES]
 
 
-def depth_camera(topic: str) -> Topic:
-    def body(time: int, number: int) -> Body:
-        distances = np.full((bags.HEIGHT, bags.WIDTH), 500 + number, np.uint16)
-        return {"encoding": "16UC1", "width": bags.WIDTH, "height": bags.HEIGHT, "step": 2 * bags.WIDTH,
-                "data": np.frombuffer(distances.tobytes(), np.uint8)}  # fmt: skip
-
-    return Topic(name=topic, type="sensor_msgs/msg/Image", rate=30, body=body)
-
-
-def multi_array(topic: str, count: int, *, shift: float = 0.0) -> Topic:
-    return Topic(
-        name=topic, type="std_msgs/msg/Float64MultiArray", has_header=False,
-        body=lambda time, number: {"data": motion(time, count, shift=shift)},
-    )  # fmt: skip
-
-
-def scalar(topic: str, *, shift: float = 0.0, kind: str = "Float64") -> Topic:
-    return Topic(
-        name=topic, type=f"std_msgs/msg/{kind}", has_header=False,
-        body=lambda time, number: {"data": float(motion(time, 1, shift=shift)[0])},
-    )  # fmt: skip
-
-
-def pose_at(time: int) -> Body:
-    half = 0.2 * np.sin((time - EPOCH_NS) / NS)
-    orientation = {"x": 0.0, "y": 0.0, "z": float(np.sin(half)), "w": float(np.cos(half))}
-    return {"position": dict(zip("xyz", motion(time, 3).tolist(), strict=True)), "orientation": orientation}
-
-
-def pose_stamped(topic: str, *, ahead_ns: int = 0) -> Topic:
-    return Topic(
-        name=topic, type="geometry_msgs/msg/PoseStamped", body=lambda time, number: {"pose": pose_at(time + ahead_ns)}
+def scalar(topic: str, *, shift: float = 0.0, kind: str = "Float64") -> Notes:
+    return messages(
+        topic, f"std_msgs/msg/{kind}", lambda time: {"data": float(motion(time, 1, shift=shift)[0])}, has_header=False
     )
+
+
+def pose_stamped(topic: str, *, ahead_ns: int = 0) -> Notes:
+    return messages(topic, "geometry_msgs/msg/PoseStamped", lambda time: {"pose": bags.pose(time + ahead_ns)})
 
 
 POSE_NAMES = tuple(f"position.{axis}" for axis in "xyz") + tuple(f"orientation.{axis}" for axis in "xyzw")
 
 
-def flat(body: Body) -> list[float]:
-    return [number for part in body.values() for number in part.values()]
-
-
-def trajectory(topic: str, names: Sequence[str]) -> Topic:
-    return Topic(
-        name=topic, type="trajectory_msgs/msg/JointTrajectory",
-        body=lambda time, number: {
-            "joint_names": list(names), "points": [{"positions": motion(time, len(names), shift=0.1)}],
-        },
+def pose_part(topic: str) -> Part:
+    return Part(
+        topic=topic, names=POSE_NAMES,
+        numbers=lambda body: [number for part in body["pose"].values() for number in part.values()],
     )  # fmt: skip
-
-
-def trajectory_part(topic: str, names: Sequence[str]) -> Part:
-    return Part(topic=topic, names=names, numbers=lambda body: body["points"][0]["positions"])
 
 
 UR = tuple(f"{name}_joint" for name in ("shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3", "shoulder_pan"))
@@ -170,16 +109,12 @@ OMX = ("joint1", "joint2", "joint3", "joint4", "joint5", "gripper_joint_1")
 SIX = tuple(f"joint_{k}" for k in range(1, 7))
 
 
-def _two_publishers() -> Sequence[Topic]:
+def _two_publishers() -> Sequence[Notes]:
     """An arm whose driver changes the order of its joints, and a gripper on the same topic at another rate."""
     arm = joints("/joint_states", UR, rate=100)
-
-    def turned(time: int, number: int) -> Body:
-        body = arm.body(time, number)
-        return body if number < 70 else {"name": body["name"][::-1], "position": body["position"][::-1].copy()}
-
-    gripper = joints("/joint_states", ("robotiq_85_left_knuckle_joint",), shift=2.0, rate=40)
-    return Topic(name=arm.name, type=arm.type, rate=100, body=turned), gripper
+    for note in arm[70:]:
+        note.body.update(name=note.body["name"][::-1], position=note.body["position"][::-1].copy())
+    return arm, joints("/joint_states", ("robotiq_85_left_knuckle_joint",), shift=2.0, rate=40)
 
 
 def _mcap(notes: Notes, path: Path) -> Path:
@@ -216,37 +151,41 @@ LAYOUTS: dict[str, Layout] = {
     "UR": Layout(
         topics=(
             joints("/joint_states", UR, rate=500), pose_stamped("/tcp_pose_broadcaster/pose"),
-            multi_array("/forward_position_controller/commands", 6), raw_camera("/camera/camera/color/image_raw"),
-            Topic(name="/force_torque_sensor_broadcaster/wrench", type="geometry_msgs/msg/WrenchStamped",
-                  body=lambda time, number: {}),
+            messages("/forward_position_controller/commands", "std_msgs/msg/Float64MultiArray",
+                     lambda time: {"data": motion(time, 6)}, has_header=False),
+            bags.raw_images("/camera/camera/color/image_raw", IMAGES, 0, "camera"),
+            messages("/force_torque_sensor_broadcaster/wrench", "geometry_msgs/msg/WrenchStamped", lambda time: {}),
         ),
         state=(joint_part("/joint_states", UR),),
         action=(Part(topic="/forward_position_controller/commands", names=[f"data_{k}" for k in range(6)],
-                     numbers=field_of("data")),),
+                     numbers=lambda body: body["data"]),),
     ),
     "ROBOTIS": Layout(
-        topics=(joints("/joint_states", OMX, rate=100), trajectory("/leader/joint_trajectory", OMX),
-                camera("/camera/cam_top/image_raw/compressed")),
+        topics=(
+            joints("/joint_states", OMX, rate=100), camera("/camera/cam_top/image_raw/compressed"),
+            messages("/leader/joint_trajectory", "trajectory_msgs/msg/JointTrajectory",
+                     lambda time: {"joint_names": [*OMX], "points": [{"positions": motion(time, 6, shift=0.1)}]}),
+        ),
         state=(joint_part("/joint_states", OMX),),
-        action=(trajectory_part("/leader/joint_trajectory", OMX),),
+        action=(Part(topic="/leader/joint_trajectory", names=OMX,
+                     numbers=lambda body: body["points"][0]["positions"]),),
     ),
     "poses and a gripper": Layout(
         topics=(pose_stamped("/ee_pose"), scalar("/gripper/width"), pose_stamped("/target_pose", ahead_ns=NS // 10),
                 scalar("/gripper/command", shift=0.1, kind="Float32"), camera("/cam_0/image/compressed")),
         state=(
-            Part(topic="/ee_pose", names=POSE_NAMES, numbers=lambda body: flat(body["pose"])),
+            pose_part("/ee_pose"),
             Part(topic="/gripper/width", names=("gripper_width",), numbers=lambda body: [body["data"]]),
         ),
         action=(
-            Part(topic="/target_pose", names=POSE_NAMES, numbers=lambda body: flat(body["pose"])),
+            pose_part("/target_pose"),
             Part(topic="/gripper/command", names=("gripper_command",), numbers=lambda body: [np.float32(body["data"])]),
         ),
         write=_mcap,
     ),
     "RealSense": Layout(
-        topics=(joints("/joint_states", SIX), raw_camera("/camera/camera/color/image_raw"),
-                depth_camera("/camera/camera/aligned_depth_to_color/image_raw"),
-                Topic(name="/camera/camera/imu", type="sensor_msgs/msg/Imu", rate=200, body=lambda time, number: {})),
+        topics=(joints("/joint_states", SIX), bags.raw_images("/camera/camera/color/image_raw", IMAGES, 0, "camera"),
+                depth_camera("/camera/camera/aligned_depth_to_color/image_raw")),
         state=(joint_part("/joint_states", SIX),),
         cameras=2,
     ),
@@ -263,11 +202,13 @@ LAYOUTS: dict[str, Layout] = {
             camera("/left/wrist_cam/image_raw/compressed"), camera("/right/wrist_cam/image_raw/compressed", 1),
         ),
         state=tuple(
-            Part(topic=f"/{side}/joint_states", names=[f"{side}_{name}" for name in SIX], numbers=field_of())
+            Part(topic=f"/{side}/joint_states", names=[f"{side}_{name}" for name in SIX],
+                 numbers=lambda body: body["position"])
             for side in ("left", "right")
         ),
         action=tuple(
-            Part(topic=f"/{side}_gello/joint_states", names=[f"{side}_{name}" for name in SIX], numbers=field_of())
+            Part(topic=f"/{side}_gello/joint_states", names=[f"{side}_{name}" for name in SIX],
+                 numbers=lambda body: body["position"])
             for side in ("left", "right")
         ),
         cameras=2,

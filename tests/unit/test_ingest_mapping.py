@@ -21,25 +21,19 @@ from demorec.extensions.imports.fields import (
 )
 from demorec.extensions.imports.import_run import import_bags
 from demorec.extensions.imports.mapping import Source
-from demorec.extensions.imports.words import task_in_name
 
 WRONG = [
     ('fps = 30', 'fpss = 30', r"unknown key 'fpss' in clock. Did you mean 'fps'\?"),
-    ('[robot]', '[robott]', r"unknown key 'robott'. Did you mean 'robot'\?"),
-    ('field = "position"', 'feild = "position"', r"unknown key 'feild' in features.observation.state"),
     ('fps = 30', 'fps = "x"', r"'x' is not a whole number"),
-    ('fps = 30', 'fps = 0', r"clock.fps is 0, allowed are 1 to 1000"),
     ('[robot]', '[episodes]\ncut = "service"\n[robot]', r"'service' is not one of 'file', 'marker', 'times'"),
     ('fps = 30', 'fps = 30\nmax_age_s = 0', r"clock.max_age_s is 0, it must be above 0"),
     ('text = "stack the cups"', '', r"\[task\] needs one of text, topic and file_name"),
     ('[features.action]', '[features.act]', r"missing feature 'action'"),
     ('[cameras.front]', '[cameras."a b"]', r"a camera is called 'a b', allowed are letters"),
     ('topic = "/leader/joint_states"', 'next = "observation.stat"', r"Did you mean 'observation.state'\?"),
-    ('topic = "/leader/joint_states"', 'next = "observation.state"\ntopic = "/x"', r"either a topic or next"),
     ('field = "position"\n[cam', 'field = "position"\nunit = "rad"\nto = "m"\n[cam', r"cannot turn rad into m"),
     ("/follower/joint_states", "/folower/joint_states", r"no message of '/folower/joint_states'. Did you mean '/foll"),
     ('field = "position"', 'field = "postion"', r"no field 'postion'. Did you mean 'position'\?"),
-    ('field = "position"', 'field = "header.frame_id"', r"holds no numbers"),
     ('field = "position"', 'field = "position"\njoints = ["shoulder_pam"]', r"Did you mean 'shoulder_pan'\?"),
     ('field = "position"', 'field = "position"\nelements = [9]', r"no element 9 among the 6"),
     ('field = "position"', 'field = "position"\nnames = ["a"]', r"names: 1 given for the 6 elements"),
@@ -62,11 +56,11 @@ def test_a_wrong_mapping_is_refused(
     assert err.count("\n") == 1
 
 
-def test_two_topics_for_the_same_elements_are_refused(tmp_path: Path) -> None:
-    bag = bags.write_mcap(bags.in_order(bags.agilex(0.3)), tmp_path / "bag.mcap")
-    text = bag_mappings.AGILEX.replace('prefix = "right_"', 'prefix = "left_"')
-    mapping = bag_mappings.write_mapping(text, tmp_path / "robot.toml")
-    with pytest.raises(BagError, match=r"2 elements of the feature 'observation.state' are called 'left_joint0'"):
+def test_two_sources_with_the_same_names_are_refused(tmp_path: Path) -> None:
+    bag = bags.write_mcap(bags.in_order(bags.so101(0.3)), tmp_path / "bag.mcap")
+    source = '[[features."observation.state"]]\ntopic = "/follower/joint_states"\nfield = "position"\n'
+    mapping = bag_mappings.write_mapping(bag_mappings.SO101.replace(source, source * 2), tmp_path / "robot.toml")
+    with pytest.raises(BagError, match=r"2 elements of the feature 'observation.state' are called 'shoulder_pan'"):
         import_bags([bag], mapping, tmp_path / "run")
 
 
@@ -107,17 +101,10 @@ def test_messages_of_another_publisher_are_a_finding_without_a_list_of_joints(tm
     assert "'wheel_left': select one publisher by joints" in text
 
 
-@pytest.mark.timeout(60)
-def test_long_numbers_in_a_name_do_not_slow_it_down() -> None:
-    name = "1" * 200 + "a"
-    assert task_in_name(name) == name
-
-
 @pytest.mark.parametrize(
     ("unit", "to", "given", "expected"),
     [
         ("degree", "rad", [180.0, -90.0], [np.pi, -np.pi / 2]),
-        ("rad", "degree", [np.pi, 0.0], [180.0, 0.0]),
         ("mm", "m", [5.0, 0.0], [0.005, 0.0]),
     ],
 )

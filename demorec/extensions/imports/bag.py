@@ -13,7 +13,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePath
-from typing import Any
 
 import zstandard
 
@@ -110,8 +109,8 @@ def _unpacked_message(message: ScannedMessage, report: Report) -> ScannedMessage
 def bags_in(path: Path) -> list[Path]:
     """The bag at a path, or, for a folder without metadata.yaml, the bags in it, in natural order of their names.
 
-    These are rosbag2 folders, MCAP, .db3 and .bag files, and such files in subfolders that lost their metadata.yaml. A
-    folder without any of them is returned itself.
+    These are rosbag2 folders, MCAP, .db3 and .bag files, and such files in subfolders that lost their metadata.yaml.
+    Without any of them, it is the folder itself.
     """
     if not path.is_dir() or os.path.lexists(path / ROSBAG2) or import_word(find(path).kind):
         return [path]
@@ -210,9 +209,6 @@ def _folder(path: Path) -> Bag:
     if not names:
         raise BagError(f"The bag's {ROSBAG2} names no files: {path}")
     files = tuple(path / name for name in dict.fromkeys(names))
-    if len(files) == 1 and not os.path.lexists(files[0]):  # a bag's only file may have been renamed
-        found = tuple(path.glob(f"*{files[0].suffix}"))
-        files = found if len(found) == 1 else files
     for file in files:
         if not os.path.lexists(file):
             raise BagError(f"The bag lacks its file {file.name[:80]}: {path}")
@@ -281,32 +277,3 @@ class TopicSummary:
         """Count a message with this log time."""
         self.count += 1
         self.first_ns, self.last_ns = min(self.first_ns, time_ns), max(self.last_ns, time_ns)
-
-
-def summarize_bag(path: Path) -> dict[str, Any]:
-    """Summarise the readable part of a bag with the message count of each topic, for `demorec info --json`.
-
-    Raises:
-        ConfigError: The path holds no bag.
-        BagError: Its format is not supported, or a file cannot be opened.
-    """
-    bag = open_bag(path)
-    problems: list[str] = []
-    topics: dict[str, TopicSummary] = {}
-    for message in bag.messages(problems):
-        topic = topics.setdefault(message.channel.topic, TopicSummary(type=message.channel.type))
-        topic.add(message.log_ns)
-    last_ns = max((topic.last_ns for topic in topics.values()), default=0)
-    first_ns = min([last_ns, *(topic.first_ns for topic in topics.values())])
-    return {
-        "kind": "bag",
-        "path": str(path),
-        "bytes": bag.num_bytes,
-        "seconds": (last_ns - first_ns) / NS,
-        "messages": sum(topic.count for topic in topics.values()),
-        "topics": [
-            {"topic": name, "type": topic.type, "messages": topic.count, "rate": topic.rate_hz}
-            for name, topic in sorted(topics.items())
-        ],
-        "problems": problems,
-    }

@@ -51,12 +51,7 @@ def write_bag(
 
 
 class _BagImages:
-    """Images of a bag's episodes, held until their episode is written.
-
-    Args:
-        bag: The bag.
-        episodes: Its episodes in writing order.
-    """
+    """Images of a bag's episodes, given in writing order, held until their episode is written."""
 
     def __init__(self, bag: Bag, episodes: Sequence[EpisodeRows]) -> None:
         self._bag, self._episodes = bag, episodes

@@ -36,16 +36,13 @@ class Timeline:
     """A stream's messages sorted by time.
 
     Attributes:
-        stream: The stream.
         times_ns: (M,) int64, strictly increasing.
         order: (M,) indices of the stream's messages. Excludes all but the first of equal times, messages without a
         time if others have one, and video before its first keyframe.
-        is_header: Whether times are header times.
+        is_header, is_log_asked: Whether times are header times; whether the mapping requests log times.
         period_ns: Usual interval, 0 for fewer than two messages.
         is_regular: Whether intervals are similar; false for a stream that publishes only changes.
-        is_log_asked: Whether the mapping requests log times.
-        sample: Sampling rule of the rows.
-        max_age_ns: Maximum age of sampled messages.
+        sample, max_age_ns: Sampling rule of the rows, and maximum age of the messages that they take.
     """
 
     stream: Stream
@@ -67,11 +64,6 @@ class Timeline:
     def rule(self) -> str:
         """Sampling rule in words."""
         return f"{self.sample} by {'header' if self.is_header else 'log'} time"
-
-    @property
-    def stamps_ns(self) -> Int:
-        """(N,) header times of the stream's messages; 0 or less if a header has no time."""
-        return self.stream.header_ns if self.is_header else self.stream.log_ns
 
     @property
     def skews_ns(self) -> Int:
@@ -132,11 +124,6 @@ class ChosenSamples:
     index: Int
     age_ns: Int
 
-    @property
-    def num_unused(self) -> int:
-        """Number of messages from the first to the last of the rows that none of them takes; all have one."""
-        return int(np.ptp(self.index)) + 1 - len(np.unique(self.index))
-
 
 def choose(times_ns: Int, rows_ns: Int, sample: Sampling) -> ChosenSamples:
     """Choose the messages for some rows.
@@ -175,17 +162,11 @@ def grid(begin_ns: int, end_ns: int, fps: int, streams: Sequence[Int] = ()) -> I
 
 
 def followed(lead: Int, others: Sequence[Int], *, period_ns: int, end_ns: int) -> Int:
-    """(R,) row times, one for each time of `lead`: at that time, or all later if images of `others` would be lost.
+    """(R,) row times up to `end_ns`, one for each image of `lead`, or all later if images of `others` would be lost.
 
     Images that several cameras take at about the same moment arrive in varying order. With a row at each image of one
     camera, another camera's image would be one period old in one row and skipped in the next. Rows therefore wait for
     the part of a period in `_WAITS` with the fewest skipped or repeated images, the shortest of equals.
-
-    Args:
-        lead: (R,) increasing.
-        others: (M,) times of each other camera with that rate, increasing.
-        period_ns: Usual interval.
-        end_ns: Maximum time of a row.
     """
 
     def rows(part: float) -> Int:

@@ -117,19 +117,18 @@ class Import:
 
     def _check_flags(self, form: ReaderRow) -> None:
         """Raise ConfigError for flags of another format."""
+        if form is not BAGS and self.workers > 1:
+            raise ConfigError("--workers: only for bags, leave it out.")
         of_datasets = {
             "--motor-units": self.motors.named,
             "--state, --action and --gripper": self.roles.named,
             "--episodes": self.episodes,
             "--skip-bad": form is not BAGS and self.skip_bad,
         }
-        if form is not BAGS and self.workers > 1:
-            raise ConfigError("--workers: only for bags, leave it out.")
-        for flag, value in of_datasets.items():
-            if form.suggester and value:
-                raise ConfigError(
-                    f"{flag}: only for datasets (demorec import lerobot DATASET --out RUN), leave it out."
-                )
+        if form.suggester and (wrong := [flag for flag, value in of_datasets.items() if value]):
+            raise ConfigError(
+                f"{wrong[0]}: only for datasets (demorec import lerobot DATASET --out RUN), leave it out."
+            )
         if not form.suggester and (self.suggest or self.mapping is not None):
             raise ConfigError(f"The import of {form.name} needs no mapping: leave --mapping and --suggest out.")
 
@@ -164,15 +163,10 @@ class Import:
         num_dropped = sum(len(report.episodes) - len(report.made) for report in result.reports)
         num_frames = sum(episode.num_frames for report in result.reports for episode in report.made)
         dropped = f", {num_dropped} dropped" if num_dropped else ""
-        odd = [finding.kind for report in result.reports for finding in report.odd]
-        notes = sum(len(report.findings) for report in result.reports) - len(odd)
         say(f"{counted(result.num_episodes, 'episode')}, {num_frames} frames{dropped}: {out}")
-        if odd:
-            kinds = ", ".join(sorted(set(odd)))
-            say(f"{counted(len(odd), 'finding')} in the bags ({kinds}), see above and demorec check.")
-        else:
-            above = f"No findings; {counted(notes, 'note')} above."
-            say(above if notes else "No findings.")
+        kinds = [finding.kind for report in result.reports for finding in report.findings]
+        listed = f"{counted(len(kinds), 'finding')} in the bags ({', '.join(sorted(set(kinds)))})"
+        say(f"{listed}, see above and demorec check." if kinds else "No findings.")
         return _list_skipped(result.skipped, len(result.reports) + len(result.skipped), "bag")
 
 

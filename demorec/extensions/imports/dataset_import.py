@@ -75,7 +75,15 @@ def import_lerobot(
     numbers = sorted(set(select_episodes(range(len(dataset.places)), episodes)))
     chosen = [(number, dataset.places[number]) for number in numbers]
     survey = _surveyed(dataset, [place for _, place in chosen], noted)
-    left_out |= _leave_out(dataset, survey)
+    unkept = dict.fromkeys(survey.inexact, "it has whole numbers that float64 cannot hold")
+    unkept |= {
+        name: "it may refer to tasks by number, and an export of the run numbers them again"
+        for name, feature in dataset.info.features.items()
+        if is_task_reference(name, feature)
+    }
+    for name in unkept:
+        dataset.leave_out(name)
+    left_out |= unkept
     cameras, fates = _cameras(dataset, survey)
     digest, num_new, num_frames = functools.cache(sha256_of), 0, 0
     with open_external_run(out, recovers=False) as folder:
@@ -99,19 +107,6 @@ def import_lerobot(
         skipped={f"episode {index}": reason for index, reason in skipped.items()},
         notes=(*dataset.notes, *_rounded(dataset)),
     )
-
-
-def _leave_out(dataset: LeRobotFolder, survey: _Survey) -> dict[str, str]:
-    """Leave out features that recordings cannot hold; return the reasons."""
-    unkept = dict.fromkeys(survey.inexact, "it has whole numbers that float64 cannot hold")
-    unkept |= {
-        name: "it may refer to tasks by number, and an export of the run numbers them again"
-        for name, feature in dataset.info.features.items()
-        if is_task_reference(name, feature)
-    }
-    for name in unkept:
-        dataset.leave_out(name)
-    return unkept
 
 
 def _opened(roots: Sequence[Path], motors: Motors | None, named: NamedRoles) -> LeRobotFolder:
@@ -141,17 +136,14 @@ def _reading(place: EpisodePlace, skipped: dict[int, str] | None) -> Iterator[No
 
 @dataclass(kw_only=True)
 class _Survey:
-    """Common properties of the readable episodes.
-
-    Attributes:
-        inexact: Features with integers that float64 cannot hold.
-        formats: Video camera -> (codec, (width, height)) of its files.
-        reasons: Video camera -> reason why its packets cannot pass through.
-    """
+    """Common properties of the readable episodes."""
 
     inexact: set[str] = field(default_factory=set)
+    """Features with integers that float64 cannot hold."""
     formats: dict[str, set[tuple[str, tuple[int, int]]]] = field(default_factory=dict)
+    """Video camera -> (codec, (width, height)) of its files."""
     reasons: dict[str, str] = field(default_factory=dict)
+    """Video camera -> reason why its packets cannot pass through."""
 
 
 def _surveyed(dataset: LeRobotFolder, places: Sequence[EpisodePlace], skipped: dict[int, str] | None) -> _Survey:
@@ -240,7 +232,14 @@ def _write(
         return False
     leads = {camera.name: recording.lead(camera.name) if camera.kept else 0 for camera in info.cameras}
     table = recording.table_with(leads)
-    images = {camera.name: _images(recording, camera) for camera in info.cameras}
+    images: dict[str, Iterator[Image]] = {}
+    for camera in info.cameras:
+        if camera.is_depth:
+            images[camera.name] = recording.distances(camera.name)
+        elif camera.kept:
+            images[camera.name] = (packet.data for packet in recording.packets(camera.name))
+        else:
+            images[camera.name] = islice(recording.images(camera.name), recording.lead(camera.name), None)
     add_episode(folder, info, table, images, outcome=recording.outcome, video=video, subtasks=subtasks)
     return True
 
@@ -258,12 +257,3 @@ def _info(recording: DatasetRecording, cameras: Mapping[str, Camera], digest: Ca
         ),
         versions=importing_versions(),
     )
-
-
-def _images(recording: DatasetRecording, camera: Camera) -> Iterator[Image]:
-    """Images of the camera's lead, if packets pass through, and of every frame."""
-    if camera.is_depth:
-        return recording.distances(camera.name)
-    if camera.kept:
-        return (packet.data for packet in recording.packets(camera.name))
-    return islice(recording.images(camera.name), recording.lead(camera.name), None)

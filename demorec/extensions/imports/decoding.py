@@ -150,17 +150,7 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr: bool) -> Decoder:
-    """Make the decoder of a type's messages.
-
-    Args:
-        type_name: "sensor_msgs/msg/JointState" (or as in ROS 1, without "msg").
-        schema_encoding: ros2msg, ros2idl, ros1msg; "" for a standard ROS type without a definition.
-        schema: Text of the definition.
-        is_cdr: Whether messages are CDR (ROS 2) rather than serialised by ROS 1.
-
-    Raises:
-        ValueError: The definition cannot be parsed; the decoder raises it for a message that does not fit.
-    """
+    """Make the decoder of a type's messages, CDR (ROS 2) or serialised by ROS 1; both raise ValueError."""
     parts = type_name.split("/")
     name = f"{parts[0]}/msg/{parts[1]}" if len(parts) == 2 else type_name
     types = _types(name, schema_encoding, schema)
@@ -178,9 +168,7 @@ def _ros_decoder(type_name: str, schema_encoding: str, schema: bytes, *, is_cdr:
 
 @lru_cache(maxsize=512)
 def _types(name: str, schema_encoding: str, schema: bytes) -> Types:
-    """Fields of a type and of all types that it refers to; cached, because a bag is read twice and bags share
-    definitions.
-    """
+    """Fields of a type and of all types that it refers to; cached, because a bag is read twice."""
     try:
         if schema_encoding in ("ros2msg", "ros1msg"):
             parsed = make_typesdict(MSGParser(f"MSG: {name}\n{schema.decode()}").specification())

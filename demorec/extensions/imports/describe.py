@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from demorec.cli.shared.output import aligned, counted, size_in_words
-from demorec.extensions.imports.bag import bags_in, summarize_bag
+from demorec.extensions.imports.bag import NS, TopicSummary, bags_in, open_bag
 from demorec.extensions.imports.import_file import load_import_file
 
 _MOST_PROBLEMS = 5
@@ -26,19 +26,31 @@ def describe_bags(path: Path) -> tuple[dict[str, Any], list[str]]:
 
 
 def _bag(path: Path) -> tuple[dict[str, Any], list[str]]:
-    plain = summarize_bag(path)
-    length = f"{plain['seconds']:.2f} s, {counted(plain['messages'], 'message')}"
-    facts = [("bag", f"{path} ({size_in_words(plain['bytes'])})"), ("length", length)]
-    facts += [("problem", problem) for problem in plain["problems"][:_MOST_PROBLEMS]]
+    """Describe the readable part of a bag with the message count of each topic."""
+    bag = open_bag(path)
+    problems: list[str] = []
+    topics: dict[str, TopicSummary] = {}
+    for message in bag.messages(problems):
+        topic = topics.setdefault(message.channel.topic, TopicSummary(type=message.channel.type))
+        topic.add(message.log_ns)
+    last_ns = max((topic.last_ns for topic in topics.values()), default=0)
+    first_ns = min([last_ns, *(topic.first_ns for topic in topics.values())])
+    seconds, count = (last_ns - first_ns) / NS, sum(topic.count for topic in topics.values())
+    facts = [
+        ("bag", f"{path} ({size_in_words(bag.num_bytes)})"),
+        ("length", f"{seconds:.2f} s, {counted(count, 'message')}"),
+        *(("problem", problem) for problem in problems[:_MOST_PROBLEMS]),
+    ]
     rows = [("topic", "messages", "rate", "type")]
-    for topic in plain["topics"]:
-        rate = f"{topic['rate']:.1f} Hz" if topic["rate"] else ""
-        rows.append((topic["topic"], str(topic["messages"]), rate, topic["type"]))
+    plain = []
+    for name, topic in sorted(topics.items()):
+        plain.append({"topic": name, "type": topic.type, "messages": topic.count, "rate": topic.rate_hz})
+        rows.append((name, str(topic.count), f"{topic.rate_hz:.1f} Hz" if topic.rate_hz else "", topic.type))
     lines = aligned(facts)
-    if plain["topics"]:
-        suggest = f"demorec import {path} --suggest writes a mapping of these topics."
-        lines = [*lines, "", *aligned(rows), "", suggest]
-    return plain, lines
+    if topics:
+        lines += ["", *aligned(rows), "", f"demorec import {path} --suggest writes a mapping of these topics."]
+    described = {"kind": "bag", "path": str(path), "bytes": bag.num_bytes, "seconds": seconds, "messages": count}
+    return {**described, "topics": plain, "problems": problems}, lines
 
 
 def describe_hdf5(path: Path) -> tuple[dict[str, Any], list[str]]:

@@ -53,14 +53,7 @@ def imported_info(
     cameras: Iterable[Camera],
     files: Iterable[SourceFile],
 ) -> EpisodeInfo:
-    """Describe an episode that was imported by a mapping.
-
-    Args:
-        urdf: The robot's model; None if unknown.
-
-    Raises:
-        FieldError: The model is not a URDF.
-    """
+    """Describe an episode that was imported by a mapping; FieldError if the robot's model is not a URDF."""
     try:
         joints = set() if urdf is None else {joint.name for joint in Urdf.parse(urdf).joints}
     except ValueError as error:

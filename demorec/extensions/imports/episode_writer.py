@@ -65,19 +65,19 @@ def add_episode(
         ConfigError: The run's episodes differ from this one.
         RecordingError: A number is not finite, or the disk is full.
     """
+
+    def frame_by_frame() -> Iterator[tuple[str, Image]]:
+        for camera, stream in images.items():  # images before the first frame
+            yield from ((camera, image) for image in islice(stream, int(table.images[camera][0])))
+        for _ in range(table.num_frames):
+            for camera, stream in images.items():
+                yield camera, next(stream)
+
     folder.check_fits(info)
     folder.begin(info)
-    stream = _frame_by_frame(images, table)
-    folder.add(write_episode(folder.path, info, table, stream, outcome=outcome, video=video, subtasks=subtasks))
-
-
-def _frame_by_frame(images: Mapping[str, Iterator[Image]], table: Table) -> Iterator[tuple[str, Image]]:
-    """Yield (camera, image); images before the first frame come first."""
-    for camera, stream in images.items():
-        yield from ((camera, image) for image in islice(stream, int(table.images[camera][0])))
-    for _ in range(table.num_frames):
-        for camera, stream in images.items():
-            yield camera, next(stream)
+    folder.add(
+        write_episode(folder.path, info, table, frame_by_frame(), outcome=outcome, video=video, subtasks=subtasks)
+    )
 
 
 def write_episode(
@@ -105,29 +105,18 @@ def write_episode(
         RecordingError: A number is not finite, or the disk is full.
     """
     with SampledWriter(episode_path(folder, info.episode_index), info, video=video, keeps_part=False) as writer:
+        remaining = iter(images)
         num_images = dict.fromkeys(table.images, 0)
-        frames = _frames(table, subtasks)
-        frame = next(frames, None)
-        for camera, image in images:
-            writer.image(camera, int(table.image_stamps[camera][num_images[camera]]), image)
-            num_images[camera] += 1
-            while frame is not None and all(number < num_images[name] for name, number in frame.images.items()):
-                writer.write(frame)
-                frame = next(frames, None)
-        while frame is not None:
-            writer.write(frame)
-            frame = next(frames, None)
-        return writer.finish(replace(outcome, num_frames=table.num_frames))
-
-
-def _frames(table: Table, subtasks: Mapping[int, str]) -> Iterator[SampledFrame]:
-    for row, time_ns in enumerate(table.time_ns.tolist()):
-        yield SampledFrame(
-            time_ns=time_ns,
-            samples={
+        for row in range(table.num_frames):
+            shown = {camera: int(numbers[row]) for camera, numbers in table.images.items()}
+            while any(number >= num_images[camera] for camera, number in shown.items()):
+                camera, image = next(remaining)
+                writer.image(camera, int(table.image_stamps[camera][num_images[camera]]), image)
+                num_images[camera] += 1
+            samples = {
                 name: Sample(stamp_ns=int(table.stamps[name][row]), vector=vectors[row])
                 for name, vectors in table.features.items()
-            },
-            images={camera: int(numbers[row]) for camera, numbers in table.images.items()},
-            subtask=subtasks.get(row, ""),
-        )
+            }
+            time_ns = int(table.time_ns[row])
+            writer.write(SampledFrame(time_ns=time_ns, samples=samples, images=shown, subtask=subtasks.get(row, "")))
+        return writer.finish(replace(outcome, num_frames=table.num_frames))

@@ -40,7 +40,7 @@ EXTENSION = Extension(
         ),
     },
     file_checks={
-        "import_findings": "demorec.extensions.imports.checks:import_findings",
-        "import_dropped": "demorec.extensions.imports.checks:import_dropped",
+        "import_findings": "demorec.extensions.imports.import_file:import_findings",
+        "import_dropped": "demorec.extensions.imports.import_file:import_dropped",
     },
 )

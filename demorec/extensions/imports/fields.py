@@ -75,10 +75,7 @@ def follow(values: Any, steps: Sequence[Step]) -> Any:
                     raise FieldError(f"there is no field {step!r}.{nearest_match(step, values)}".rstrip("."))
                 values = values[step]
             else:
-                kind = (
-                    "a list" if isinstance(values, np.ndarray) else "a text" if isinstance(values, str) else "a number"
-                )
-                raise FieldError(f"there is no field {step!r} in {kind}")
+                raise FieldError(f"there is no field {step!r} in a number or text")
         elif isinstance(step, int):
             if not isinstance(values, list | np.ndarray) or not 0 <= step < len(values):
                 raise FieldError(f"there is no element {step}")
@@ -159,19 +156,17 @@ class SourceReader:
     """Reader of a source's vectors, with the layout of its first message.
 
     Attributes:
-        source: The source.
         names: Names of the feature's elements.
         joints: Names of these elements in messages, where their order may vary; empty if elements have no names, or
         several share one.
-        steps: Path of the numbers.
-        names_steps: Path of the corresponding names; None if elements have none.
+        steps, names_steps: Path of the numbers, and of their names; None if elements have none.
     """
 
     source: Source
-    names: tuple[str, ...] = ()
-    joints: tuple[str, ...] = ()
-    steps: tuple[Step, ...] = ()
-    names_steps: tuple[Step, ...] | None = None
+    names: tuple[str, ...]
+    joints: tuple[str, ...]
+    steps: tuple[Step, ...]
+    names_steps: tuple[Step, ...] | None
     _orders: dict[tuple[str, ...], list[int]] = field(init=False, compare=False, default_factory=dict)
 
     def read(self, values: Values) -> NDArray[np.floating[Any]]:

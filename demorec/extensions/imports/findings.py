@@ -18,7 +18,6 @@ from demorec.extensions.imports.streams import NO_STAMP
 
 _EPOCH_S = 1e8
 """Difference between two clocks that implies another epoch: three years, since no clock is that wrong."""
-_YEAR_S = 365.25 * 86_400
 _GAP = 5.0
 """Minimum periods without a message for a gap; shorter ones are lost messages."""
 _LOST = 1.6
@@ -27,23 +26,13 @@ _MOVED_S = 0.05
 """Minimum change of a clock in a bag that is reported."""
 _SHORTER_S = 0.5
 """Minimum time by which a stream must begin later or end earlier than others."""
-_SLOW = 1.15
-"""Minimum ratio of a stream's period to the rows' period for a slow stream."""
 _EARLY_S = 0.05
 """Maximum time by which a header may be later than its log time: clocks set by NTP differ by less."""
-NOTE = "note"
-"""Kind of an observation that is not a problem."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportFinding:
-    """A finding or note.
-
-    Attributes:
-        kind: Kind, one word of a fixed list.
-        stream: Stream ("observation.state", "camera front"), "" for the whole bag.
-        text: Description with figures.
-    """
+    """A finding of one kind about a stream ("observation.state", "camera front"), "" for the whole bag."""
 
     kind: str
     stream: str
@@ -77,7 +66,8 @@ def _stream_findings(line: Timeline) -> Iterator[ImportFinding]:
     unstamped = int(np.sum((stream.header_ns <= 0) & (stream.header_ns != NO_STAMP)))
     if unstamped and not line.is_log_asked:
         yield _of(line, "unstamped", f"{unstamped} of {len(stream)} headers have no time")
-    known = line.stamps_ns[line.stamps_ns > 0]
+    stamps = stream.header_ns if line.is_header else stream.log_ns
+    known = stamps[stamps > 0]
     if late := max(int(np.sum(np.diff(stream.log_ns) < 0)), int(np.sum(np.diff(known) < 0))):
         yield _of(line, "order", f"{late} messages come before earlier ones")
     if repeated := len(known) - len(np.unique(known)):
@@ -136,7 +126,7 @@ def _have_another_epoch(lines: Sequence[Timeline]) -> bool:
 
 
 def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
-    """Streams with another clock than most, and header times of another epoch that the rows use."""
+    """Streams with another clock than most, and log times next to header times of another clock."""
     skews = {line: float(np.median(line.skews_ns)) / NS for line in lines if len(line.skews_ns)}
     if not skews:
         return
@@ -153,12 +143,6 @@ def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Impor
     for topic, texts in bag.streams.texts.items():
         if topic != bag.mapping.robot.urdf_topic and not all(each.is_header for each in texts):
             yield ImportFinding(kind="clock_offset", stream=topic, text=f"{topic}: {text}")
-    if _have_another_epoch(lines):
-        text = (
-            f"all headers are {abs(usual) / _YEAR_S:.1f} years {'behind' if usual > 0 else 'ahead of'} the times of "
-            "recording, and rows follow them: simulated time, or a clock that was never set"
-        )
-        yield ImportFinding(kind=NOTE, stream="", text=text)
 
 
 def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
@@ -186,47 +170,36 @@ def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[
             text = f"rows follow its messages, {rate:.1f} a second, but fps is {fps}"
             yield ImportFinding(kind="fps", stream=follows, text=text)
     for line in lines.lines.values():
-        # Cameras, if any, decide the rows, which use few of the messages of a faster stream.
-        is_slow = line.period_ns * fps > _SLOW * NS
-        if line.stream.heads or (line.is_regular and (is_slow or not lines.mapping.cameras)):
+        if line.stream.heads:
             yield from _use_findings(line, episodes, fps, follows)
 
 
 def _use_findings(line: Timeline, episodes: Sequence[EpisodeRows], fps: int, follows: str) -> Iterator[ImportFinding]:
-    """Rows that repeat a message, and messages in no row: a finding if other rows would lose fewer images, else a
-    note.
-    """
-    num_rows = num_repeated = num_free = num_messages = num_skipped = 0
+    """Rows that repeat an image, and images in no row, if other rows would lose fewer."""
+    num_rows = num_repeated = num_free = num_images = num_skipped = 0
     for rows in episodes:
         index = line.chosen(rows.table.time_ns).index
         steps = np.diff(index)
         num_rows += len(index)
-        num_messages += int(np.ptp(index)) + 1
+        num_images += int(np.ptp(index)) + 1
         num_skipped += int(np.maximum(steps - 1, 0).sum())
         num_repeated += int((steps == 0).sum())
-        # A row may repeat a message if the next one is lost, or at the stream's end, or once at an episode's edge.
+        # A row may repeat an image if the next one is lost, or at the stream's end, or once at an episode's edge.
         again = index[1:][steps == 0]
         again = again[again < len(line.times_ns) - 1]
         waits = line.times_ns[again + 1] - line.times_ns[again]
         num_free += max(0, int(np.sum(waits <= _LOST * line.period_ns)) - 1)
-    is_repeated, skipped = num_free > RATE * num_rows, num_skipped / num_messages
     rate = NS / max(line.period_ns, 1)
-    what = "image" if line.stream.heads else "message"
-    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows repeat its {what}"
-    skips = f"{100 * skipped:.3g} % of its {what}s are in no row"
-    rates = f"since it comes {rate:.1f} times a second and rows {fps} times"
-    if num_free and num_skipped and line.stream.heads:
+    repeats = f"{100 * num_repeated / num_rows:.3g} % of the rows repeat its image"
+    skips = f"{100 * num_skipped / num_images:.3g} % of its images are in no row"
+    advice = f"use fps = {max(1, round(rate))}"
+    if num_free and num_skipped:
         is_other_rate = abs(rate - fps) > max(RATE * fps, 0.5)
-        advice = f"use fps = {max(1, round(rate))}" if is_other_rate else 'use rows = "camera"'
-        advice = "they come too unevenly for these rows" if follows and not is_other_rate else advice
-        yield _of(line, "repeats", f"{repeats} and {skips}: {advice}")
-    elif is_repeated or skipped > RATE:
-        text = f"{repeats if is_repeated else skips}, {rates}"
-        # Taking every second image can be intended; an irregular step is only justified by a camera that rows follow.
-        is_uneven = is_repeated or abs(rate / fps - round(rate / fps)) > RATE
-        if line.stream.heads and is_uneven and not follows:
-            yield _of(line, "repeats" if is_repeated else "skips", f"{text}: use fps = {max(1, round(rate))}")
-        else:
-            yield _of(line, NOTE, text)
-    elif num_skipped and follows and line.stream.heads:
-        yield _of(line, NOTE, f"{skips}: rows follow {follows}")
+        uneven = "they come too unevenly for these rows" if follows else 'use rows = "camera"'
+        yield _of(line, "repeats", f"{repeats} and {skips}: {advice if is_other_rate else uneven}")
+    elif follows:
+        return  # the images of a camera that has another rate than the one that rows follow
+    elif num_free > RATE * num_rows:
+        yield _of(line, "repeats", f"{repeats}: {advice}")
+    elif num_skipped > RATE * num_images and abs(rate / fps - round(rate / fps)) > RATE:
+        yield _of(line, "skips", f"{skips}: {advice}")  # taking every second image can be intended

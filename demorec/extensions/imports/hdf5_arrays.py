@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -24,64 +23,51 @@ _EXACT = 2**53
 """Maximum integer up to which float64 is exact."""
 
 
-@dataclass(frozen=True, kw_only=True, eq=False)
-class _Column:
-    """One part of a feature with its dataset."""
+class StoredFeature:
+    """A feature of an episode; FieldError if its datasets are not vectors.
 
-    part: Source
-    array: StoredArray
-    names: tuple[str, ...]
+    Args:
+        shift: Number of rows by which frames precede the datasets' rows: 1 for the next row of a feature.
+    """
 
-    def rows(self, begin: int, end: int) -> NDArray[np.floating[Any]]:
-        """Read (end - begin, D): float32 if it holds all numbers, otherwise float64.
+    def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
+        self.name, self.shift, self.arrays = name, shift, arrays
+        self._parts = parts
+        self._names = [_names(part, array) for part, array in zip(parts, arrays, strict=True)]
+
+    def described(self, dtype: DTypeLike) -> Feature:
+        """Describe it in recordings' form, with vectors of this type."""
+        names = tuple(name for part_names in self._names for name in part_names)
+        units = [part.to or part.unit for part, own in zip(self._parts, self._names, strict=True) for _ in own]
+        called = (name.removesuffix(".pos") for name in names)  # LeRobot's suffix for the position of a joint
+        source = "; ".join(part.dataset for part in self._parts) + (" of the next row" if self.shift else "")
+        return imported_feature(self.name, dtype, names, units, called=called, source=source)
+
+    def vectors(self, count: int) -> NDArray[np.floating[Any]]:
+        """Read (T, D) of the first `count` frames: float32 if it holds all numbers, otherwise float64.
 
         Raises:
             FieldError: A number is not finite, or float64 cannot hold it.
             Hdf5Error: They cannot be read.
         """
-        rows: NDArray[Any] = self.array.read(begin, end).reshape(end - begin, -1)
-        rows = rows[:, list(self.part.elements)] if self.part.elements else rows
-        if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
-            raise FieldError(f"{self.array.place} has whole numbers that float64 cannot hold")
-        is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
-        values = converted(self.part, rows.astype(np.float32 if is_small else np.float64))
-        if len(wrong := np.argwhere(~np.isfinite(values))):
-            row, element = wrong[0].tolist()
-            raise FieldError(
-                f"{self.array.place} is {values[row, element]} in row {begin + row} ({self.names[element]}), numbers "
-                "must be finite"
-            )
-        return values
+        parts = zip(self._parts, self.arrays, self._names, strict=True)
+        begin, end = self.shift, self.shift + count
+        return np.concatenate([_rows(part, array, names, begin, end) for part, array, names in parts], axis=1)
 
 
-class StoredFeature:
-    """A feature of an episode.
-
-    Args:
-        name: Its name.
-        parts, arrays: Its parts, and the dataset of each.
-        shift: Number of rows by which frames precede the datasets' rows: 1 for the next row of a feature.
-
-    Raises:
-        FieldError: The datasets are not vectors.
-    """
-
-    def __init__(self, name: str, parts: Sequence[Source], arrays: Sequence[StoredArray], *, shift: int) -> None:
-        self.name, self.shift = name, shift
-        pairs = zip(parts, arrays, strict=True)
-        self.columns = tuple(_Column(part=part, array=array, names=_names(part, array)) for part, array in pairs)
-
-    def described(self, dtype: DTypeLike) -> Feature:
-        """Describe it in recordings' form, with vectors of this type."""
-        names = tuple(name for column in self.columns for name in column.names)
-        units = (column.part.to or column.part.unit for column in self.columns for _ in column.names)
-        called = (name.removesuffix(".pos") for name in names)  # LeRobot's suffix for the position of a joint
-        source = "; ".join(column.part.dataset for column in self.columns) + (" of the next row" if self.shift else "")
-        return imported_feature(self.name, dtype, names, units, called=called, source=source)
-
-    def vectors(self, count: int) -> NDArray[np.floating[Any]]:
-        """Read (T, D) of the first `count` frames; errors as in `_Column.rows`."""
-        return np.concatenate([column.rows(self.shift, self.shift + count) for column in self.columns], axis=1)
+def _rows(part: Source, array: StoredArray, names: Sequence[str], begin: int, end: int) -> NDArray[np.floating[Any]]:
+    """Read (end - begin, D) of one part; errors as in `StoredFeature.vectors`."""
+    rows: NDArray[Any] = array.read(begin, end).reshape(end - begin, -1)
+    rows = rows[:, list(part.elements)] if part.elements else rows
+    if rows.dtype.kind in "iu" and ((rows > _EXACT) | (rows < -_EXACT)).any():
+        raise FieldError(f"{array.place} has whole numbers that float64 cannot hold")
+    is_small = rows.dtype.kind == "f" and rows.dtype.itemsize <= 4
+    values = converted(part, rows.astype(np.float32 if is_small else np.float64))
+    if len(wrong := np.argwhere(~np.isfinite(values))):
+        row, element = wrong[0].tolist()
+        number, place = values[row, element], f"row {begin + row} ({names[element]})"
+        raise FieldError(f"{array.place} is {number} in {place}, numbers must be finite")
+    return values
 
 
 def _names(part: Source, array: StoredArray) -> tuple[str, ...]:
@@ -158,12 +144,7 @@ class StoredCamera:
         return Camera(name=self.name, width=self.width, height=self.height, kept=self.kept, source=place)
 
     def images(self) -> Iterator[Image]:
-        """Yield one image per row.
-
-        Raises:
-            FieldError: A JPEG file is truncated, or has another size.
-            Hdf5Error: They cannot be read.
-        """
+        """Yield one image per row; FieldError if a JPEG file is truncated, or has another size."""
         for number, row in enumerate(self._array.rows()):
             if self._form == "depth":
                 yield row.reshape(self.height, self.width).astype(row.dtype.newbyteorder("="), copy=False)
@@ -199,11 +180,7 @@ class StoredCamera:
 
 
 def is_camera(array: StoredArray) -> bool:
-    """Whether a dataset holds images, JPEG files or, by its name or last axis, depth.
-
-    Raises:
-        Hdf5Error: Its first row cannot be read.
-    """
+    """Whether a dataset holds images, JPEG files or, by its name or last axis, depth."""
     form, place = image_form(array), array.place.rpartition("/")[2]
     if form == "jpeg":
         return len(array) > 0 and array.read(0, 1)[0].tobytes().startswith(_JPEG)

@@ -29,7 +29,6 @@ _KINDS: dict[type | None, Kind] = {h5py.Group: "group", h5py.Dataset: "dataset"}
 _REASONS = (
     ("truncated file", "it is cut off"),
     ("required filter", "it is compressed in a way that is not installed here"),
-    ("can't open directory", "it is compressed in a way that is not installed here"),  # message of filters
     ("No NumPy equivalent", "its type is not a plain number"),
 )
 """Messages of the HDF5 library and their meaning; all others mean that the file is damaged."""
@@ -86,25 +85,23 @@ class ForeignFile(Closing):
     Its groups and datasets are those with a hard link, each under one name: other links can lead out of the file, or
     in circles.
 
-    Attributes:
-        path: Path of the file.
-
     Raises:
         Hdf5Error: It is not HDF5, truncated or damaged; raised by all methods.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._kinds: dict[str, type] = {}
+        self._items: dict[str, h5py.Group | h5py.Dataset] = {}
         with _errors_reported("The HDF5 file cannot be read", path):
             with open_regular(path) as file:
                 if file.read(len(HDF5_MAGIC)) != HDF5_MAGIC:
                     raise Hdf5Error(f"This is not an HDF5 file: {path}")
             self._root = h5py.File(path, "r", locking=False)
-            self._root.visititems(lambda name, item: self._kinds.__setitem__(name, type(item)))
+            self._root.visititems(self._items.__setitem__)
 
     def close(self) -> None:
         """Close the file; idempotent."""
+        self._items.clear()
         self._root.close()
 
     def children(self, place: str) -> dict[str, Kind]:
@@ -113,21 +110,22 @@ class ForeignFile(Closing):
         if not isinstance(group, h5py.Group):
             raise Hdf5Error(f"{_shown(place)} is not a group: {self.path}")
         with _errors_reported(f"{_shown(place)} cannot be read", self.path):
-            kinds = {str(name): self._kinds.get(f"{place}/{name}".lstrip("/")) for name in group}
-        return {name: _KINDS.get(kind, "other") for name, kind in kinds.items()}
+            items = {str(name): self._items.get(f"{place}/{name}".lstrip("/")) for name in group}
+        return {name: _KINDS.get(type(item), "other") for name, item in items.items()}
 
     def datasets(self, place: str) -> list[str]:
         """Paths of all datasets below a group."""
         inside = f"{place}/" if place else ""
-        return [name for name, kind in self._kinds.items() if kind is h5py.Dataset and name.startswith(inside)]
+        items = self._items.items()
+        return [name for name, item in items if isinstance(item, h5py.Dataset) and name.startswith(inside)]
 
     def has(self, place: str) -> bool:
         """Whether a group or dataset with that name exists; targets of links do not count."""
-        return place.strip("/") in self._kinds
+        return place.strip("/") in self._items
 
     def is_group(self, place: str) -> bool:
         """Whether a group with that name exists."""
-        return self._kinds.get(place) is h5py.Group
+        return isinstance(self._items.get(place), h5py.Group)
 
     def attribute(self, place: str, name: str) -> Scalar | None:
         """A text, number or boolean attribute of a group or dataset; None if it is missing."""
@@ -147,11 +145,7 @@ class ForeignFile(Closing):
         return StoredArray(self.path, place, found)
 
     def names(self, place: str) -> list[str]:
-        """Read a dataset of texts, such as robomimic's masks.
-
-        Raises:
-            Hdf5Error: It is missing, or not a list of texts.
-        """
+        """Read a dataset of texts, such as robomimic's masks; Hdf5Error if it is missing, or not a list of texts."""
         found = self._find(place)
         with _errors_reported(f"{place} cannot be read", self.path):
             is_list = isinstance(found, h5py.Dataset) and len(found.shape or ()) == 1 and not found.is_virtual
@@ -160,11 +154,8 @@ class ForeignFile(Closing):
             return [str(text) for text in found.asstr(errors="replace")[:]]
 
     def _find(self, place: str) -> h5py.Group | h5py.Dataset:
-        if not place:
-            return self._root
-        if place in self._kinds:
-            with _errors_reported(f"{place} cannot be read", self.path):
-                return self._root[place]
+        if not place or place in self._items:
+            return self._items.get(place, self._root)
         parent, _, name = place.rpartition("/")
         names = self.children(parent)
         if name in names:
@@ -206,15 +197,9 @@ def _attribute(found: h5py.Group | h5py.Dataset, name: str, place: str, path: Pa
         if attribute.get_space().get_simple_extent_type() == h5py.h5s.NULL or attribute.shape not in ((), (1,)):
             return None
         value = found.attrs[name]
-        return _scalar(value.item() if isinstance(value, np.ndarray) else value)
-
-
-def _scalar(value: object) -> Scalar | None:
-    if isinstance(value, bytes):
-        return value.decode(errors="replace")
-    if isinstance(value, np.generic):
-        value = value.item()
-    return value if isinstance(value, str | bool | int | float) else None
+        value = value.item() if isinstance(value, np.ndarray | np.generic) else value
+        value = value.decode(errors="replace") if isinstance(value, bytes) else value
+        return value if isinstance(value, str | bool | int | float) else None
 
 
 def _shown(place: str) -> str:

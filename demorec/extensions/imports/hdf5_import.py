@@ -21,7 +21,6 @@ import numpy as np
 from demorec.core.config import VideoConfig
 from demorec.core.errors import ConfigError
 from demorec.core.files import sha256_of
-from demorec.core.registry import nearest_match
 from demorec.episode.episode import Outcome, Table
 from demorec.episode.info import EpisodeInfo, SourceFile
 from demorec.episode.validity import find_problems
@@ -32,7 +31,7 @@ from demorec.extensions.imports.hdf5_arrays import StoredCamera, StoredFeature
 from demorec.extensions.imports.hdf5_file import ForeignFile, Hdf5Error, Scalar, StoredArray
 from demorec.extensions.imports.mapping import MAX_FPS, Episodes, SourceMapping
 from demorec.extensions.imports.mapping_file import read_mapping
-from demorec.extensions.imports.words import in_natural_order, task_in_name
+from demorec.extensions.imports.words import in_natural_order, stated_task
 from demorec.mcap.streams import frame_times
 from demorec.runs.external import differences, open_external_run, planned_episode
 from demorec.runs.find import expect
@@ -108,7 +107,11 @@ def _planned(
             for place in places:
                 stored = _Stored(file, place, mapping)
                 info = stored.described(urdf, source, len(episodes))
-                info = _alike(info, episodes[0].info if episodes else info, file, place)
+                first = episodes[0].info if episodes else info
+                if different := differences(first, info):
+                    name = f"{place} of {path}" if place else str(path)
+                    raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
+                info = replace(info, urdf=first.urdf)  # one text in memory
                 episodes.append(_PlannedDemo(path, place, info, stored.outcome()))
                 cameras = cameras or {c.name: f"{c.width}x{c.height}, {c.description}" for c in stored.cameras}
                 if stored.has_last:
@@ -116,9 +119,7 @@ def _planned(
             left_out = {**_unnamed(file, places[0], mapping), **left_out}
             success = mapping.episodes.success
             if success and all(one.outcome.success is None for one in episodes if one.path == path):
-                near = nearest_match(success, list(file.children(places[0])))
-                told = f"No episode has an attribute or dataset {success!r} with its outcome.{near}"
-                raise Hdf5Error(f"{told.rstrip('.?')}: {path}")
+                raise Hdf5Error(f"No episode has an attribute or dataset {success!r} with its outcome: {path}")
     return episodes, cameras, left_out
 
 
@@ -142,7 +143,7 @@ class _Stored:
         others: list[StoredArray] = []
         for feature in self.features:
             arrays = others if not feature.name.startswith("observation.") else observed
-            arrays += [] if feature.shift else [column.array for column in feature.columns]
+            arrays += [] if feature.shift else feature.arrays
         # Observations may have one more row than actions, the result of the last action.
         self.num_rows = num_rows = len((others or observed)[0])
         self.has_last = len(observed[0]) == num_rows + 1
@@ -150,11 +151,6 @@ class _Stored:
             for one in arrays:
                 if len(one) != wanted:
                     raise FieldError(f"{one.place} has {len(one)} rows, other datasets of the episode have {wanted}")
-        stated = file.attribute(place, "num_samples")
-        if stated is not None and stated != num_rows:
-            raise FieldError(
-                f"{place or 'the episode'} has {num_rows} rows, but its num_samples is {reprlib.repr(stated)}"
-            )
         self.num_frames = min(num_rows, len(observed[0]) - max(feature.shift for feature in self.features))
         if self.num_frames < 1:
             raise FieldError(f"{place or 'the episode'} has {num_rows} rows, too few for a frame")
@@ -213,12 +209,8 @@ class _Stored:
     def _task(self) -> str:
         """Instruction of the task; Hdf5Error if the file does not have it."""
         task, path = self._mapping.task, self._file.path
-        if task.text:
-            return task.text
-        if task.file_name:
-            if text := task_in_name(path.stem):
-                return text
-            raise Hdf5Error(f"The mapping takes the task from the file's name, which has none: {path}")
+        if text := stated_task(task, path.stem):
+            return text
         found = found_attribute(self._file, self._place, task.attribute)
         if not isinstance(found, str) or not found.strip():
             raise Hdf5Error(
@@ -230,7 +222,7 @@ class _Stored:
         """Outcome, which is unknown if the mapping does not name its source, or the episode does not have it.
 
         Raises:
-            Hdf5Error: It has an invalid value.
+            FieldError: It has an invalid value.
         """
         name = self._mapping.episodes.success.strip("/")
         return Outcome(success=self._success(name) if name else None, num_frames=self.num_frames)
@@ -239,26 +231,15 @@ class _Stored:
         file, place = self._file, self._place
         found = file.attribute(place, name)
         if isinstance(found, str) or (isinstance(found, float) and not math.isfinite(found)):
-            raise Hdf5Error(
-                f"{place or 'The episode'} has {name} = {reprlib.repr(found)}, allowed are booleans and numbers: "
-                f"{file.path}"
+            raise FieldError(
+                f"{place or 'the episode'} has {name} = {reprlib.repr(found)}, allowed are booleans and numbers"
             )
-        if found is not None:
-            return bool(found)
-        if not file.has(f"{place}/{name}"):
-            return None
+        if found is not None or not file.has(f"{place}/{name}"):
+            return None if found is None else bool(found)
         array = file.array(f"{place}/{name}".lstrip("/"))
         if len(array) != self.num_rows:
-            raise Hdf5Error(f"{array.place} has {len(array)} rows, the episode has {self.num_rows}: {file.path}")
+            raise FieldError(f"{array.place} has {len(array)} rows, the episode has {self.num_rows}")
         return bool((array.read(self.num_rows - 1, self.num_rows).astype(np.float64) > 0).all())
-
-
-def _alike(info: EpisodeInfo, first: EpisodeInfo, file: ForeignFile, place: str) -> EpisodeInfo:
-    """Return an episode that shares the first one's URDF text in memory; ConfigError if it differs."""
-    if different := differences(first, info):
-        name = f"{place} of {file.path}" if place else str(file.path)
-        raise ConfigError(f"The episodes differ ({'; '.join(different)}): import {name} into another run.")
-    return replace(info, urdf=first.urdf)
 
 
 def _unnamed(file: ForeignFile, place: str, mapping: SourceMapping) -> dict[str, str]:

@@ -99,9 +99,6 @@ def summarize_hdf5(path: Path) -> dict[str, Any]:
     """Summarise a file for `demorec info --json`: episodes, rate, and datasets of the first episode.
 
     For an unknown layout all datasets are listed, and the number of episodes is None.
-
-    Raises:
-        Hdf5Error: It cannot be read.
     """
     with ForeignFile(path) as file:
         layout = _layout_of(file)

@@ -6,7 +6,7 @@ implementations agree on: bilinear interpolation, and ITU-R BT.601 with limited 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any, NamedTuple, cast
 
@@ -20,7 +20,7 @@ from demorec.core.errors import describe_error
 from demorec.extensions.imports.fields import FieldError, image_bytes, whole
 from demorec.mcap.cdr import Values
 from demorec.mcap.lossless import decode_millimetres
-from demorec.mcap.video import DECODERS, deep_gray, is_keyframe, nal_units
+from demorec.mcap.video import DECODERS, is_keyframe, nal_units
 
 _PIXELS: dict[str, tuple[str, int]] = {
     "rgb8": ("rgb24", 3),
@@ -215,34 +215,25 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
     return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
 
 
-_shapes: dict[tuple[str, bytes], tuple[int, int, str]] = {}
-"""(codec, parameter sets) -> width, height and `deep_gray` of the keyframes, from one decoded keyframe."""
-
-
-class NoColorError(FieldError):
-    """Encoded images hold a measurement with unknown unit instead of colour."""
+_sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
+"""(codec, parameter sets) -> width and height of the keyframes, from one decoded keyframe."""
 
 
 def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
-    """Return width and height of a keyframe.
-
-    Raises:
-        FieldError: It decodes to no image.
-        NoColorError: Its pixels are not colours.
-    """
+    """Return width and height of a keyframe; FieldError if it decodes to no image."""
     key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
-    if key not in _shapes:
-        frame = next(_frames(codec, [data]), None)
-        if frame is None:
+    if key not in _sizes:
+        try:
+            context = cast(av.VideoCodecContext, av.CodecContext.create(DECODERS[codec], "r"))
+            context.thread_count = 1
+            context.options = {"max_pixels": str(MAX_PIXELS)}
+            frames = [*context.decode(av.Packet(data)), *context.decode(None)]
+        except (av.FFmpegError, ValueError) as error:
+            raise FieldError(f"its {codec} video cannot be decoded") from error
+        if not frames:
             raise FieldError(f"its {codec} keyframe cannot be decoded")
-        _shapes[key] = (frame.width, frame.height, deep_gray(codec, frame.format.name, key[1]))
-    width, height, measurement = _shapes[key]
-    if measurement:
-        raise NoColorError(
-            f"its {codec} video holds {measurement}, which is depth or another measurement and not colour: leave the "
-            "topic out, or record the distances as 16UC1 or 32FC1 images"
-        )
-    return width, height
+        _sizes[key] = (frames[0].width, frames[0].height)
+    return _sizes[key]
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:
@@ -251,18 +242,6 @@ def _parameter_sets(codec: str, data: bytes) -> bytes:
     kinds = (7, 8) if codec == "h264" else (32, 33, 34)
     places = [place for _, place in units[1:]] + [units[-1][1]]
     return b"".join(data[at:end] for (kind, at), end in zip(units, places, strict=True) if kind in kinds)
-
-
-def _frames(codec: str, packets: Iterable[bytes]) -> Iterator[av.VideoFrame]:
-    try:
-        context = cast(av.VideoCodecContext, av.CodecContext.create(DECODERS[codec], "r"))
-        context.thread_count = 1
-        context.options = {"max_pixels": str(MAX_PIXELS)}
-        for data in packets:
-            yield from context.decode(av.Packet(data))
-        yield from context.decode(None)
-    except (av.FFmpegError, ValueError) as error:
-        raise FieldError(f"its {codec} video cannot be decoded") from error
 
 
 def _compressed_depth(data: bytes) -> NDArray[np.uint16]:

@@ -1,21 +1,27 @@
-"""import.json: sources, mapping and findings of an import, stored for `check`."""
+"""import.json: sources, mapping and findings of an import, and the checks that report them.
+
+The bags may be gone when the run is checked.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from demorec.check.base import Fault, NotApplicableError, check, listed
+from demorec.check.run import CheckedRun
 from demorec.core.errors import ConfigError, describe_error, resource_error
 from demorec.core.files import read_text_limited, replace_text
 from demorec.core.plain import from_json, to_json
 from demorec.extensions.imports.bag import NS
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.clock import Timeline
-from demorec.extensions.imports.findings import NOTE, ImportFinding, lost_in
+from demorec.extensions.imports.findings import ImportFinding, lost_in
 from demorec.extensions.imports.rows import EpisodeRows
 from demorec.runs.run_file import IMPORT_NAME
 
@@ -78,11 +84,6 @@ class BagReport:
     episodes: tuple[EpisodeReport, ...]
 
     @property
-    def odd(self) -> tuple[ImportFinding, ...]:
-        """Findings except notes."""
-        return tuple(finding for finding in self.findings if finding.kind != NOTE)
-
-    @property
     def made(self) -> tuple[EpisodeReport, ...]:
         """Episodes that were not dropped."""
         return tuple(episode for episode in self.episodes if episode.episode_index is not None)
@@ -92,7 +93,7 @@ class BagReport:
         for episode in self.episodes:
             if episode.episode_index is None:
                 yield from episode.lines()
-        if kinds := sorted({finding.kind for finding in self.odd}):
+        if kinds := sorted({finding.kind for finding in self.findings}):
             yield f"findings in the bag ({', '.join(kinds)}), which demorec check lists"
 
 
@@ -117,7 +118,7 @@ def stream_figures(line: Timeline, episodes: Sequence[EpisodeRows]) -> dict[str,
         "longest ms": f"{steps.max(initial=0) / 1e6:.1f}",
         "lost": str(int(lost_in(line).sum()) if line.is_regular else 0),
         "age ms": f"{max(ages) / 1e6:.1f}" if ages else "-",
-        "unused": str(sum(choice.num_unused for choice in chosen)),
+        "unused": str(sum(int(np.ptp(choice.index)) + 1 - len(np.unique(choice.index)) for choice in chosen)),
     }
 
 
@@ -184,3 +185,41 @@ def save_import_file(content: ImportFile, folder: Path) -> None:
         raise resource_error(error, path) or BagError(
             f"import.json cannot be written ({error.strerror}): {path}"
         ) from error
+
+
+_MAX_LISTED = 5
+
+import_check = partial(
+    check,
+    family="files",
+    on=("external run",),
+    needs="an imported run",
+    why="Data is missing from the run, or has the wrong time.",
+    do="look at it: demorec view {path}",
+)
+
+
+@import_check(measures="findings of the import about clocks and losses")
+def import_findings(run: CheckedRun) -> Iterator[Fault]:
+    """List the findings of the import."""
+    words = [
+        f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
+        for bag in _import_file(run).bags
+        for finding in bag.findings
+    ]
+    return listed(words, "look", _MAX_LISTED)
+
+
+@import_check(measures="episodes that an import dropped, skipped files")
+def import_dropped(run: CheckedRun) -> Iterator[Fault]:
+    """List the episodes of the imported files that are not in the run, except those that a marker discards."""
+    found = _import_file(run)
+    rows = [row for bag in found.bags for row in bag.episodes if row.episode_index is None and not row.discarded]
+    dropped = [row.reason for row in rows] + [f"{bag.name}: {bag.reason}" for bag in found.skipped]
+    return listed(dropped, "look", _MAX_LISTED)
+
+
+def _import_file(run: CheckedRun) -> ImportFile:
+    if (found := load_import_file(run.path)) is None:
+        raise NotApplicableError("the run was not imported")
+    return found

@@ -126,7 +126,6 @@ def import_bags(
 
     Args:
         paths: Bags, each of which is one episode or several by the mapping; or folders of bags.
-        mapping_path: Path of the mapping.
         out: The run's folder; a run started with the same mapping is continued.
         video: Encoding of images that arrive as pixels.
         workers: Number of processes that read and write; the recordings do not depend on it.

@@ -26,7 +26,7 @@ from demorec.extensions.imports.import_file import BagReport, EpisodeReport, str
 from demorec.extensions.imports.mapping import Episodes, SourceMapping
 from demorec.extensions.imports.rows import EpisodeRows, NoRowsError, TakenImages, Timelines, Window
 from demorec.extensions.imports.streams import Text, read_streams
-from demorec.extensions.imports.words import task_in_name
+from demorec.extensions.imports.words import stated_task
 from demorec.mcap.sampled_writer import MAX_STAMP_NS, MAX_SUBTASK
 from demorec.mcap.video import size_problem
 from demorec.runs.external import differences
@@ -69,13 +69,7 @@ class PlannedBag:
 
 @dataclass(frozen=True, kw_only=True)
 class ImportSettings:
-    """Settings of an import.
-
-    Attributes:
-        mapping: Mapping of the bags.
-        urdf: The robot's URDF, None if the mapping names no file.
-        video: Encoding of pixels.
-    """
+    """Settings of an import; `urdf` is None if the mapping names no file."""
 
     mapping: SourceMapping
     urdf: str | None
@@ -84,11 +78,6 @@ class ImportSettings:
 
 def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
     """Read and judge a bag; its episodes are numbered from 0.
-
-    Args:
-        bag: Bag to read.
-        files: Digests of its files.
-        settings: Settings of the import.
 
     Raises:
         BagError: It cannot be read, does not fit the mapping, or would yield an incomplete episode.
@@ -132,11 +121,10 @@ def plan_bag(bag: Bag, files: Files, settings: ImportSettings) -> PlannedBag:
 
 
 def _reported(findings: Sequence[ImportFinding]) -> str:
-    """Other findings in a bag without a complete episode, as possible causes."""
-    kinds = {finding.kind: finding.kind for finding in findings}
-    offsets = [finding.text for finding in findings if finding.kind == "clock_offset"]
-    kinds |= {"clock_offset": f"clock_offset, {offsets[0]}"} if offsets else {}
-    return f" (the bag's report: {'; '.join(sorted(kinds.values()))})" if kinds else ""
+    """Other findings in a bag without a complete episode, as possible causes; a clock's offset with its remedy."""
+    texts = {finding.kind: finding.text for finding in reversed(findings)}
+    kinds = [f"{kind}, {text}" if kind == "clock_offset" else kind for kind, text in sorted(texts.items())]
+    return f" (the bag's report: {'; '.join(kinds)})" if kinds else ""
 
 
 def _episode(
@@ -187,10 +175,14 @@ def windows(lines: Timelines) -> list[Window]:
             )
         return found
     markers = lines.streams.texts[episodes.topic]
-    if unknown := _unknown_words(markers, lines.mapping):
+    known = {True, False, "", *_words(episodes)}
+    if episodes.topic == lines.mapping.subtasks.topic:
+        known |= {marker.value for marker in markers if isinstance(marker.value, str)}
+    if unknown := dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if marker.value not in known):
         raise BagError(
-            f"The mapping does not list these markers of {episodes.topic}: {unknown}; put each into episodes.discard "
-            "(the episode is left out) or episodes.ignore, or set start, stop, success or failure"
+            f"The mapping does not list these markers of {episodes.topic}: {listed(unknown, _MOST_LISTED, ', ')}; put "
+            "each into episodes.discard (the episode is left out) or episodes.ignore, or set start, stop, success or "
+            "failure"
         )
     if found := _between_markers(markers, episodes):
         return found
@@ -199,19 +191,10 @@ def windows(lines: Timelines) -> list[Window]:
     )
 
 
-def _unknown_words(markers: list[Text], mapping: SourceMapping) -> str:
-    """Marker texts without a meaning in the mapping, each once; "" if all have one. Subtasks may share their
-    topic.
-    """
-    words = mapping.episodes
-    known = {True, False, "", words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
-    is_shared = words.topic == mapping.subtasks.topic
-
-    def is_known(value: object) -> bool:
-        return isinstance(value, str | int | float) and ((is_shared and isinstance(value, str)) or value in known)
-
-    found = dict.fromkeys(repr(marker.value)[:_SHOWN] for marker in markers if not is_known(marker.value))
-    return listed(found, _MOST_LISTED, ", ")
+def _words(episodes: Episodes) -> set[str]:
+    """Texts of markers with a meaning."""
+    words = (episodes.start, episodes.stop, episodes.success, episodes.failure)
+    return {*words, *episodes.discard, *episodes.ignore}
 
 
 def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
@@ -240,12 +223,8 @@ def _between_markers(markers: list[Text], words: Episodes) -> list[Window]:
 def _task_text(bag_name: str, lines: Timelines, window: Window) -> str:
     """Instruction of an episode; BagError if the bag does not have it."""
     task = lines.mapping.task
-    if task.text:
-        return task.text.strip()
-    if task.file_name:
-        if text := task_in_name(bag_name):
-            return text
-        raise BagError("The mapping takes the task from the bag's name, which has none")
+    if text := stated_task(task, bag_name):
+        return text
     texts = [text for text in lines.streams.texts[task.topic] if text.time_ns <= window.end_ns]
     if not texts:
         raise BagError(f"No text of {task.topic} is before the episode's end, so its task is unknown")
@@ -263,10 +242,8 @@ def _subtask_rows(lines: Timelines, rows: EpisodeRows) -> dict[int, str]:
     Raises:
         BagError: A message is not text.
     """
-    words, topic = lines.mapping.episodes, lines.mapping.subtasks.topic
-    is_marker = words.cut == "marker" and words.topic == topic
-    ends = {words.start, words.stop, words.success, words.failure, *words.discard, *words.ignore}
-    markers = ends if is_marker else set()
+    episodes, topic = lines.mapping.episodes, lines.mapping.subtasks.topic
+    markers = _words(episodes) if episodes.cut == "marker" and episodes.topic == topic else set()
     found: dict[int, str] = {}
     for text in sorted(lines.streams.texts.get(topic, ()), key=lambda text: text.time_ns):
         if not rows.window.begin_ns <= text.time_ns <= rows.table.time_ns[-1]:
@@ -334,20 +311,18 @@ def _problems(episode: PlannedEpisode, video: VideoConfig) -> Iterator[str]:
 
 def _report(window: Window, zero_ns: int, episode: PlannedEpisode | None, reason: str) -> EpisodeReport:
     """Report a window of a bag that begins at `zero_ns`, with its episode or the reason why it has none."""
-    rows = None if episode is None else episode.rows
-    begin_ns, end_ns = window.begin_ns, window.end_ns
-    if rows:
-        begin_ns, end_ns = int(rows.table.time_ns[0]), int(rows.table.time_ns[-1])
+    begin_ns, end_ns, num_frames = window.begin_ns, window.end_ns, 0
+    if episode:
+        times = episode.rows.table.time_ns
+        begin_ns, end_ns, num_frames = int(times[0]), int(times[-1]), len(times)
     return EpisodeReport(
-        episode_index=None if episode is None else episode.info.episode_index,
+        episode_index=episode.info.episode_index if episode else None,
         begin_s=(begin_ns - zero_ns) / NS,
         end_s=(end_ns - zero_ns) / NS,
-        num_frames=rows.table.num_frames if rows else 0,
+        num_frames=num_frames,
         success=window.success,
-        pictures=(
-            {name: plan.described(rows.table.images[name]) for name, plan in rows.cameras.items()} if rows else {}
-        ),
+        pictures={name: plan.described() for name, plan in episode.rows.cameras.items()} if episode else {},
         reason=reason,
         discarded=window.discarded,
-        follows=rows.follows if rows else "",
+        follows=episode.rows.follows if episode else "",
     )

@@ -57,8 +57,7 @@ class TakenImages:
     """Images that an episode takes from a camera.
 
     Attributes:
-        topic: Topic of the messages.
-        head: Head of the first image.
+        topic, head: Topic of the messages, and head of the first image.
         kept: Codec of passthrough packets, or encoding of depth; "" for pixels, which are encoded once.
         taken: (P,) index of each image's message in its topic, sorted by time.
     """
@@ -68,16 +67,11 @@ class TakenImages:
     kept: Kept
     taken: Int
 
-    def described(self, shown: Int) -> str:
-        """Describe the treatment of the images, of which rows show those with these numbers (R,)."""
-        num_shown = len(np.unique(shown))
-        what = f"{len(self.taken)} images {self.head.width}x{self.head.height}, "
+    def described(self) -> str:
+        """Describe the treatment of the images."""
         kind = self.head.encoding if self.head.format == "raw" else self.head.format
-        what += f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
-        repeated = len(shown) - num_shown
-        rows = "row shows" if repeated == 1 else "rows show"
-        what += f", {repeated} {rows} the image of the row before" if repeated else ""
-        return what + (f", {len(self.taken) - num_shown} shown by no row" if len(self.taken) > num_shown else "")
+        fate = f"{self.kept} passed through as it is" if self.kept else f"{kind}, encoded once"
+        return f"{len(self.taken)} images {self.head.width}x{self.head.height}, {fate}"
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -102,12 +96,7 @@ class NoRowsError(BagError):
 
 
 class Timelines:
-    """All streams of a bag on the mapping's clock.
-
-    Attributes:
-        streams, mapping: As given.
-        lines: Stream -> timeline.
-    """
+    """All streams of a bag on the mapping's clock; `lines` is stream -> timeline."""
 
     def __init__(self, streams: BagStreams, mapping: SourceMapping) -> None:
         self.streams, self.mapping = streams, mapping
@@ -155,10 +144,7 @@ class Timelines:
         )
 
     def _feature(self, name: str, chosen: Mapping[Key, ChosenSamples], times: Int, count: int) -> tuple[Numbers, Int]:
-        """Return the first `count` rows (R, D) of a feature and their timestamps.
-
-        The rows are float32 if all sources are, otherwise float64.
-        """
+        """First `count` rows (R, D) of a feature, float32 if all sources are, otherwise float64; their timestamps."""
         values, ages = [], []
         for key, later in self.sources(name):
             part = slice(later, later + count)
@@ -200,10 +186,8 @@ class Timelines:
         return grid(begin, end, clock.fps, [line.times_ns for line in slow]), ""
 
     def _cameras_at_fps(self, begin: int, end: int) -> list[str]:
-        """Cameras with an image for each row; the one that rows follow is first.
-
-        It is the one with the fewest images; among those with nearly as few, the first of the mapping, so that it is
-        the same in all episodes. A depth camera is followed only without others.
+        """Cameras with an image for each row. The first, which rows follow, has the fewest images, but not depth; among
+        those with nearly as few it is the first of the mapping, so that it is the same in all episodes.
         """
         fps = self.mapping.clock.fps
         counts: dict[str, int] = {}

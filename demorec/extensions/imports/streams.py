@@ -50,16 +50,13 @@ class Stream:
     Attributes:
         label: Name: "observation.state" or "camera front".
         part: Its entry in the mapping.
-        type: Type of its messages.
         reader: Reader of a source's numbers, set by its first message.
         logged, stamped: Growing `log_ns` and `header_ns`.
         places: Index of each message within its topic, from 0; empty except for cameras.
         vectors: Concatenated vectors of the source, in its unit: a separate array per message would take three times as
         much memory for a million messages, and fragment it.
-        dtype: Type of the vectors.
         heads: (N,) head of each image; empty except for cameras.
-        num_malformed: Number of messages that cannot be read or are incomplete.
-        first_problem: Problem of the first of them.
+        num_malformed, first_problem: Messages that cannot be read or are incomplete, and the first one's problem.
         first_refusal: Reason why the first message was left to another publisher.
     """
 
@@ -153,12 +150,7 @@ class Stream:
 
 
 class Text(NamedTuple):
-    """A text, number or boolean of a topic (task, marker, robot description), with its time.
-
-    Attributes:
-        time_ns: Time of its message by the mapping's clock.
-        is_header: Whether that is a header time.
-    """
+    """A text, number or boolean of a topic (task, marker, robot description), with its time by the mapping's clock."""
 
     time_ns: int
     value: Any
@@ -166,17 +158,13 @@ class Text(NamedTuple):
 
 
 def _label(feature: str, source: Source, sources: Sequence[Source]) -> str:
-    """Name of a feature, with the joints if several of its sources share a topic."""
-    if not source.joints or sum(other.topic == source.topic for other in sources) == 1:
-        return feature
-    return f"{feature} ({', '.join(source.joints[:2])}{', ...' if len(source.joints) > 2 else ''})"
+    """Name of a feature, with the first joint if several of its sources share a topic."""
+    is_shared = source.joints and sum(other.topic == source.topic for other in sources) > 1
+    return f"{feature} ({source.joints[0]}{', ...' if len(source.joints) > 1 else ''})" if is_shared else feature
 
 
 class BagStreams:
     """All data that a mapping takes from a bag.
-
-    Args:
-        mapping: Mapping of the bag.
 
     Attributes:
         all: Key -> stream, the sources of features before cameras.
@@ -285,11 +273,7 @@ class BagStreams:
 
 
 def read_streams(bag: Bag, mapping: SourceMapping) -> BagStreams:
-    """Read a whole bag.
-
-    Raises:
-        BagError: The mapping does not fit the bag; the message lists all problems.
-    """
+    """Read a whole bag; BagError with all problems if the mapping does not fit it."""
     streams = BagStreams(mapping)
     for message in bag.messages(streams.problems):
         streams.add(message)

@@ -5,6 +5,9 @@ from __future__ import annotations
 import re
 from collections.abc import Container
 
+from demorec.extensions.imports.fields import FieldError
+from demorec.extensions.imports.mapping import TaskText
+
 _NUMBER = re.compile(r"[_\-. \d]*\d$")
 """Number of an episode or a day. Names are foreign: nested repetition would take exponential time."""
 
@@ -12,6 +15,13 @@ _NUMBER = re.compile(r"[_\-. \d]*\d$")
 def task_in_name(name: str) -> str:
     """Task in a file's name: "stack the cups" for "stack_the_cups_003"."""
     return _NUMBER.sub("", name).replace("_", " ").replace("-", " ").strip()
+
+
+def stated_task(task: TaskText, name: str) -> str:
+    """Task in a mapping's text or a file's name; "" if it is elsewhere. Raises FieldError if the name has none."""
+    if task.file_name and not task_in_name(name):
+        raise FieldError(f"the mapping takes the task from the name {name!r}, which has none")
+    return task_in_name(name) if task.file_name else task.text.strip()
 
 
 def in_natural_order(name: str) -> list[tuple[int, str]]:
