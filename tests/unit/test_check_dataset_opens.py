@@ -27,6 +27,16 @@ def opened(dataset: Path) -> tuple[Finding, ...]:
     return result.findings
 
 
+def stand_in(module: str, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make a package that is imported in place of LeRobot."""
+    package = folder / "lerobot" / "datasets"
+    package.mkdir(parents=True)
+    (package.parent / "__init__.py").touch()
+    (package / "__init__.py").touch()
+    (package / "lerobot_dataset.py").write_text(module)
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+
+
 def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(SAMPLE, tmp_path / "d")
     video = next((tmp_path / "d" / "videos").rglob("*.mp4"))
@@ -47,7 +57,6 @@ def test_a_missing_file_is_named_and_not_the_hub(tmp_path: Path, monkeypatch: py
     "module",
     [
         "raise ImportError('libtorch_cpu.so: failed to map segment from shared object')",
-        "raise SystemError('error return without exception set')",
         "class LeRobotDataset:\n    def __init__(self, **_): raise MemoryError('Unable to allocate 3 GiB')",
         "class LeRobotDataset:\n    def __init__(self, **_): import os; os.kill(os.getpid(), 9)",
     ],
@@ -57,12 +66,7 @@ def test_too_little_memory_implies_nothing_about_the_dataset(
 ) -> None:
     """A stand-in LeRobot fails as under `ulimit -v`, and as when the kernel kills it."""
     export(SAMPLE, tmp_path / "d")
-    fake = tmp_path / "fake" / "lerobot" / "datasets"
-    fake.mkdir(parents=True)
-    for path in (fake.parent / "__init__.py", fake / "__init__.py"):
-        path.touch()
-    (fake / "lerobot_dataset.py").write_text(module)
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
+    stand_in(module, tmp_path / "fake", monkeypatch)
     assert exit_code("check", tmp_path / "d", "--lerobot", "--only", "lerobot_opens") == 1
     out, err = capsys.readouterr()
     assert "failed" not in out
@@ -72,14 +76,8 @@ def test_too_little_memory_implies_nothing_about_the_dataset(
 
 def test_a_dataset_that_lerobot_refuses_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     export(SAMPLE, tmp_path / "d")
-    fake = tmp_path / "fake" / "lerobot" / "datasets"
-    fake.mkdir(parents=True)
-    for path in (fake.parent / "__init__.py", fake / "__init__.py"):
-        path.touch()
-    (fake / "lerobot_dataset.py").write_text(
-        "class LeRobotDataset:\n    def __init__(self, **_): raise ValueError('no')"
-    )
-    monkeypatch.setenv("PYTHONPATH", str(tmp_path / "fake"))
+    module = "class LeRobotDataset:\n    def __init__(self, **_): raise ValueError('no')"
+    stand_in(module, tmp_path / "fake", monkeypatch)
     (found,) = opened(tmp_path / "d")
     assert found.severity == "broken"
 
