@@ -134,6 +134,7 @@ def _other_paths(folder: LeRobotFolder) -> Iterator[Fault]:
                 severity="broken",
                 value=f"{len(other)} files",
                 message=f"info.json has {key or 'the rows'} in {template}, found {other[0]}",
+                do=_BY_HAND,
             )
 
 
