@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,7 +24,7 @@ from demorec.cli.shared.paths import (
     tell_incomplete,
     tell_unfinished,
 )
-from demorec.core.atomic import atomic_write
+from demorec.core.atomic import atomic_write, atomic_write_all
 from demorec.core.errors import ConfigError, check_option
 from demorec.core.replacing import IMAGE, RERUN_FILE, OptionalTarget
 from demorec.core.tables import RANKINGS
@@ -124,9 +124,7 @@ class View:
         from demorec.view.scene import save
 
         read = places_read(self.paths)
-        with ExitStack() as stack:
-            writes = [atomic_write(target, RERUN_FILE, overwrite=self.overwrite, sources=read) for target in targets]
-            parts = [stack.enter_context(write) for write in writes]
+        with atomic_write_all(targets, RERUN_FILE, overwrite=self.overwrite, sources=read) as parts:
             for source, part in zip(sources, parts, strict=True):
                 save(source, part)
         for source, target in zip(sources, targets, strict=True):

@@ -4,28 +4,29 @@ The content is written in the workshop, a hidden folder next to the target: `.NA
 a second command, and its content marks the workshop as demorec's. The last step takes the name only if it is still
 free, or, with `--overwrite`, if the existing target is unchanged since the start.
 
-One system call renames the result, or exchanges it with the target that it replaces. Where the file system cannot
-exchange, the old target is first moved into the workshop: the next command with the same target moves it back if a
-crash came in between. The lock is removed last, so that the next command recognises and removes the remains of a crash.
+One system call renames a single target, or exchanges it with the target that it replaces. Several targets are moved in
+sequence, the old ones first: the next command with the same targets reads a journal and undoes an interrupted move. The
+lock is removed last, so that the next command recognises and removes the remains of a crash.
 """
 
 from __future__ import annotations
 
 import errno
+import json
 import os
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from itertools import count
 from pathlib import Path
+from typing import Any
 
 from demorec.core.errors import ConfigError, DemorecError, ExportError, resource_error, write_error
 from demorec.core.files import open_locked, sync_path
-from demorec.core.replacing import ReplaceableKind, check_replaceable
+from demorec.core.replacing import ReplaceableKind, check_replaceable, json_object, shown
 
-_LOCK, _NEW, _OLD = "lock", "new", "old"
-"""Content of a workshop: the lock, and folders for the result and the target that it replaces."""
+_LOCK, _JOURNAL, _NEW, _OLD = "lock", "journal.json", "new", "old"
+"""Content of a workshop: the lock, the journal of moves, the new targets and the old ones."""
 _MARK = b"demorec is writing here; its next command to the same place removes this folder.\n"
 _AT_FDCWD = -100
 _NO_REPLACE = 1
@@ -61,36 +62,48 @@ def atomic_write(
         ExportError: It cannot be written for another reason, such as a full disk.
         DemorecError: A source has disappeared or cannot be read.
     """
+    with atomic_write_all([target], kind, overwrite=overwrite, sources=sources) as (part,):
+        yield part
+
+
+@contextmanager
+def atomic_write_all(
+    targets: Sequence[Path], kind: ReplaceableKind, *, overwrite: bool = False, sources: Iterable[Path] = ()
+) -> Iterator[list[Path]]:
+    """Yield a path to write to for each target; all targets appear when the block ends. See `atomic_write`."""
     sources = tuple(sources)
-    place = (Path.cwd() / target).resolve()
-    workshop = place.parent / f".{place.name}.demorec-part"
-    part = workshop / _NEW / place.name
+    places = [(Path.cwd() / target).resolve() for target in targets]
+    workshop = places[0].parent / f".{places[0].name}.demorec-part"
 
     def check() -> None:
-        check_replaceable(Path.cwd() / target, kind, overwrite=overwrite, sources=sources)
+        for target in targets:
+            check_replaceable(Path.cwd() / target, kind, overwrite=overwrite, sources=sources)
 
     try:
-        if not os.path.lexists(workshop):  # otherwise the target of an interrupted command is restored first
+        if not os.path.lexists(workshop):  # otherwise undo the remains of an interrupted move of several targets first
             check()
-        with _locked(workshop, target):
-            _restore(workshop, place)
+        with _locked(workshop, targets[0]):
+            _undo(workshop)
             for folder in (_NEW, _OLD):
                 shutil.rmtree(workshop / folder, ignore_errors=True)
                 (workshop / folder).mkdir()
             check()
-            before = snapshot(place)
+            before = [snapshot(place) for place in places]
+            parts = [workshop / _NEW / place.name for place in places]
             if kind.is_folder:
-                part.mkdir()
-            yield part
-            _sync(part)
-            _publish(workshop, part, place, before)
+                for part in parts:
+                    part.mkdir()
+            yield parts
+            for part in parts:
+                _sync(part)
+            _publish(workshop, parts, places, before)
     except BrokenPipeError:  # the reader of standard output has closed it
         raise
     except OSError as error:
-        if isinstance(error.filename, str) and _is_below(error.filename, sources, other_than=(workshop, place)):
+        if isinstance(error.filename, str) and _is_below(error.filename, sources, other_than=(workshop, *places)):
             raise DemorecError(f"The source cannot be read ({error.strerror}): {error.filename}") from error
         what = f"{kind.name[0].upper()}{kind.name[1:]}"
-        raise resource_error(error) or write_error(what, error, target, ExportError) from error
+        raise resource_error(error) or write_error(what, error, targets[0], ExportError) from error
 
 
 def _is_below(name: str, folders: Iterable[Path], *, other_than: Iterable[Path]) -> bool:
@@ -212,13 +225,13 @@ def _check_ours(workshop: Path) -> None:
     found = {path.name for path in workshop.iterdir()} if is_folder else {""}
     lock = workshop / _LOCK
     is_marked = lock.is_file() and lock.read_bytes() == _MARK
-    if not found <= {_LOCK, _NEW, _OLD} or (found - {_LOCK} and not is_marked):
+    if not found <= {_LOCK, _JOURNAL, _NEW, _OLD} or (found - {_LOCK} and not is_marked):
         raise ConfigError(f"This was not made by demorec and is in the way, move it elsewhere: {workshop}")
 
 
 def _clear(workshop: Path) -> None:
-    """Remove a workshop, its lock last, unless the next command must move the old target back."""
-    if all(any((workshop / folder).glob("*")) for folder in (_NEW, _OLD)):
+    """Remove a workshop, its lock last, unless its journal lists moves that the next command must undo."""
+    if (workshop / _JOURNAL).exists():
         return
     for folder in (_NEW, _OLD):
         shutil.rmtree(workshop / folder, ignore_errors=True)
@@ -228,19 +241,25 @@ def _clear(workshop: Path) -> None:
             workshop.rmdir()
 
 
-def _publish(workshop: Path, part: Path, place: Path, before: Snapshot) -> None:
-    """Give the result its name; ConfigError, with the result kept, if another file has taken the name meanwhile."""
+def _publish(workshop: Path, parts: Sequence[Path], places: Sequence[Path], before: Sequence[Snapshot]) -> None:
+    """Give all parts their names; ConfigError, with the parts kept, if another file has taken a name meanwhile."""
     try:
-        if not before:
-            take_name(part, place)
-        elif not _exchanged(part, place, before):
-            _replace(workshop, part, place, before)
+        if len(parts) > 1:
+            _move_all(workshop, parts, places, before)
+        elif not before[0]:
+            take_name(parts[0], places[0])
+        elif not _exchanged(parts[0], places[0], before[0]):
+            _move_all(workshop, parts, places, before)
     except FileExistsError as error:
+        found = zip(places, before, strict=True)
+        changed = [str(place / name) for place, was in found for name in _differences(was, snapshot(place))]
+        kept = [_kept(part, place) for part, place in zip(parts, places, strict=True)]
         raise ConfigError(
-            f"Files have appeared or changed while this command ran, and are left unchanged ({place}); the result is "
-            f"kept as {_kept(part, place)}"
+            f"Files have appeared or changed while this command ran, and are left unchanged ({shown(changed)}); the "
+            f"result is kept as {shown([str(path) for path in kept])}"
         ) from error
-    sync_path(place.parent)
+    for folder in {place.parent for place in places}:
+        sync_path(folder)
 
 
 def _exchanged(part: Path, place: Path, before: Snapshot) -> bool:
@@ -261,37 +280,59 @@ def _exchanged(part: Path, place: Path, before: Snapshot) -> bool:
     return True
 
 
-def _replace(workshop: Path, part: Path, place: Path, before: Snapshot) -> None:
-    """Move the old target away and the result into its place; errors as in `_exchanged`."""
-    old = workshop / _OLD / place.name
+def _move_all(workshop: Path, parts: Sequence[Path], places: Sequence[Path], before: Sequence[Snapshot]) -> None:
+    """Move all old targets away, then all parts into place; undo the moves if one fails."""
+    made = {str(place): snapshot(part) for place, part in zip(places, parts, strict=True)}
+    # A journal cut off here lists nothing, because nothing has been moved yet.
+    (workshop / _JOURNAL).write_text(json.dumps(made))
+    sync_path(workshop / _JOURNAL)
+    sync_path(workshop)
     try:
-        if os.path.lexists(place):
-            place.rename(old)
-            if snapshot(old) != before:
-                raise _taken(place)
-        take_name(part, place)
+        for place, was in zip(places, before, strict=True):
+            old = workshop / _OLD / place.name
+            if was and os.path.lexists(place):
+                place.rename(old)
+                if snapshot(old) != was:
+                    raise _taken(place)
+        for place, part in zip(places, parts, strict=True):
+            take_name(part, place)
+            sync_path(place.parent)
     except BaseException:
-        _restore(workshop, place)
+        _undo(workshop)
         raise
+    (workshop / _JOURNAL).unlink()  # no undo after this point
 
 
-def _restore(workshop: Path, place: Path) -> None:
-    """Move the old target back, unless the result has taken its place."""
-    part, old = workshop / _NEW / place.name, workshop / _OLD / place.name
-    if os.path.lexists(part) and os.path.lexists(old):
-        try:
-            take_name(old, place)
-        except FileExistsError:
-            _kept(old, place)
+def _undo(workshop: Path) -> None:
+    """Undo the moves in a journal: new targets into the workshop, old ones to their places."""
+    made: dict[str, Any] = json_object(workshop / _JOURNAL)
+    for name, new in made.items():
+        place = Path(name)
+        part, old = workshop / _NEW / place.name, workshop / _OLD / place.name
+        if not os.path.lexists(part) and snapshot(place) == new:  # otherwise it was changed or removed meanwhile
+            place.rename(part)
+        if os.path.lexists(old):
+            try:
+                take_name(old, place)
+            except FileExistsError:
+                _kept(old, place)
+    (workshop / _JOURNAL).unlink(missing_ok=True)
 
 
 def _kept(part: Path, place: Path) -> Path:
     """Keep a result under a free name next to its place: NAME.1, or NAME.1.html for a file."""
     stem, suffix = (place.name, "") if part.is_dir() else (place.stem, place.suffix)
-    for number in count(1):
+    number = 1
+    while True:
         path = place.with_name(f"{stem}.{number}{suffix}")
-        with suppress(FileExistsError):
+        try:
             if not os.path.lexists(path):
                 take_name(part, path)
-                break
-    return path
+                return path
+        except FileExistsError:
+            pass
+        number += 1
+
+
+def _differences(before: Snapshot, now: Snapshot) -> list[str]:
+    return sorted(name for name in {*before, *now} if before.get(name) != now.get(name))

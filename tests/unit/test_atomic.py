@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import os
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
+from support.export import content_of
 
 from demorec.core import atomic
-from demorec.core.atomic import atomic_write
+from demorec.core.atomic import atomic_write, atomic_write_all
 from demorec.core.errors import ConfigError
 from demorec.core.replacing import ReplaceableKind
 
 FILE = ReplaceableKind(name="a note", recognises=lambda path: True)
 FOLDER = ReplaceableKind(name="a book", is_folder=True, recognises=lambda path: True)
-pytestmark = pytest.mark.filterwarnings("ignore:This process .* is multi-threaded:DeprecationWarning")
 
 
 @pytest.fixture(params=["flags", "links", "neither"], autouse=True)
@@ -74,22 +72,26 @@ def test_files_that_appear_meanwhile_stay_and_the_result_is_kept(
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted(["x.txt", kept.name])
 
 
-def test_the_old_file_returns_after_a_kill_between_moving_it_away_and_naming_the_new_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(atomic, "_rename", lambda old, new, flag: False)
-    target = tmp_path / "x.txt"
-    target.write_text("old")
-    if (child := os.fork()) == 0:
-        monkeypatch.setattr(atomic, "take_name", lambda *_: os._exit(7))
-        with atomic_write(target, FILE, overwrite=True) as part:
-            part.write_text("new")
-    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 7
-    assert not target.exists()
-    with suppress(ZeroDivisionError), atomic_write(target, FILE, overwrite=True):
-        raise ZeroDivisionError
-    assert target.read_text() == "old"
-    assert list(tmp_path.iterdir()) == [target]
+@pytest.mark.parametrize("kind", [FILE, FOLDER], ids=["file", "folder"])
+def test_several_appear_together_or_none(tmp_path: Path, kind: ReplaceableKind) -> None:
+    targets = [tmp_path / name for name in ("a", "b", "c")]
+    with atomic_write_all(targets, kind) as parts:
+        for part in parts:
+            fill(part, kind, "old")
+        assert not any(target.exists() for target in targets)
+    before = content_of(tmp_path)
+
+    def write_and_disturb() -> None:
+        with atomic_write_all(targets, kind, overwrite=True) as parts:
+            for part in parts:
+                fill(part, kind, "new")
+            fill(targets[1], kind, "mine, and longer")
+
+    with pytest.raises(ConfigError, match=r"left unchanged \(.*b"):
+        write_and_disturb()
+    mine = {name: b"mine, and longer" for name in before if name.startswith("b")}
+    kept = {f"{name[0]}.1{name[1:]}": b"new" for name in before}
+    assert content_of(tmp_path) == before | mine | kept
 
 
 def test_an_error_leaves_nothing_not_even_new_parents(tmp_path: Path) -> None:

@@ -26,13 +26,12 @@ from demorec.core.errors import ExportError, describe_error
 from demorec.core.files import open_regular
 from demorec.datasets.lerobot.depth import LARGEST_CODE, DepthScale
 from demorec.datasets.lerobot.episode_places import EpisodePlace
-from demorec.datasets.lerobot.layout import video_info
+from demorec.datasets.lerobot.layout import DatasetFeature, video_info
 from demorec.datasets.lerobot.mp4 import EncodedVideo, one_image_file
 from demorec.datasets.lerobot.mp4_index import check_video, mp4_index
 from demorec.datasets.lerobot.paths import INFO_PATH
 
 if TYPE_CHECKING:
-    from demorec.datasets.lerobot.folder import LeRobotFolder
     from demorec.mcap.video import Rgb
 
 PacketCodec = Literal["h264", "h265", "av1"]
@@ -158,11 +157,12 @@ class EpisodeVideo:
     Methods and properties raise ExportError if the images cannot be read.
     """
 
-    def __init__(self, folder: LeRobotFolder, key: str, place: EpisodePlace) -> None:
+    def __init__(
+        self, open_file: Callable[[Path], VideoFile], key: str, place: EpisodePlace, feature: DatasetFeature, fps: int
+    ) -> None:
         self.path, self.first = place.videos[key]
         self.length = place.length
-        self._open_file, self._key, self._feature = folder.open_video, key, folder.info.features[key]
-        self._fps = int(folder.info.fps)
+        self._open_file, self._key, self._feature, self._fps = open_file, key, feature, fps
         self._episode = place.episode_index
 
     @property

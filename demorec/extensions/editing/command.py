@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 from demorec.cli.shared.flags import Positional, arg
 from demorec.cli.shared.output import ProgressBar, counted, say
 from demorec.cli.shared.paths import refuse_inside
-from demorec.core.atomic import atomic_write
+from demorec.core.atomic import atomic_write_all
 from demorec.core.errors import ConfigError
 from demorec.core.extension import targets_of
 from demorec.core.plain import listed
@@ -95,14 +94,12 @@ class Edit:
         return 0
 
     def _write(self, sources: Sequence[LeRobotFolder], outs: Sequence[Path]) -> None:
-        """Write the new datasets, none of which appears before all are complete, and print a summary."""
+        """Write the new datasets, which appear together, and print a summary."""
         from demorec.extensions.editing.write import write_plan
 
         results: list[tuple[int, int]] = []
         roots = [source.root for source in sources]
-        with ExitStack() as stack:
-            writes = [atomic_write(out, _RESULT, overwrite=self.overwrite, sources=roots) for out in outs]
-            folders = [stack.enter_context(write) for write in writes]
+        with atomic_write_all(outs, _RESULT, overwrite=self.overwrite, sources=roots) as folders:
             plans = self.plans(sources)
             for plan, folder in zip(plans.values(), folders, strict=True):
                 with ProgressBar("writing") as bar:

@@ -159,7 +159,7 @@ class Shuffle(EditOne):
 
 @dataclass(frozen=True, kw_only=True)
 class Split(EditOne):
-    """Split a dataset into parts, each in a folder with its name in --out; none appears before all are complete.
+    """Split a dataset into parts, each in a folder with its name in --out; all appear together.
 
     Examples:
       demorec dataset split cups --shares train=0.8 val=0.2 --out parts
