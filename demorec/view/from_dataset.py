@@ -42,8 +42,8 @@ def open_stored_episode(dataset: LeRobotFolder, number: int) -> Iterator[Dataset
     try:
         episode = _ShownEpisode(dataset, number)
         has_state = {STATE, ACTION} <= dataset.info.features.keys()
-        is_simulated = episode.known.get("root_seed") is not None and has_state
-        yield _SimulatedEpisode(dataset, number) if is_simulated else episode
+        has_scene = episode.known.get("root_seed") is not None and has_state
+        yield _SimulatedEpisode(dataset, number) if has_scene else episode
     except (OSError, ValueError, TypeError, KeyError, IndexError) as error:  # nulls and unexpected values in its tables
         unreadable = RecordingError(f"The dataset cannot be read ({describe_error(error)}): {dataset.root}")
         raise resource_error(error) or unreadable from error

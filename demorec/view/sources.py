@@ -91,7 +91,7 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
     folder = path.resolve().parent
     with Recording(path) as recording:
         roles, motion = roles_of_recording(recording.info, named), recording.motion()
-        is_simulated = scene_of(recording.info) is not None
+        has_scene = scene_of(recording.info) is not None
         yield Playback(
             name=path.name.removesuffix(".mcap"),
             group=folder.parent.name if folder.name in (EPISODES, FAILED) else folder.name,
@@ -100,6 +100,6 @@ def open_recorded(path: Path, named: NamedRoles = NO_NAMES) -> Iterator[Playback
             data=recording,
             motion=motion,
             roles=roles,
-            curves=simulated_curves(recording, motion) if is_simulated else feature_curves(recording, roles),
+            curves=simulated_curves(recording, motion) if has_scene else feature_curves(recording, roles),
             statements=tuple((frame, "subtask", text) for frame, text in recording.subtasks),
         )
