@@ -126,6 +126,9 @@ ALONE: dict[str, tuple[Fault, str]] = {
     "rows of no episode": (of_table("data", lambda t: pa.concat_tables([t, t.slice(0, 5)])), "contradicting_counts"),
     "a null in an index": (value_of("task_index", 20, None), "unreadable_episodes"),
     "an episode that ends late": (value_of("length", 2, 10_000, "meta/episodes"), "unreadable_episodes"),
+    "a missing table": (lambda dataset: next(dataset.glob("data/*/*.parquet")).unlink(), "unreadable_episodes"),
+    "a NaN in the state": (value_of(STATE, 20, float("nan")), "missing_numbers"),
+    "an infinity in the action": (value_of("action", 20, float("inf")), "missing_numbers"),
     "a wrong deviation": (of_stats("action", "std", lambda v: [*v[:2], 1.0, *v[3:]]), "wrong_statistics"),
     "a wrong quantile": (of_stats("action", "q10", lambda v: [0.5 * number for number in v]), "wrong_statistics"),
     "a wrong count": (of_stats("action", "count", lambda v: [v[0] - 1]), "wrong_statistics"),
@@ -194,6 +197,17 @@ def test_the_good_one_passes(is_ours: bool, dataset: Path) -> None:
     skipped = {result.check for result in report.results if result.verdict == "not measured"}
     assert skipped == {"image_lag", "unusual_motion"}
     assert ("dataset_sidecar" in {result.check for result in report.results}) == is_ours
+
+
+@pytest.mark.slow
+def test_a_nan_spoils_its_rows_and_not_the_other_checks(dataset: Path) -> None:
+    shutil.rmtree(dataset / "demorec")
+    value_of(STATE, 20, float("nan"))(dataset)
+    edit_column(dataset, "observation.ee_pose", lambda rows: rows[:, [0, 1, 2, 6, 3, 4, 5]])
+    found = {result.check: result.verdict for result in checked(dataset, "dataset", images=False).results}
+    failed = {check for check, verdict in found.items() if verdict == "broken"}
+    assert failed == {"missing_numbers", "pose_mismatch", "wrong_statistics"}
+    assert "not measured" not in {found["joint_limits"], found["velocity_mismatch"], found["action_lag"]}
 
 
 def test_a_missing_video_leaves_the_other_checks(dataset: Path) -> None:

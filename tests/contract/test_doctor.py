@@ -114,6 +114,7 @@ NUMBERS: dict[str, tuple[Change, str]] = {
     "a frozen elbow": (frozen_elbow, "frozen_state"),
     "a jump": (jumping, "state_jumps"),
     "half a minute's rest": (resting, "idle_ends"),
+    "the end cut off": (lambda s, a: (s[: len(s) // 2], a[: len(a) // 2]), "cut_off_episodes"),
     "samples held for four frames": (lambda s, a: (s[np.arange(len(s)) // 4 * 4], a), "held_samples"),
 }
 

@@ -11,7 +11,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from demorec.check.base import Fault, NotMeasuredError, check
-from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, Evidence
+from demorec.core.geometry import Array
+from demorec.extensions.doctor.evidence import DROP, LOOK_OR_DROP, EpisodeEvidence, Evidence
+from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.robust import usual
 from demorec.extensions.doctor.scores import score_episodes
 from demorec.extensions.doctor.units import moving_elements, other_units
@@ -24,6 +26,15 @@ MAX_UNUSUAL_SPREADS = 10.0
 """Number of usual spreads from which a quantity is far from the usual one."""
 MAX_UNUSUAL_SHARE = 0.1
 """Maximum ratio of episodes with a quantity far from the median: more are another way to do the task."""
+MIN_END_SPEED = 0.8
+"""Minimum final speed, relative to the episode's root mean square, of an episode that ends during a motion."""
+MAX_REST_SPEED = 0.3
+"""Maximum final speed, relative to the same, of an episode that ends at rest."""
+MIN_RESTING_SHARE = 0.9
+"""Minimum ratio of other episodes ending at rest for a moving end to count as cut off."""
+END_S = 0.2
+MIN_SPAN = 0.05
+"""Minimum range, relative to the largest, by which steps are divided: some elements move in few episodes only."""
 MIN_IDLE_S = 3.0
 """Minimum idle time at an end, seconds, that is worth trimming."""
 IDLE_TIMES = 4.0
@@ -35,6 +46,68 @@ MIN_COMMON = 5
 """Minimum number of episodes with the common instruction for a single other one to be questioned."""
 MIN_SIMILARITY = 0.8
 """Minimum ratio of equal letters of two words that differ by a typing error."""
+
+
+@check(
+    family="set",
+    needs="state, eight episodes",
+    measures="episodes that are cut off",
+    unit="% of usual speed",
+    why="The end of the task is missing: the policy does not learn to finish.",
+    do=LOOK_OR_DROP,
+)
+def cut_off_episodes(evidence: Evidence) -> Iterator[Fault]:
+    """Find episodes that end during a motion, where nearly all others end at rest.
+
+    The target must move, too: an arm reaches it tenths of a second later.
+    """
+    speeds: dict[int, float] = {}
+    count = max(2, round(END_S * evidence.fps))
+    for episode, state in evidence.need_state(3 * count):
+        speed = _end_speed(evidence, state, count)
+        if speed < math.inf:
+            target = _target(evidence, episode, state)
+            speeds[episode.number] = min(speed, _end_speed(evidence, target, count))
+    if len(speeds) <= MIN_OTHERS:
+        raise NotMeasuredError(f"it compares {MIN_OTHERS + 1} episodes or more")
+    at_rest = sum(each < MAX_REST_SPEED for each in speeds.values()) / (len(speeds) - 1)  # of the others
+    for number, end_speed in speeds.items() if at_rest >= MIN_RESTING_SHARE else ():
+        if end_speed > MIN_END_SPEED:
+            yield Fault(
+                severity="look",
+                episode=number,
+                value=f"{end_speed:.0%}",
+                message=f"it ends while the arm moves at {end_speed:.0%} of its speed; {at_rest:.0%} end at rest",
+            )
+
+
+def _end_speed(evidence: Evidence, values: Array, count: int) -> float:
+    """Compute the speed in the last frames, relative to the root mean square; infinite without any motion."""
+    speed = _arm_speed(evidence, values)
+    size = float(np.sqrt((speed**2).mean()))
+    return float(speed[-count:].mean()) / size if size > 0 else math.inf
+
+
+def _target(evidence: Evidence, episode: EpisodeEvidence, state: Array) -> Array:
+    """Return the (T, D) targets of the state's elements; the state itself where there are none."""
+    try:
+        if episode.action is None or evidence.once(relation_of).kind != "target":
+            return state
+    except NotMeasuredError:
+        return state
+    pairs = [(element, column) for element, column in enumerate(evidence.action_of) if column is not None]
+    found = state.copy()
+    found[:, [element for element, _ in pairs]] = episode.action[:, [column for _, column in pairs]]
+    return found
+
+
+def _arm_speed(evidence: Evidence, state: Array) -> Array:
+    """Compute the (T - 1,) speed of the arm in units of the elements' ranges, of at least a part of the largest one."""
+    arm = ~evidence.is_gripper & evidence.is_position
+    ranges = evidence.ranges[arm]
+    floor = MIN_SPAN * ranges.max(initial=0.0)
+    steps = np.diff(state[:, arm], axis=0) if floor > 0 else np.zeros((len(state) - 1, 1))
+    return np.asarray(np.linalg.norm(steps / np.maximum(ranges, floor or 1.0), axis=1))
 
 
 @check(

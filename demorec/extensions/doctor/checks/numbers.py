@@ -1,4 +1,4 @@
-"""Checks of numbers: missing ones, other units, and jumps."""
+"""Checks of numbers: missing ones, other units, jumps, and constant zeros."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from demorec.check.base import Fault, NotMeasuredError, check
 from demorec.core.geometry import Array
+from demorec.episode.element_names import joint_of
 from demorec.extensions.doctor.evidence import DROP, Evidence
 from demorec.extensions.doctor.relation import relation_of
 from demorec.extensions.doctor.units import (
@@ -233,3 +234,41 @@ def element_name(evidence: Evidence, element: int) -> str:
     """Name an element of the state in messages."""
     name = evidence.elements[element]
     return f"element {name} of the state" if name.isdigit() else name
+
+
+@check(
+    family="numbers",
+    needs="state",
+    measures="elements that are exactly zero throughout",
+    why="A converter that lacks a joint writes zeros: the policy learns nothing about it, and commands zero.",
+    do="compare the order of the joints in the recorder with the names in info.json",
+)
+def zero_elements(evidence: Evidence) -> Iterator[Fault]:
+    """Find elements of state and action that are exactly zero in all rows while others of the same arm move.
+
+    An arm that rests as a whole is excluded, and so are elements that rest at another value.
+    """
+    episodes = evidence.need_state()
+    zero = np.all([~state.any(axis=0) for _, state in episodes], axis=0)
+    groups = [_group(name) for name in evidence.elements]
+    acting = [e.action for e, _ in episodes if e.action is not None]
+    found = []
+    for element in np.flatnonzero(zero).tolist():
+        column = evidence.action_of[element]
+        if column is not None and any(action[:, column].any() for action in acting):
+            continue
+        peers = [k for k, group in enumerate(groups) if group == groups[element]]
+        if np.mean([evidence.ranges[k] > 0 for k in peers]) >= 0.5:
+            found.append(evidence.elements[element])
+    if found:
+        yield Fault(
+            severity="look",
+            value=f"{len(found)} of {len(evidence.elements)} elements",
+            message=f"state and action of {', '.join(found)} are exactly zero in all frames, and other joints move",
+        )
+
+
+def _group(name: str) -> str:
+    """Determine the arm of an element: "left" or "right" if its name implies it."""
+    words = joint_of(name).lower().replace(".", "_").replace("/", "_").split("_")
+    return next((word for word in words if word in ("left", "right", "l", "r")), "")
