@@ -6,21 +6,10 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.extensions.imports.clock import MISSING, choose
+from demorec.extensions.imports.clock import choose
 
 TIMES = st.lists(st.integers(0, 10**6), min_size=1, max_size=30, unique=True).map(sorted)
 ROWS = st.lists(st.integers(-10, 10**6 + 10), min_size=1, max_size=30, unique=True).map(sorted)
-
-
-@given(TIMES, ROWS)
-def test_latest(times: list[int], rows: list[int]) -> None:
-    chosen = choose(np.array(times), np.array(rows), "latest")
-    for row, index, age in zip(rows, chosen.index, chosen.age_ns, strict=True):
-        before = [time for time in times if time <= row]
-        if not before:
-            assert (index, age) == (-1, MISSING)
-        else:
-            assert (times[index], age) == (before[-1], row - before[-1])
 
 
 @given(TIMES, ROWS)

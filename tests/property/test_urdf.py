@@ -1,15 +1,11 @@
-"""Joint trees: reading terminates for any joints of a URDF, and a path leads from the root to its link.
-
-Unreadable elements are named.
-"""
+"""Joint trees: reading terminates for any joints of a URDF, and a path leads from the root to its link."""
 
 from __future__ import annotations
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.robots.urdf import Urdf, read_links
+from demorec.robots.urdf import Urdf
 
 links = st.integers(0, 6).map("link{}".format)
 
@@ -36,31 +32,3 @@ def test_any_joints_are_a_tree_or_refused(pairs: list[tuple[str, str]]) -> None:
         assert path[-1].child == link
     assert len({child for _, child in pairs}) == len(pairs)
     assert set(urdf.link_poses({})) == {"root", *(child for _, child in pairs)}
-
-
-@pytest.mark.parametrize(
-    "pairs",
-    [
-        [("root", "a"), ("b", "c"), ("c", "b")],  # a cycle outside the tree
-        [("root", "a"), ("root", "b"), ("a", "c"), ("b", "c")],  # a link with two joints
-    ],
-)
-def test_joints_that_do_not_form_a_tree_are_named(pairs: list[tuple[str, str]]) -> None:
-    with pytest.raises(ValueError, match=r"one tree.*joint"):
-        Urdf.parse(urdf_text(pairs))
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("no xml", "not valid XML"),
-        ('<robot><link name="a"><visual><geometry><box/></geometry></visual></link></robot>', "size"),
-        (
-            '<robot><link name="a"><visual><geometry><box size="1 x 1"/></geometry></visual></link></robot>',
-            "1 x 1.*3 finite",
-        ),
-    ],
-)
-def test_links_that_cannot_be_read_are_named(text: str, words: str) -> None:
-    with pytest.raises(ValueError, match=words):
-        read_links(text)

@@ -237,13 +237,6 @@ def test_the_sidecar_has_the_data_that_lerobot_cannot_hold(run: Path, tmp_path: 
     }
 
 
-def test_episodes_without_cameras(tmp_path: Path) -> None:
-    write_episode(tmp_path / "e.mcap", num_frames=6, cameras=())
-    export(tmp_path, tmp_path / "d")
-    assert info(tmp_path / "d")["video_path"] is None
-    assert not (tmp_path / "d" / "videos").exists()
-
-
 def test_append_refuses_existing_episodes(run: Path, tmp_path: Path) -> None:
     """Episodes are compared by content: neither the recording's name nor its place matters."""
     out, copies = tmp_path / "d", tmp_path / "copies"

@@ -11,7 +11,6 @@ from typing import Any
 import av
 import h5py
 import numpy as np
-import pyarrow.parquet as pq
 import pytest
 from support.export import data_table, export
 from support.external import FORCE, STATE, TOP, Episode, make_external, write_external
@@ -73,18 +72,6 @@ def test_a_missing_image_is_an_error(tmp_path: Path) -> None:
     run = run_of(tmp_path / "run", replace(episode, frames=gap))
     with pytest.raises(ExportError, match="Frame 7 has no image of the camera top, like 2 of 30 frames"):
         export(run, tmp_path / "d")
-
-
-def test_failures_stay_out_and_unknown_outcomes_do_not(tmp_path: Path) -> None:
-    outcomes = (True, False, None)
-    run = run_of(
-        tmp_path / "run",
-        *(complete(num_frames=5, episode_index=index, success=success) for index, success in enumerate(outcomes)),
-    )
-    report = export(run, tmp_path / "d")
-    assert (report.num_episodes, report.skipped_failures) == (2, 1)
-    table = pq.read_table(next((tmp_path / "d" / "demorec" / "episodes").rglob("*.parquet")))
-    assert table.column("success").to_pylist() == [True, None]
 
 
 @pytest.mark.parametrize("exporter", EXPORTERS.names())

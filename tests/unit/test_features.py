@@ -1,4 +1,4 @@
-"""Feature vectors against SciPy, one frame against many, and actions integrated to poses."""
+"""Feature vectors against SciPy, signs of quaternions, and increments of noisy commands."""
 
 from __future__ import annotations
 
@@ -17,10 +17,8 @@ from demorec.episode.features import (
     EE_POSE,
     ENVIRONMENT_STATE,
     action_vectors,
-    joint_target_from_increment,
     observation_names,
     observation_vectors,
-    pose_from_delta,
 )
 from demorec.episode.scene import Body, Goal, RobotPlacement, Scene, Shape
 from demorec.robots.panda import PANDA
@@ -159,38 +157,6 @@ def columns_of(rng: np.random.Generator, count: int) -> Trajectory:
         command_base_from_tcp=poses(), phase=("x",) * count, is_deliberate_miss=np.zeros(count, dtype=bool),
         world_from_camera={},
     )  # fmt: skip
-
-
-@pytest.mark.parametrize("rows", [slice(None), np.arange(2, 50, 3)])
-def test_increments_sum_up_to_the_absolute_targets(rows: slice | np.ndarray[Any, Any]) -> None:
-    rng = np.random.default_rng(5)
-    scene, columns = make_scene(rng), columns_of(rng, 50)
-    target = np.array(scene.robot.joint_position)
-    for action, absolute in zip(
-        action_vectors(columns, scene, "joint_increment", rows),
-        action_vectors(columns, scene, "joint", rows),
-        strict=True,
-    ):
-        target = joint_target_from_increment(target, action)
-        assert np.allclose(target, absolute[:7], atol=1e-5)
-        assert action[-1] == absolute[-1]
-
-
-@pytest.mark.parametrize("rows", [slice(None), np.arange(2, 50, 3)])
-def test_pose_deltas_compose_to_the_absolute_poses(rows: slice | np.ndarray[Any, Any]) -> None:
-    rng = np.random.default_rng(6)
-    scene, columns = make_scene(rng), columns_of(rng, 50)
-    pose = Pose(position=columns.base_from_tcp[0, :3], quat_xyzw=columns.base_from_tcp[0, 3:])
-    deltas = action_vectors(columns, scene, "ee_delta", rows)
-    absolutes = action_vectors(columns, scene, "ee", rows)
-    assert deltas.shape[1] == 7
-    assert np.sqrt((deltas[:, 3:6] ** 2).sum(axis=1)).max() <= math.pi + 1e-5
-    for delta, absolute in zip(deltas, absolutes, strict=True):
-        pose = pose_from_delta(pose, delta)
-        assert np.allclose(pose.position, absolute[:3], atol=1e-5)
-        angle = (Rotation.from_quat(pose.quat_xyzw) * Rotation.from_quat(absolute[3:7]).inv()).magnitude()
-        assert angle < 1e-4
-        assert delta[-1] == absolute[-1]
 
 
 @pytest.mark.parametrize("fps", [30, 10])

@@ -72,21 +72,6 @@ def test_an_unpowered_joint_slows_down_by_its_equation(
     assert (found >= -1e-9).all()
 
 
-@pytest.mark.parametrize(("limit", "damping", "friction"), [(0.05, 0.02, 0.0), (3.0, 50.0, 1.0)])
-def test_a_motor_at_its_limit_reaches_its_steady_speed(
-    limit: float, damping: float, friction: float, tmp_path: Path
-) -> None:
-    steady = (limit - friction) / damping
-    found = speeds(tmp_path, limit=limit, damping=damping, friction=friction, start=0.0, target=500.0)
-    assert np.abs(found - steady * (1 - np.exp(-damping * TIME / INERTIA))).max() < 0.05 * steady
-    assert found.max() <= steady * (1 + 1e-9)
-
-
-def test_friction_beyond_the_motor_holds_the_joint(tmp_path: Path) -> None:
-    found = speeds(tmp_path, limit=1.0, damping=0.0, friction=1.0, start=0.0, target=500.0)
-    assert np.abs(found).max() < 1e-9
-
-
 def expert_frames(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arm: str, finger: str) -> tuple[Frame, ...]:
     """One episode of the documented arm, whose turning and sliding joints have these <dynamics>."""
     module = f"arms_{abs(hash((arm, finger)))}"

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
-from support.commands import exit_code
 from support.sim import episode, run
 
 from demorec.core.errors import ConfigError, SceneError
@@ -258,8 +257,3 @@ def test_a_folder_without_meshes_is_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.stl").write_bytes(b"no mesh")
     with pytest.raises(ConfigError, match="no triangles"):
         load_shelf(f"{tmp_path}//")
-
-
-def test_list_shows_the_shelves(capsys: pytest.CaptureFixture[str]) -> None:
-    assert exit_code("list", "objects") == 0
-    assert "330 shapes: mug, glass, bowl" in capsys.readouterr().out

@@ -1,4 +1,4 @@
-"""Mesh files: correct reading, and errors for broken ones; decimation and cache keep the essential parts."""
+"""Mesh files: correct reading, and errors for broken ones; a cache that survives damage."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import trimesh
 from support import render as scenes
 
 from demorec.core.errors import RenderError
-from demorec.render.raster.decimate import decimate
 from demorec.render.raster.mesh import cached_mesh
 from demorec.render.raster.mesh_files import load_mesh
 
@@ -46,17 +45,6 @@ def test_broken_files_are_named(tmp_path: Path, name: str, content: bytes) -> No
     path.write_bytes(content)
     with pytest.raises(RenderError, match=name):
         load_mesh(path)
-
-
-def test_decimation_stays_near_the_surface() -> None:
-    mesh = load_mesh(Path(scenes.DATA) / "franka_panda/meshes/visual/hand.obj")
-    few = decimate(mesh, 512)
-    assert 400 < few.num_faces <= 512
-    distance = trimesh.proximity.closest_point_naive(
-        trimesh.Trimesh(mesh.points, mesh.faces, process=False), few.points[few.faces].mean(1)[:40]
-    )[1]
-    assert np.median(distance) < 1e-3
-    assert np.allclose((few.normals**2).sum(-1), 1, atol=1e-6)
 
 
 def test_the_cache_survives_damage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -109,19 +109,6 @@ def test_missing_depth_is_an_error(tmp_path: Path) -> None:
         assert recording.segment_names() == {}
 
 
-@pytest.mark.parametrize(("width", "height", "step"), [(64, 48, 1), (640, 480, 4)])
-def test_statistics_are_of_every_other_image(tmp_path: Path, width: int, height: int, step: int) -> None:
-    """Every fourth row of an image, shifted each time; large images are thinned as LeRobot does."""
-    info, frames, outcome = make_episode(num_frames=7, width=width, height=height)
-    path = record(tmp_path / "a.mcap", frames, info, outcome)
-    with Recording(path) as recording:
-        found = recording.pixel_statistics("wrist")
-    thinned = [frame.images["wrist"].color[::step, ::step] for frame in frames[::2]]
-    chosen = np.concatenate([image[number % 4 :: 4].reshape(-1, 3) for number, image in enumerate(thinned)])
-    assert found.num_images == 4
-    assert np.array_equal(found.counts, [np.bincount(chosen[:, channel], minlength=256) for channel in range(3)])
-
-
 def test_the_same_episode_gives_the_same_bytes(tmp_path: Path) -> None:
     first = write_episode(tmp_path / "a.mcap", num_frames=35, depth=True, segmentation=True).read_bytes()
     assert write_episode(tmp_path / "b.mcap", num_frames=35, depth=True, segmentation=True).read_bytes() == first

@@ -16,7 +16,7 @@ from support.conventions import CONVENTIONS, Convention, write_convention
 from demorec.core.errors import ConfigError
 from demorec.datasets.lerobot.layout import DatasetFeature
 from demorec.episode.element_names import read_names
-from demorec.episode.roles import Column, NamedRoles, find_roles, matching_elements
+from demorec.episode.roles import Column, NamedRoles, find_roles
 from demorec.view.sources import find_episodes
 
 Capture = pytest.CaptureFixture[str]
@@ -197,30 +197,6 @@ def test_any_names_are_read_and_written_back_as_they_were(names: Any, count: int
     feature = DatasetFeature.from_json({"dtype": "float32", "shape": [count], "names": names})
     assert json.dumps(feature.to_json()["names"]) == json.dumps(names)
     assert len(feature.elements) == count
-
-
-@given(st.lists(st.text("abc_", min_size=1, max_size=5), min_size=1, max_size=6, unique=True))
-def test_every_known_form_gives_the_same_names(names: list[str]) -> None:
-    forms: list[Any] = [names, [names], {"motors": names}, {"axes": names}, {"a": names[:1], "b": [names[1:]]}]
-    forms += [{name: place for place, name in enumerate(names)}, tuple(names)]
-    assert {read_names(form, len(names)) for form in forms} == {tuple(names)}
-    assert {read_names(form, len(names) + 1) for form in forms} == {None}
-
-
-@pytest.mark.parametrize(
-    ("state", "action", "expected"),
-    [
-        (("a.pos", "b.pos"), ("b", "a"), [1, 0]),
-        (("0", "1"), ("x", "y"), [0, 1]),
-        (("x", "y"), ("0", "1", "2"), [None, None]),
-        (("a", "a"), ("a", "a"), [0, 1]),
-        (("a", "b"), ("c", "b.vel"), [None, 1]),
-    ],
-)
-def test_elements_match_by_name_or_position(
-    state: tuple[str, ...], action: tuple[str, ...], expected: list[int | None]
-) -> None:
-    assert matching_elements(state, action) == expected
 
 
 def vector(count: int) -> Column:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from support.check import edit_json
 from support.generate import expected_attempts
 
 from demorec.core.config import GenerateConfig
@@ -79,15 +79,6 @@ def test_every_damage_is_reported_as_damage(tmp_path: Path, damage: Callable[[st
         load_run_file(tmp_path)
 
 
-def edit(path: Path, change: Callable[[Any], object]) -> None:
-    """Edit run.json as JSON, and check that it changed."""
-    plain = json.loads(path.read_text())
-    before = json.dumps(plain)
-    change(plain)
-    assert json.dumps(plain) != before
-    path.write_text(json.dumps(plain))
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -104,7 +95,7 @@ def test_impossible_numbers_are_damage(tmp_path: Path, change: Callable[[Any], o
     run = a_run()
     assert run.attempts[0].success, "the first line must be that of a recording in episodes/"
     save_run_file(run, tmp_path)
-    edit(tmp_path / "run.json", change)
+    edit_json(tmp_path / "run.json", change)
     with pytest.raises(DamagedRunFileError) as error:
         load_run_file(tmp_path)
     assert words in str(error.value)

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from demorec.cli.shared.output import OutputError, aligned, say, tell
+from demorec.cli.shared.output import OutputError, say, tell
 from demorec.core.text import printable
 
 
@@ -56,10 +56,3 @@ def test_a_full_disk_behind_the_output_is_reported(monkeypatch: pytest.MonkeyPat
         monkeypatch.setattr(sys, "stdout", full)
         with pytest.raises(OutputError, match="No space left"):
             say("x" * 10)
-
-
-@given(st.lists(st.tuples(st.text(), st.text(min_size=1)), min_size=1))
-def test_columns_are_aligned_for_any_content(cells: list[tuple[str, str]]) -> None:
-    rows = aligned([("name", "|"), *((name, "|") for name, _ in cells)])
-    assert len({len(row.rpartition("|")[0]) for row in rows}) == 1
-    assert all(printable(row) == row for row in rows)

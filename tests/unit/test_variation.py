@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,9 +14,7 @@ from support.sim import episode, first_frame, run
 from demorec.core.config import GenerateConfig
 from demorec.core.errors import ConfigError, SceneError
 from demorec.core.geometry import Pose
-from demorec.episode.scene import Texture
 from demorec.episode.variation import PRESETS, Ranges, resolve, stated_error
-from demorec.render.procedural import texture_pixels
 from demorec.tasks.sampling import stratified_point
 
 
@@ -157,22 +155,3 @@ def test_a_held_out_region_off_the_table_is_a_clear_error() -> None:
     ranges = Ranges(held_out_x=(0.0, 0.1), held_out_y=(0.8, 0.9))
     with pytest.raises(SceneError, match="held_out_x"):
         episode(0, split="eval", ranges=ranges)
-
-
-@pytest.mark.parametrize("pattern", ["plain", "checker", "stripes", "noise", "wood"])
-def test_textures_are_functions_of_their_fields(
-    pattern: Literal["plain", "checker", "stripes", "noise", "wood"],
-) -> None:
-    dark, light = (0.2, 0.1, 0.0), (0.8, 0.9, 1.0)
-    texture = Texture(pattern=pattern, colors=(dark, light), scale=4, seed=1)
-    pixels = texture_pixels(texture, 64).astype(int)
-    assert pixels.shape == (64, 64, 3)
-    assert np.array_equal(pixels, texture_pixels(texture, 64))
-    assert (pixels >= [51, 26, 0]).all()
-    assert (pixels <= [204, 230, 255]).all()
-    assert (np.ptp(pixels, axis=(0, 1)) > 80).all() == (pattern != "plain")
-    other = texture_pixels(Texture(pattern=pattern, colors=(dark, light), scale=4, seed=2), 64)
-    assert np.array_equal(pixels, other) == (pattern in ("plain", "checker", "stripes"))
-    if pattern == "checker":
-        assert [tuple(pixels[8, 8]), tuple(pixels[8, 24])] == [(51, 26, 0), (204, 230, 255)]
-        assert np.array_equal(pixels[:16, :16], pixels[16:32, 16:32])

@@ -58,16 +58,6 @@ def test_observation_agrees_with_the_simulator(world: World, scene: Scene) -> No
     assert np.abs(at_rest[:7]).max() > 10
 
 
-def test_the_wrench_grows_by_the_weight_of_the_lifted_object() -> None:
-    prepared = episode(0, variation="none")
-    frames, outcome = run(prepared)
-    assert outcome.success
-    lift = next(i for i, f in enumerate(frames) if f.observation.object_poses["red_cube"].position[2] > 0.06)
-    free = np.mean([f.observation.sensed["wrench"][2] for f in frames[: lift // 2]])
-    held = np.mean([f.observation.sensed["wrench"][2] for f in frames[lift + 10 : lift + 60]])
-    assert abs((free - held) - 9.81 * prepared.info.simulated.scene.body("red_cube").mass) < 0.15
-
-
 def test_a_body_with_an_offset_centre_of_mass_has_the_scenes_pose(world: World, scene: Scene) -> None:
     pose = Pose.from_yaw([0.5, 0.3, 0.4], 0.8)
     duck = Body(

@@ -1,9 +1,8 @@
-"""Columns as arrays, the cache of frames and open video files, each by itself."""
+"""Rows of columns, joined or in chunks."""
 
 from __future__ import annotations
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -27,20 +26,3 @@ def test_rows_are_taken_from_any_chunks(lengths: list[int], rows: list[int], joi
     assert len(column) == len(values)
     assert np.array_equal(column.take(wanted), values[wanted])
     assert np.array_equal(column.take(wanted.reshape(1, -1)), values[wanted][None])
-
-
-@pytest.mark.parametrize(
-    "array",
-    [
-        pa.array(["a", "b"]),
-        pa.array([1.0, None]),
-        pa.array([[1.0], [2.0, 3.0]]),
-        pa.array([[[1.0], [2.0, 3.0]], [[1.0, 2.0], [3.0]]]),
-        pa.array([1 << 63, 2], pa.uint64()),
-        pa.array([1, 2], pa.timestamp("s")),
-    ],
-)
-def test_what_is_no_array_of_numbers_is_left_to_lerobot(array: pa.Array) -> None:
-    from lerobot_policy_act_keypoints.columns import numbers
-
-    assert numbers(pa.chunked_array([array])) is None
