@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import bag_mappings, bags
 from support.commands import exit_code
@@ -91,6 +92,28 @@ def imports(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[[bag
 Imports = Callable[[bags.Notes, str], tuple[int, str, str]]
 
 
+def test_a_clock_that_was_never_set(imports: Imports) -> None:
+    """All headers agree among each other, and are years from the times of recording."""
+    shift = 5 * 365 * 24 * 3600 * bags.NS
+    notes = [replace(note, header_ns=note.header_ns + shift) for note in real() if note.topic != GRIPPER]
+    code, told, _ = imports(notes, MAPPING)
+    assert code == 0
+    assert "all headers are 5.0 years ahead of" in told
+    assert "No findings." not in told
+
+
+@pytest.mark.parametrize(("step", "is_still"), [(0.0, True), (0.004, False)])
+def test_a_bag_in_which_nothing_moves(step: float, is_still: bool, imports: Imports) -> None:
+    """A robot that was never switched on, with encoder noise."""
+    random = np.random.default_rng(0)
+    notes = [
+        bags.with_body(note, position=np.array([0.3, -1.2 + step * (k > 100)]) + 5e-4 * random.uniform(-0.5, 0.5, 2))
+        for k, note in enumerate(note for note in isaac() if note.topic != FRONT)
+    ]
+    _, told, _ = imports(bags.in_order(notes), MAPPING.partition("[cameras.front]")[0])
+    assert ("  still: nothing moves" in told) is is_still
+
+
 @pytest.mark.parametrize("mapping", ["suggested", MAPPING])
 def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
     """The camera has 23 images a second by the recorder's clock, and 30 by the headers, which rows follow."""
@@ -98,7 +121,7 @@ def test_simulated_time(mapping: str, imports: Imports, tmp_path: Path) -> None:
     code, told, _ = imports(notes, mapping)
     assert code == 0
     assert tomllib.loads((tmp_path / "robot.toml").read_text())["clock"]["fps"] == 30
-    assert "No findings." in told
+    assert "No findings but the notes above." in told
     with Recording(tmp_path / "run/episodes/episode_000000.mcap") as recording:
         assert recording.info.fps == 30
         times = recording.table().time_ns.tolist()

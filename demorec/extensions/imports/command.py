@@ -164,9 +164,11 @@ class Import:
         num_frames = sum(episode.num_frames for report in result.reports for episode in report.made)
         dropped = f", {num_dropped} dropped" if num_dropped else ""
         say(f"{counted(result.num_episodes, 'episode')}, {num_frames} frames{dropped}: {out}")
-        kinds = [finding.kind for report in result.reports for finding in report.findings]
+        kinds = [finding.kind for report in result.reports for finding in report.odd]
         listed = f"{counted(len(kinds), 'finding')} in the bags ({', '.join(sorted(set(kinds)))})"
-        say(f"{listed}, see above and demorec check." if kinds else "No findings.")
+        has_notes = len(kinds) < sum(len(report.findings) for report in result.reports)
+        none = "No findings but the notes above." if has_notes else "No findings."
+        say(f"{listed}, see above and demorec check." if kinds else none)
         return _list_skipped(result.skipped, len(result.reports) + len(result.skipped), "bag")
 
 

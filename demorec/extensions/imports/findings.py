@@ -26,13 +26,18 @@ _MOVED_S = 0.05
 """Minimum change of a clock in a bag that is reported."""
 _SHORTER_S = 0.5
 """Minimum time by which a stream must begin later or end earlier than others."""
+_YEAR_S = 365.25 * 86_400
+_MAX_ENCODER_NOISE = 1e-3
+"""Maximum range of a resting joint: radians or metres, or the same ratio of larger values in degrees or counts."""
+NOTE = "note"
+"""Kind of an observation that is not a problem."""
 _EARLY_S = 0.05
 """Maximum time by which a header may be later than its log time: clocks set by NTP differ by less."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class ImportFinding:
-    """A finding of one kind about a stream ("observation.state", "camera front"), "" for the whole bag."""
+    """A finding of one kind, or a note, about a stream ("observation.state", "camera front"), "" for the whole bag."""
 
     kind: str
     stream: str
@@ -46,7 +51,7 @@ def bag_findings(bag: Timelines) -> tuple[ImportFinding, ...]:
     if not _have_another_epoch(lines):
         found += [finding for line in lines for finding in _skew_findings(line)]
     found += [ImportFinding(kind="cut_off", stream="", text=problem) for problem in bag.streams.problems]
-    found += [*_extent_findings(lines), *_clock_findings(bag, lines)]
+    found += [*_extent_findings(lines), *_clock_findings(bag, lines), *_still_findings(lines)]
     once: dict[tuple[str, str], ImportFinding] = {}
     for finding in found:  # features that share a topic also share its findings
         once.setdefault((finding.kind, finding.text), finding)
@@ -131,6 +136,12 @@ def _clock_findings(bag: Timelines, lines: Sequence[Timeline]) -> Iterator[Impor
     if not skews:
         return
     usual = float(np.median(list(skews.values())))
+    if _have_another_epoch(lines):
+        text = (
+            f"all headers are {abs(usual) / _YEAR_S:.1f} years {'behind' if usual > 0 else 'ahead of'} the times of "
+            "recording, and rows follow them: simulated time, or a clock that was never set"
+        )
+        yield ImportFinding(kind=NOTE, stream="", text=text)
     for line, skew in skews.items():
         if abs(skew - usual) > SKEW_S:
             yield _of(line, "clock_offset", f"its clock is off by {usual - skew:+.3f} s against the other streams")
@@ -156,6 +167,23 @@ def _extent_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
             yield _of(line, "late_start", f"begins {late:.2f} s late")
         if early > _SHORTER_S:
             yield _of(line, "early_end", f"ends {early:.2f} s early")
+
+
+def _still_findings(lines: Sequence[Timeline]) -> Iterator[ImportFinding]:
+    """A robot without any motion in the whole bag: a rehearsal, a stopped controller, or another robot's topics."""
+    measured = [line for line in lines if line.stream.names and len(line.times_ns) > 1]
+    if measured and not any(_moves(line) for line in measured):
+        text = f"nothing moves: no number of {', '.join(line.stream.label for line in measured)} changes in this bag"
+        yield ImportFinding(kind="still", stream="", text=text)
+
+
+def _moves(line: Timeline) -> bool:
+    values = line.stream.values.astype(np.float64)
+    values = values[np.isfinite(values).all(axis=1)]
+    if len(values) < 2:
+        return False
+    noise = _MAX_ENCODER_NOISE * np.maximum(np.abs(values).max(axis=0), 1.0)
+    return bool((np.ptp(values, axis=0) > noise).any())
 
 
 def row_findings(lines: Timelines, episodes: Sequence[EpisodeRows]) -> Iterator[ImportFinding]:

@@ -20,7 +20,7 @@ from demorec.core.errors import describe_error
 from demorec.extensions.imports.fields import FieldError, image_bytes, whole
 from demorec.mcap.cdr import Values
 from demorec.mcap.lossless import decode_millimetres
-from demorec.mcap.video import DECODERS, is_keyframe, nal_units
+from demorec.mcap.video import DECODERS, deep_gray, is_keyframe, nal_units
 
 _PIXELS: dict[str, tuple[str, int]] = {
     "rgb8": ("rgb24", 3),
@@ -215,14 +215,23 @@ def _starts_by_itself(codec: str, data: bytes) -> bool:
     return 33 in kinds and any(16 <= kind <= 23 for kind in kinds)  # ITU-T H.265, table 7-1
 
 
-_sizes: dict[tuple[str, bytes], tuple[int, int]] = {}
-"""(codec, parameter sets) -> width and height of the keyframes, from one decoded keyframe."""
+_shapes: dict[tuple[str, bytes], tuple[int, int, str]] = {}
+"""(codec, parameter sets) -> width, height and `deep_gray` of the keyframes, from one decoded keyframe."""
+
+
+class NoColorError(FieldError):
+    """Encoded images hold a measurement with unknown unit instead of colour."""
 
 
 def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
-    """Return width and height of a keyframe; FieldError if it decodes to no image."""
+    """Return width and height of a keyframe.
+
+    Raises:
+        FieldError: It decodes to no image.
+        NoColorError: Its pixels are not colours.
+    """
     key = (codec, data[:_SEQUENCE_BYTES] if codec == "av1" else _parameter_sets(codec, data))
-    if key not in _sizes:
+    if key not in _shapes:
         try:
             context = cast(av.VideoCodecContext, av.CodecContext.create(DECODERS[codec], "r"))
             context.thread_count = 1
@@ -232,8 +241,14 @@ def _keyframe_size(codec: str, data: bytes) -> tuple[int, int]:
             raise FieldError(f"its {codec} video cannot be decoded") from error
         if not frames:
             raise FieldError(f"its {codec} keyframe cannot be decoded")
-        _sizes[key] = (frames[0].width, frames[0].height)
-    return _sizes[key]
+        _shapes[key] = (frames[0].width, frames[0].height, deep_gray(codec, frames[0].format.name, key[1]))
+    width, height, measurement = _shapes[key]
+    if measurement:
+        raise NoColorError(
+            f"its {codec} video holds {measurement}, which is depth or another measurement and not colour: leave the "
+            "topic out, or record the distances as 16UC1 or 32FC1 images"
+        )
+    return width, height
 
 
 def _parameter_sets(codec: str, data: bytes) -> bytes:

@@ -21,7 +21,7 @@ from demorec.core.plain import from_json, to_json
 from demorec.extensions.imports.bag import NS
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.clock import Timeline
-from demorec.extensions.imports.findings import ImportFinding, lost_in
+from demorec.extensions.imports.findings import NOTE, ImportFinding, lost_in
 from demorec.extensions.imports.rows import EpisodeRows
 from demorec.runs.run_file import IMPORT_NAME
 
@@ -88,12 +88,17 @@ class BagReport:
         """Episodes that were not dropped."""
         return tuple(episode for episode in self.episodes if episode.episode_index is not None)
 
+    @property
+    def odd(self) -> tuple[ImportFinding, ...]:
+        """Findings except notes."""
+        return tuple(finding for finding in self.findings if finding.kind != NOTE)
+
     def dropped_lines(self) -> Iterator[str]:
         """Describe dropped parts and findings."""
         for episode in self.episodes:
             if episode.episode_index is None:
                 yield from episode.lines()
-        if kinds := sorted({finding.kind for finding in self.findings}):
+        if kinds := sorted({finding.kind for finding in self.odd}):
             yield f"findings in the bag ({', '.join(kinds)}), which demorec check lists"
 
 
@@ -205,7 +210,7 @@ def import_findings(run: CheckedRun) -> Iterator[Fault]:
     words = [
         f"{bag.name}: {finding.kind}, {finding.stream}: {finding.text}".replace(", : ", ": ")
         for bag in _import_file(run).bags
-        for finding in bag.findings
+        for finding in bag.odd
     ]
     return listed(words, "look", _MAX_LISTED)
 

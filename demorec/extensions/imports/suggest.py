@@ -10,7 +10,6 @@ import math
 import re
 from array import array
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -22,7 +21,7 @@ from demorec.extensions.imports.bag import NS, Bag, TopicSummary, bags_in, open_
 from demorec.extensions.imports.bag_files import BagError
 from demorec.extensions.imports.decoding import BagDecoder, UnknownEncodingError
 from demorec.extensions.imports.fields import FieldError, follow, parse_path, reader_of, stamp_of
-from demorec.extensions.imports.image_messages import ImageHead, image_head
+from demorec.extensions.imports.image_messages import ImageHead, NoColorError, image_head
 from demorec.extensions.imports.mapping import MAX_FPS, Clock, Source
 from demorec.extensions.imports.words import quoted, task_in_name, unique_name
 from demorec.mcap.cdr import Values
@@ -176,8 +175,12 @@ class _Topic(TopicSummary):
             self.stamps_ns.append(stamp)
         if self.first is None:
             self.first = values
-            with suppress(FieldError):  # not an image
+            try:
                 self.head = image_head(values)
+            except NoColorError as error:
+                self.problem = str(error)
+            except FieldError:
+                pass  # not an image
         if self.head is None and not self.problem and (part := _part_of(self.name, self.type, values)):
             known = {joint for other in self.parts for joint in other.joints}
             if not self.parts or (part.joints and known.isdisjoint(part.joints)):
