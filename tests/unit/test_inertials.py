@@ -8,7 +8,7 @@ import pytest
 
 from demorec.core.errors import ConfigError
 from demorec.core.geometry import Pose
-from demorec.robots.model_check import check_masses, require_masses
+from demorec.robots.model_check import require_masses
 from demorec.sim.bodies import load_urdf
 from demorec.sim.client import connect
 
@@ -33,14 +33,6 @@ def arm(*, arm: str = BOX + inertial(), tool: str = "", base: str = "", ground: 
         <limit lower="-3" upper="3" effort="100" velocity="10"/></joint>
       <joint name="t" type="fixed"><parent link="arm"/><child link="tool"/><origin xyz="1 0 0"/></joint>
     </robot>"""
-
-
-@pytest.mark.parametrize(
-    "model",
-    ["franka_panda/panda.urdf", "kuka_iiwa/model.urdf", "xarm/xarm6_with_gripper.urdf", "demorec:iiwa.urdf"],
-)
-def test_models_of_pybullet_and_demorec_specify_their_masses(model: str) -> None:
-    check_masses(model)
 
 
 @pytest.mark.parametrize(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import signal
 import subprocess
 import sys
 import threading
@@ -165,7 +164,6 @@ def test_the_end_of_an_episode_is_reported(tmp_path: Path) -> None:
 Act = Callable[[Any], object]
 BAD: dict[str, tuple[Act, str]] = {
     "length": (lambda e: e.write([0.0]), r"of shape \(1,\), it must be float64 of shape \(2,\)"),
-    "matrix": (lambda e: e.write(np.zeros((2, 2))), r"float64 of shape \(2, 2\)"),
     "feature": (lambda e: e.write({"stat": [0.0, 1.0]}), "unknown feature 'observation.stat'.*'observation.state'"),
     "mixture": (lambda e: e.write({"a": 0.0, "force": [1.0]}), r"'observation.a' is float64 of shape \(\)"),
     "element": (lambda e: e.write({"a": 0.0, "c": 1.0}), "no element 'c'"),
@@ -306,8 +304,7 @@ with Recorder(sys.argv[1], robot="arm", cameras={"top": (48, 64)}, fps=50, task=
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGINT])
-def test_the_end_of_the_program_loses_at_most_a_second(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_killed_program_loses_at_most_a_second(tmp_path: Path) -> None:
     command = [sys.executable, "-c", KILLED, str(tmp_path / "run")]
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as program:
         assert program.stdout is not None
@@ -315,21 +312,18 @@ def test_the_end_of_the_program_loses_at_most_a_second(tmp_path: Path, number: s
         for line in program.stdout:
             last = int(line)
             if last == 120:
-                program.send_signal(number)
+                program.kill()
                 break
         last = max([last, *(int(line) for line in program.stdout)])
     with recorder(tmp_path / "run", robot="arm", cameras=TOP, fps=50) as run:
-        assert len(run.recovered) == (1 if number == signal.SIGKILL else 0)
+        assert len(run.recovered) == 1
         with run.episode() as episode:
             episode.write([0.0], [0.0])
     first, second = load_any_run_file(tmp_path / "run").attempts
     assert (first.success, second.episode_index) == (None, 1)
     assert last - 50 <= first.num_frames - 1 <= last
-    if number == signal.SIGINT:
-        assert first.num_frames - 1 == last
-        assert first.reason == "interrupted"
     with recording_of(tmp_path / "run") as found:
         table = found.table()
         assert table.features["observation.state"][:, 0].tolist() == list(range(first.num_frames))
         assert table.images["top"].tolist() == list(range(first.num_frames))
-        assert found.is_recovered == (number == signal.SIGKILL)
+        assert found.is_recovered

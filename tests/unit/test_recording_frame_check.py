@@ -34,10 +34,6 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: observed(f, joint_position=f.observation.joint_position[:7]),
         "25 numbers for /joint_states, it must have 27",
     ),
-    "a sample of another length": (
-        lambda f: replace(f, joint_samples=(replace(f.joint_samples[0], joint_velocity=np.zeros(3)),)),
-        "21 numbers for /joint_states, it must have 27",
-    ),
     "an unknown object": (
         lambda f: observed(f, object_poses={**f.observation.object_poses, "ball": Pose()}),
         "poses of the objects ball, cube, the scene has cube",
@@ -54,19 +50,12 @@ FAULTS: dict[str, tuple[Callable[[Frame], Frame], str]] = {
         lambda f: moved(f, joint_target=with_nan(f.command.joint_target)),
         "a number for /command that is not finite",
     ),
-    "a NaN in a sample": (
-        lambda f: replace(
-            f,
-            joint_samples=(replace(f.joint_samples[0], joint_effort=with_nan(f.joint_samples[0].joint_effort)),),
-        ),
-        "a number for /joint_states that is not finite",
-    ),
 }
 
 
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_frame_that_does_not_fit_is_refused_at_once(fault: str, tmp_path: Path) -> None:
-    info, frames, _ = make_episode(num_frames=4, cameras=("front",), physics_rate_joints=True)
+    info, frames, _ = make_episode(num_frames=4, cameras=("front",))
     spoil, words = FAULTS[fault]
     with EpisodeWriter(tmp_path / "e.mcap", info) as writer:
         for frame in frames[:2]:
