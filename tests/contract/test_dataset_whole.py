@@ -108,14 +108,22 @@ EVERY_FAULT = ("info", "check", "view", "import", "select")
 """Commands that are tried with every fault; the others open a dataset as `select` does."""
 
 
+def wrong_files(root: Path) -> None:
+    """The table assigns the rows of all episodes to the first data file, as some converters did (lerobot#2401)."""
+    zeros = pa.array([0] * NUM_EPISODES, pa.int64())
+    name = "data/file_index"
+    change_table(root, "meta/episodes", lambda table: table.set_column(table.schema.get_field_index(name), name, zeros))
+
+
 @pytest.mark.slow
 @pytest.mark.long
+@pytest.mark.parametrize("spoil", [without_table, wrong_files])
 @pytest.mark.parametrize("command", EVERY_FAULT)
 def test_episodes_missing_from_the_table_are_found_by_the_rows(
-    command: str, apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    command: str, spoil: Callable[[Path], None], apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     root = Path(shutil.copytree(apart, tmp_path / "d"))
-    without_table(root)
+    spoil(root)
     before = content_of(root)
     assert exit_code(*words_of(READERS[command], root, tmp_path / "new")) == (1 if command == "check" else 0)
     captured = capsys.readouterr()

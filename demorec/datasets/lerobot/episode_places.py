@@ -1,6 +1,6 @@
 """Which episodes a dataset has, and where their rows and images are stored, by its tables of episodes and of tasks.
 
-If the table of episodes is missing, the rows tell: each contains the number of its episode. The
+If the table of episodes is missing or names other files, the rows tell: each contains the number of its episode. The
 images are located by counting: an episode has as many as rows, a camera's videos hold the episodes in order, and no
 episode spans two files.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import re
 import reprlib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -334,6 +334,24 @@ def _unknown_images(root: Path, key: str, found: str) -> ExportError:
         f"The images of {key} cannot be assigned to rows ({found}): leave the camera out (demorec "
         f"dataset drop-features), or restore its videos: {root}"
     )
+
+
+def relocated(root: Path, listed: Sequence[EpisodePlace]) -> tuple[EpisodePlace, ...] | None:
+    """Locate the rows of episodes if their table names other data files; None if the table fits, or no file does.
+    Raises ExportError if a data file cannot be read.
+    """
+    files = tables_in(root, "data")
+    there = {path: open_table(path).metadata.num_rows for path in files}
+    if rows_by_file(listed).items() >= {path: count for path, count in there.items() if count}.items():
+        return None
+    runs = {run.episode_index: run for run in episode_runs(files)}
+    found = tuple(
+        replace(place, data=run.data, first_row=run.first_row)
+        if (run := runs.get(place.episode_index)) is not None and run.length == place.length
+        else place
+        for place in listed
+    )
+    return found if rows_by_file(found).items() >= there.items() else None
 
 
 def rows_by_file(places: Sequence[EpisodePlace]) -> dict[Path, int]:

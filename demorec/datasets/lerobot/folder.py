@@ -28,6 +28,7 @@ from demorec.datasets.lerobot.episode_places import (
     places_by_rows,
     read_episode_table,
     read_tasks,
+    relocated,
     rows_by_file,
 )
 from demorec.datasets.lerobot.files import open_table, read_json, read_table, tables_in
@@ -114,12 +115,12 @@ class LeRobotFolder:
 
     @cached_property
     def listed(self) -> tuple[EpisodePlace, ...]:
-        """Episodes in the episodes' table, or located by the rows if it is missing."""
+        """Episodes in the episodes' table, or located by the rows if it is missing or names other files."""
         return self._listed_and_problem[0]
 
     @property
     def is_found_by_rows(self) -> bool:
-        """Whether the table of episodes is missing, so that the episodes were located by their rows."""
+        """Whether the table of episodes is missing or wrong, so that the episodes were located by their rows."""
         return self._listed_and_problem[1] != ""
 
     @property
@@ -177,7 +178,12 @@ class LeRobotFolder:
     @cached_property
     def _listed_and_problem(self) -> tuple[tuple[EpisodePlace, ...], str]:
         if has_episode_table(self.root, self.info):
-            return tuple(read_episode_table(self.root, self.info)), ""
+            listed = tuple(read_episode_table(self.root, self.info))
+            with suppress(ExportError):  # an unreadable file is reported for its own episodes
+                if not self.info.is_old and (found := relocated(self.root, listed)) is not None:
+                    moved = sum(a.data != b.data for a, b in zip(listed, found, strict=True))
+                    return found, f"The table of episodes names wrong data files for {moved} of them: {_BY_ROWS}"
+            return listed, ""
         found = places_by_rows(self.root, self.info, self.tasks) if tables_in(self.root, "data") else ()
         return found, f"The dataset has no table of episodes: {_BY_ROWS}" if found else ""
 
